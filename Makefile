@@ -1,0 +1,31 @@
+# Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
+.PHONY: setup demo serve test test-slow check format bench
+BIN := .venv/bin
+
+setup:       ## uv, the locked environment, an EGL; nothing where nothing is missing
+	@deploy/setup.sh
+
+demo: setup  ## the main job: simulated rig, capture, service, textured head in out/demo
+	$(BIN)/eigenhead demo --out out/demo
+
+serve: setup ## the service with its data in out/data
+	$(BIN)/eigenhead serve --data out/data
+
+test: setup  ## the fast tests
+	$(BIN)/pytest -n 2 --dist loadfile
+
+test-slow: setup  ## the tests that take more than a few seconds each
+	$(BIN)/pytest -m slow
+
+check: setup ## ruff, pyright, import-linter
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports
+
+format: setup
+	$(BIN)/ruff check --fix --select I .
+	$(BIN)/ruff format .
+
+bench: setup ## timings of inner loops
+	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/benchmarks

@@ -1,0 +1,448 @@
+"""From pictures of a board to a calibrated rig: detection, lenses, pose graph, bundle, checks; one function."""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from calibration.board import Board
+from calibration.bundle import (
+    INTRINSICS,
+    PER_CAMERA,
+    Free,
+    Observations,
+    Prior,
+    Solution,
+    State,
+    camera_of,
+    corner_sigma,
+    observations,
+    orthonormal,
+    residuals,
+    solve,
+    values_of,
+    weak_prior,
+)
+from calibration.checks import (
+    Check,
+    check_against_previous,
+    check_cheirality,
+    check_determined,
+    check_held_out,
+    check_scale,
+    failed,
+    measure_aspect,
+)
+from calibration.detection import Detections, Report, View, WrongBoard, detect_folder, ignore_progress
+from calibration.gauge import effective_pose, gauge_projection, image_sigma, subject_points
+from calibration.intrinsics import Lens, estimate_lenses
+from calibration.outliers import (
+    CORNER_SIGMAS,
+    Dropped,
+    bad_views,
+    drop_blurred,
+    drop_misread,
+    explain_shot,
+)
+from calibration.pose_graph import Graph, build_graph
+from calibration.timing import TimeOffsets, board_velocities, estimate_offsets
+from calibration.world import in_world_frame
+from rig.errors import EigenheadError
+from rig.files import write_atomically
+from rig.geometry import RigidTransform
+from rig.layout import Rig, document_from_rig
+
+# Time offsets are used where they explain this share of the residuals; below it they would only follow noise.
+OFFSET_GAIN = 0.05
+ROUNDS = 4  # of leaving out what the rest contradicts
+
+
+class CalibrationRefused(EigenheadError):
+    """The pictures were understood, but what they give is not to be used. ``calibration`` is there for the report."""
+
+    def __init__(self, reasons: Iterable[str], calibration: "Calibration | None" = None) -> None:
+        self.reasons = tuple(reasons)
+        self.calibration = calibration
+        super().__init__("the calibration is refused: " + "; ".join(self.reasons))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """A calibrated rig with its evidence.
+
+    ``rig`` has per-camera pose covariances in the gauge of ``calibration.gauge``; ``pose_covariance`` is the joint one
+    of all cameras' left perturbations (rad, mm) in that gauge, with what the uncertainty of the lenses adds to it;
+    ``pose_sigma_px`` its size at the subject; ``intrinsics_sigma`` per camera that of fx fy cx cy k1 k2 p1 p2 k3.
+    ``misses`` per view: the used corners' numbers, pixels, and projected less detected (px)."""
+
+    rig: Rig
+    board: Board
+    front: str
+    pose_covariance: Float[np.ndarray, "6c 6c"]
+    intrinsics_sigma: dict[str, Float[np.ndarray, " 9"]]
+    pose_sigma_px: dict[str, float]
+    misses: dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    detected: int
+    lenses: dict[str, Lens]
+    sync_px: float
+    offsets: TimeOffsets | None
+    offsets_used: bool
+    dropped: tuple[Dropped, ...]
+    checks: tuple[Check, ...]
+    warnings: tuple[str, ...]
+
+    def figures(self) -> dict[str, Any]:
+        """The numbers of ``calibrate --json``."""
+        everything = np.concatenate([miss for _, _, miss in self.misses.values()])
+        cameras = {}
+        for camera in self.rig:
+            own = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
+            cameras[camera.name] = {
+                "rms_px": _rms(np.concatenate(own)),
+                "alone_rms_px": self.lenses[camera.name].rms_px,
+                "views": len(own),
+                "corners": int(sum(len(miss) for miss in own)),
+                "pose_sigma_px": self.pose_sigma_px[camera.name],
+                "focal_sigma_px": float(self.intrinsics_sigma[camera.name][0]),
+            }
+        return {
+            "rms_px": _rms(everything),
+            "used_share": len(everything) / self.detected,
+            "corners": len(everything),
+            "sync_px": self.sync_px,
+            "cameras": cameras,
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Everything but the residuals, as JSON."""
+        names = self.rig.names
+        offsets = None
+        if self.offsets is not None:
+            offsets = {
+                "used": self.offsets_used,
+                "unit": "shots",
+                "cameras": dict(zip(names, self.offsets.offsets.tolist(), strict=True)),
+                "sigma": dict(zip(names, self.offsets.sigma.tolist(), strict=True)),
+                "rms_without_px": self.offsets.rms_without_px,
+                "rms_with_px": self.offsets.rms_with_px,
+            }
+        sigma = {
+            name: dict(zip(INTRINSICS, values.tolist(), strict=True)) for name, values in self.intrinsics_sigma.items()
+        }
+        return {
+            "figures": self.figures(),
+            "front": self.front,
+            "checks": [
+                {"name": c.name, "passed": c.passed, "detail": c.detail, "advice": c.advice} for c in self.checks
+            ],
+            "dropped": [{"shot": d.shot, "camera": d.camera, "reason": d.reason} for d in self.dropped],
+            "warnings": list(self.warnings),
+            "time_offsets": offsets,
+            "intrinsics_sigma": sigma,
+            "rig": document_from_rig(self.rig),
+        }
+
+
+def calibrate(
+    images: Path,
+    board: Board,
+    *,
+    front: str | None = None,
+    previous: Rig | None = None,
+    cache: Path | None = None,
+    workers: int = 2,
+    report: Report = ignore_progress,
+) -> Calibration:
+    """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``; pictures of one shot name show one moment.
+
+    Raises InputError on damaged pictures, WrongBoard, PoseGraphError or CalibrationRefused with what to do.
+    ``previous`` is the rig's last calibration, against which names, layout, scale and lenses are checked; ``cache`` a
+    folder that keeps detections by the pictures' content."""
+    detections = detect_folder(images, board, cache=cache, workers=workers, report=report)
+    return calibrate_detections(detections, front=front, previous=previous, report=report)
+
+
+def calibrate_detections(
+    detections: Detections, *, front: str | None = None, previous: Rig | None = None, report: Report = ignore_progress
+) -> Calibration:
+    """``calibrate`` after detection: a pure function."""
+    detected = detections.corner_count
+    report("lenses", 0.0)
+    detections, dropped = drop_blurred(detections)
+    _refuse_blind_cameras(detections, dropped)
+    lenses = estimate_lenses(detections)
+    detections, misread = drop_misread(detections, lenses)
+    dropped += misread
+    _refuse_blind_cameras(detections, dropped)
+    report("pose graph", 0.0)
+    graph = build_graph(detections, lenses)
+    report("bundle", 0.0)
+    fit = _adjust(graph, detections, lenses, report)
+    return _judged(fit, detections, lenses, [*dropped, *fit.dropped], detected, front, previous, report)
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Writes ``cameras.json`` with covariances."""
+    write_atomically(path, json.dumps(document_from_rig(calibration.rig), indent=1).encode())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    solution: Solution
+    seen: Observations
+    views: tuple[View, ...]
+    kept: Bool[np.ndarray, " n"]
+    names: tuple[str, ...]
+    prior: Prior
+    sigma: Float[np.ndarray, " c"]
+    sync_px: float
+    offsets: TimeOffsets
+    free: Free
+    dropped: tuple[Dropped, ...]
+
+
+def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) -> None:
+    seen = {view.camera for view in detections.views}
+    blind = [name for name in detections.sizes if name not in seen]
+    if not blind:
+        return
+    if len(blind) == len(detections.sizes) and not dropped:
+        raise WrongBoard(
+            ["no picture shows it: is board.toml the board that was used, and is it in the pictures whole?"]
+        )
+    reasons = []
+    for name in blind:
+        notes = [note for note in detections.notes if note.startswith(f"{name}/")]
+        lost = [str(drop) for drop in dropped if drop.camera == name]
+        why = notes[0] if notes else lost[0] if lost else "no picture shows the board"
+        reasons.append(f"{name} never sees the board ({why})")
+    raise CalibrationRefused(reasons)
+
+
+def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], report: Report) -> _Fit:
+    """The bundle, again and again until nothing contradicts it any more."""
+    names, noise = graph.names, np.array([lenses[name].noise_px for name in graph.names])
+    weak = weak_prior([detections.sizes[name] for name in names])
+    dropped = list(_explain(graph.strays, graph, graph.state(lenses), detections, float(np.median(noise))))
+    gone = {(d.shot, d.camera) for d in dropped}
+    views = tuple(v for v in (*graph.views, *graph.strays) if not {(v.shot, v.camera), (v.shot, None)} & gone)
+    views = tuple(v for v in views if v in graph.views)
+    state = graph.state(lenses)
+
+    def tick() -> None:
+        report("bundle", min(0.9, len(dropped) / 10))
+
+    for attempt in range(ROUNDS):
+        seen = observations(views, names, graph.shots, detections.board)
+        if attempt == 0:
+            for scale in (8.0, 2.0):
+                sigma = np.sqrt(noise**2 + 0.25) * scale
+                state = solve(state, seen, weak, sigma, robust="cauchy", tick=tick).state
+        sigma, _ = corner_sigma(state, seen, noise)
+        state = solve(state, seen, _prior(weak, names, lenses, noise, sigma), sigma, robust="cauchy", tick=tick).state
+        bad = bad_views(state, seen)
+        if not bad.any():
+            break
+        strange = [view for view, is_bad in zip(views, bad, strict=True) if is_bad]
+        found = list(_explain(strange, graph, state, detections, float(np.median(sigma))))
+        dropped += found
+        gone = {(d.shot, d.camera) for d in found}
+        views = tuple(v for v in views if not {(v.shot, v.camera), (v.shot, None)} & gone)
+    return _finish(state, views, graph, detections, lenses, weak, noise, tuple(dropped), report)
+
+
+def _finish(
+    state: State,
+    views: tuple[View, ...],
+    graph: Graph,
+    detections: Detections,
+    lenses: dict[str, Lens],
+    weak: Prior,
+    noise: Float[np.ndarray, " c"],
+    dropped: tuple[Dropped, ...],
+    report: Report,
+) -> _Fit:
+    """Single corners out, Huber's cost, time offsets where they explain something."""
+    names = graph.names
+    blind = [name for name in names if name not in {view.camera for view in views}]
+    if blind:
+        raise CalibrationRefused(
+            [f"{name}: every view of it contradicts the other cameras" for name in blind]
+            + [str(d) for d in dropped[:5]]
+        )
+    shots = tuple(shot for shot in graph.shots if any(view.shot == shot for view in views))
+    at = [graph.shots.index(shot) for shot in shots]
+    state = replace(
+        state,
+        board_rotations=state.board_rotations[at],
+        board_translations=state.board_translations[at],
+        velocities=state.velocities[at],
+    )
+    everything = observations(views, names, shots, detections.board)
+    sigma, _ = corner_sigma(state, everything, noise)
+    prior = _prior(weak, names, lenses, noise, sigma)
+    offsets = estimate_offsets(state, everything, prior, sigma)
+    used = offsets.rms_with_px < (1 - OFFSET_GAIN) * offsets.rms_without_px
+    free = Free(offsets=used)
+    kept = np.ones(len(everything.pixels), dtype=bool)
+    solution = None
+    for round_number in range(3):
+        report("bundle", 0.9)
+        if used:
+            state = replace(state, velocities=board_velocities(state))
+        solution = solve(state, everything.subset(kept), prior, sigma, free=free, robust="huber")
+        state = solution.state
+        if round_number == 2:
+            break
+        sigma, _ = corner_sigma(state, everything.subset(kept), noise)
+        prior = _prior(weak, names, lenses, noise, sigma)
+        size = np.linalg.norm(residuals(state, everything), axis=1)
+        kept = size < CORNER_SIGMAS * 1.1774 * sigma[everything.camera[everything.view_of]]
+    assert solution is not None
+    seen = everything.subset(kept)
+    _, sync = corner_sigma(state, seen, noise)
+    return _Fit(solution, seen, views, kept, names, prior, sigma, sync, offsets, free, dropped)
+
+
+def _prior(
+    weak: Prior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
+) -> Prior:
+    """Where views err as a whole (moments that differ), the joint fit must take their corners for noisier than they are
+    to each other, and would bend the lenses to explain the rest. What each lens was found to be by itself then counts
+    as knowledge, by the share of the noise that is not the corners' own."""
+    share = 1.0 - noise**2 / sigma**2
+    mean = np.stack([values_of(lenses[name].intrinsics) for name in names])
+    information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])
+    return weak.and_also(mean, information * share[:, None, None])
+
+
+def _explain(
+    strange: Iterable[View], graph: Graph, state: State, detections: Detections, noise_px: float
+) -> Iterable[Dropped]:
+    boards = {
+        shot: RigidTransform(rotation, translation)
+        for shot, rotation, translation in zip(
+            graph.shots, state.board_rotations, state.board_translations, strict=True
+        )
+    }
+    strange = list(strange)
+    for shot in sorted({view.shot for view in strange}):
+        inside = [view for view in (*graph.views, *graph.strays) if view.shot == shot]
+        bad = [view for view in strange if view.shot == shot]
+        yield from explain_shot(shot, inside, bad, detections, state, graph.names, boards, noise_px)
+
+
+def _judged(
+    fit: _Fit,
+    detections: Detections,
+    lenses: dict[str, Lens],
+    dropped: Sequence[Dropped],
+    detected: int,
+    front: str | None,
+    previous: Rig | None,
+    report: Report,
+) -> Calibration:
+    report("checks", 0.0)
+    state = orthonormal(fit.solution.state)
+    bare = Rig(tuple(camera_of(state, i, name, detections.sizes[name]) for i, name in enumerate(fit.names)))
+    rig = in_world_frame(bare, front)
+    covariance, intrinsics_sigma, pose_sigma = _covariances(fit, rig)
+    blocks = [covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(rig))]
+    rig = Rig(tuple(replace(camera, covariance=block) for camera, block in zip(rig, blocks, strict=True)))
+    aspect, aspect_sigma = measure_aspect(fit.solution.state, fit.seen, fit.prior, fit.sigma, fit.free)
+    checks = [
+        check_cheirality(state, fit.seen, detections.board),
+        check_held_out(fit.solution.state, fit.seen, fit.prior, fit.sigma, fit.free),
+        check_scale(detections.board, aspect, aspect_sigma),
+        check_determined(rig, pose_sigma),
+        *check_against_previous(rig, previous),
+    ]
+    report("checks", 1.0)
+    offsets = fit.offsets if np.isfinite(fit.offsets.sigma).all() else None
+    calibration = Calibration(
+        rig,
+        detections.board,
+        front or rig.front_camera(),
+        covariance,
+        intrinsics_sigma,
+        dict(zip(rig.names, pose_sigma.tolist(), strict=True)),
+        _misses(fit),
+        detected,
+        lenses,
+        fit.sync_px,
+        offsets,
+        fit.free.offsets,
+        tuple(dropped),
+        tuple(checks),
+        _warnings(fit, lenses, dropped),
+    )
+    bad = failed(checks)
+    if bad:
+        raise CalibrationRefused([f"{c.name}: {c.detail}: {c.advice}" for c in bad], calibration)
+    return calibration
+
+
+def _covariances(
+    fit: _Fit, rig: Rig
+) -> tuple[Float[np.ndarray, "6c 6c"], dict[str, Float[np.ndarray, " 9"]], Float[np.ndarray, " c"]]:
+    """Poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and what both amount to in
+    pixels at the subject. The uncertainty of the
+    lenses is contained in that of the poses (``effective_pose``), for a fit takes the intrinsics as they are.
+
+    Corners of one view err together where moments differ or the board bends; the covariance of independent corners is
+    raised by how much more the views' means scatter than their corners would let them."""
+    full = fit.solution.covariance() * _design_effect(fit)
+    cameras = len(fit.names)
+    block = full[: cameras * PER_CAMERA, : cameras * PER_CAMERA].reshape(cameras, PER_CAMERA, cameras, PER_CAMERA)
+    points = subject_points(rig)
+    into = np.stack([effective_pose(camera, points) for camera in rig])
+    poses = np.einsum("cik,ckdl,djl->cidj", into, block, into).reshape(6 * cameras, 6 * cameras)
+    projection = gauge_projection(rig)
+    joint = projection @ poses @ projection.T
+    spread = np.sqrt(np.einsum("cici->ci", block)[:, : len(INTRINSICS)])
+    return 0.5 * (joint + joint.T), dict(zip(fit.names, spread, strict=True)), image_sigma(rig, block)
+
+
+def _design_effect(fit: _Fit) -> float:
+    """Variance of the views' mean residuals over what independent corners would give, at least 1."""
+    misses = residuals(fit.solution.state, fit.seen)
+    counts = np.bincount(fit.seen.view_of, minlength=len(fit.seen.camera))
+    filled = counts > 0
+    sums = np.stack([np.bincount(fit.seen.view_of, misses[:, k], minlength=len(counts)) for k in range(2)], axis=1)
+    sigma = fit.sigma[fit.seen.camera]
+    ratios = (sums[filled] ** 2).mean(axis=1) / counts[filled] / sigma[filled] ** 2
+    return max(1.0, float(ratios.mean()))
+
+
+def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Per view: numbers, pixels and misses of its used corners."""
+    every = residuals(fit.solution.state, fit.seen)
+    table, first = {}, 0
+    for index, view in enumerate(fit.views):
+        own = fit.kept[first : first + len(view.found.ids)]
+        first += len(view.found.ids)
+        if own.any():
+            span = slice(fit.seen.starts[index], fit.seen.starts[index + 1])
+            table[view.camera, view.shot] = (view.found.ids[own], view.found.corners[own], every[span])
+    return table
+
+
+def _warnings(fit: _Fit, lenses: dict[str, Lens], dropped: Sequence[Dropped]) -> tuple[str, ...]:
+    found = [lens.weakness for lens in lenses.values() if lens.weakness]
+    found += [f"left out: {drop}" for drop in dropped]
+    if fit.sync_px > 0.3:
+        found.append(
+            f"cameras disagree by {fit.sync_px:.2f} px beyond the corners' noise: moments that differ, or a bent board"
+        )
+    if fit.free.offsets:
+        late = ", ".join(f"{n} {o:+.2f}" for n, o in zip(fit.names, fit.solution.state.offsets, strict=True))
+        found.append(f"the cameras' moments differ; offsets in shots were estimated and used: {late}")
+    return tuple(found)
+
+
+def _rms(misses: Float[np.ndarray, "n 2"]) -> float:
+    return float(np.sqrt((misses**2).sum(axis=1).mean()))

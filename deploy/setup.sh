@@ -1,0 +1,102 @@
+#!/usr/bin/env bash
+# Makes this checkout ready to run: uv, the locked environment in .venv, and an EGL to draw with.
+#
+#   deploy/setup.sh           what `make demo`, `make test` and the service need
+#   deploy/setup.sh --tests   also the Debian packages without which some tests skip
+#
+# Needs bash and python3 (3.11 or newer), nothing else. As root it installs missing Debian packages; without root it
+# names the one command to run. Says what it did; does nothing, in milliseconds, where nothing is to do.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+UV_LEAST=0.9
+EGL_PACKAGES=(libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri)
+# cameras over GigE Vision, the trigger box's firmware in a simulator, pages in a browser, jobs on PostgreSQL
+TEST_PACKAGES=(gcc libc6-dev gcc-avr avr-libc simavr libsimavr-dev libelf-dev aravis-tools libaravis-0.8-0
+  gir1.2-aravis-0.8 chromium postgresql)
+
+say() { echo "setup: $*" >&2; }
+fail() { say "$*"; exit 1; }
+
+tests=""
+for argument in "$@"; do
+  case "$argument" in
+    --tests) tests=tests ;;
+    *) fail "unknown option $argument; it knows --tests" ;;
+  esac
+done
+
+# The stamp holds what the environment was made from; with --tests it stands for the packages too.
+stamp=".venv/.ready${tests:+-$tests}"
+wanted="$(cat uv.lock pyproject.toml deploy/setup.sh | sha256sum) $PWD"
+if [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$wanted" ]; then
+  exit 0
+fi
+
+missing_packages() {
+  local package
+  for package in "$@"; do
+    [ "$(dpkg-query -W -f '${db:Status-Status}' "$package" 2>/dev/null)" = installed ] || echo "$package"
+  done
+}
+
+# install_packages WHY PACKAGE...
+install_packages() {
+  local why=$1
+  shift
+  command -v apt-get >/dev/null || fail "$why: no apt-get here; install what Debian calls $*"
+  if [ "$(id -u)" != 0 ]; then
+    fail "$why. Run this once, then try again: sudo apt-get update && sudo apt-get install -y --no-install-recommends $*"
+  fi
+  say "$why: installing $* from Debian"
+  local log
+  log=$(mktemp)
+  export DEBIAN_FRONTEND=noninteractive
+  { apt-get update && apt-get install -y --no-install-recommends "$@"; } >"$log" 2>&1 </dev/null ||
+    { tail -n 20 "$log" >&2; fail "apt-get failed; its words are above"; }
+  rm -f "$log"
+}
+
+find_uv() {
+  local found
+  for found in "$(command -v uv || true)" "$cache/uv"; do
+    [ -n "$found" ] && version="$("$found" --version 2>/dev/null | cut -d' ' -f2)" && [ -n "$version" ] || continue
+    [ "$(printf '%s\n' "$UV_LEAST" "$version" | sort -V | head -n 1)" = "$UV_LEAST" ] && echo "$found" && return
+  done
+  return 1
+}
+
+command -v python3 >/dev/null || install_packages "python3 is missing" python3
+python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+  fail "python3 is $(python3 --version | cut -d' ' -f2), 3.11 or newer is needed (Debian 12 has it)"
+
+cache="${XDG_CACHE_HOME:-$HOME/.cache}/eigenhead"
+if ! uv="$(find_uv)"; then
+  # Without certificates nothing can be fetched over https; a minimal Debian has none.
+  python3 -c 'import os, ssl, sys
+p = ssl.get_default_verify_paths()
+sys.exit(not any(map(os.path.exists, (os.environ.get("SSL_CERT_FILE", ""), "/etc/ssl/certs/ca-certificates.crt", p.cafile or ""))))' ||
+    install_packages "no certificates to fetch uv with" ca-certificates
+  say "uv is missing: fetching it into $cache"
+  python3 deploy/fetch_uv.py "$cache"
+  uv="$(find_uv)" || fail "the uv that was fetched does not run here"
+fi
+
+say "environment: $("$uv" --version | cut -d' ' -f1-2) sync of uv.lock into .venv"
+"$uv" sync --locked --quiet
+
+# The only sure sign of a working EGL is a context.
+egl_works() { .venv/bin/python -c 'import moderngl; moderngl.create_context(standalone=True, backend="egl").release()' 2>/dev/null; }
+if ! egl_works; then
+  install_packages "no EGL to draw with" "${EGL_PACKAGES[@]}"
+  egl_works || fail "EGL still does not start: .venv/bin/python -c 'import moderngl; moderngl.create_context(standalone=True, backend=\"egl\")' says why"
+fi
+
+if [ -n "$tests" ]; then
+  mapfile -t missing < <(missing_packages "${TEST_PACKAGES[@]}")
+  [ ${#missing[@]} = 0 ] || install_packages "some tests would skip" "${missing[@]}"
+fi
+
+echo "$wanted" >.venv/.ready
+[ -z "$tests" ] || echo "$wanted" >"$stamp"
+say "ready"

@@ -1,0 +1,310 @@
+"""Eigenhead models (section 3.1, eq. 1): a mean head, its modes, and the resolutions it is evaluated at.
+
+A model is stored as a coarse cage (mean and modes) and a linear operator from cage vertices to each level. The default
+refines its cage by Loop subdivision to at least 48,000 vertices; an imported model keeps its own vertices and has the
+identity there. Modes carry their standard deviation, so coefficients are N(0, 1) (the paper's alpha_m = sigma_m z_m).
+
+Memory of a loaded model: 12 (M + 1) V0 bytes for mean and modes (5 MB for the default's 137 modes), plus about 20 bytes
+per stored operator entry (13 MB). ``basis`` of a whole level is cached: 12 M V bytes (36 MB at full, 60 modes).
+"""
+
+import hashlib
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Float32, Int
+
+from pipeline.eigenheads.surface import boundary_vertices, refine, row_count
+from rig.errors import EigenheadError
+
+FORMAT = "eigenhead-model/1"
+PACKS = Path(__file__).parent / "packs"
+DEFAULT = "makehuman-138"
+_PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman": "makehuman.npz"}
+
+
+class UnknownModel(EigenheadError):
+    """A model name that is neither shipped nor in the user's folder, nor a file."""
+
+    def __init__(self, name: str) -> None:
+        known = ", ".join(sorted(list_models()))
+        super().__init__(
+            f"no head model {name!r}: known are {known}. Give a file path, or put one into {models_folder()} "
+            "with `eigenhead model import` or `eigenhead model fetch ict-facekit`"
+        )
+
+
+class BadModel(EigenheadError):
+    """A file that is not a head model of this project, or a damaged one."""
+
+    def __init__(self, path: Path | str, why: str) -> None:
+        super().__init__(
+            f"{path} cannot be used as a head model: {why}. A foreign model is read by `eigenhead model import`"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """One resolution. ``vertices_level = operator @ vertices_cage``; faces wind anticlockwise seen from outside."""
+
+    faces: Int[np.ndarray, "F 3"]
+    operator: sparse.csr_array  # (V, V0)
+    face_region: Bool[np.ndarray, " V"]  # ear to ear, lower forehead to under the chin
+    boundary: Bool[np.ndarray, " V"]  # on an open edge of the mesh
+    landmarks: Mapping[str, int]  # those of the 26 that are vertices here
+    rows: Int[np.ndarray, " V"]  # the same vertices in the full level
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return row_count(self.operator)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadModel:
+    """H(z) = mean + sum_m z_m modes_m (eq. 1), head frame, mm. Arrays are read-only. Memory: see the module."""
+
+    name: str
+    licence: str
+    source: str
+    notice: str
+    sha256: str
+    subjects: Mapping[str, int]  # total, male, female
+    mean: Float32[np.ndarray, "V0 3"]
+    modes: Float32[np.ndarray, "M V0 3"]  # mm per standard deviation
+    sigma: Float32[np.ndarray, " M"]  # sqrt(lambda_m), mm
+    landmarks: Mapping[str, int]  # 26 names to vertex indices of the full level (all lie in the cage)
+    levels: Mapping[str, Level]  # full, p95, p99, cage
+    figures: Mapping[str, float]  # what was measured when the model was built, e.g. generalisation_mm
+    scores: Float32[np.ndarray, "N M"]  # coefficients of the training heads; N = 0 where they are not known
+    _bases: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
+
+    def cage(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "V0 3"]:
+        """Cage vertices (float64, mm) for the first m <= M coefficients, in standard deviations."""
+        count = len(coefficients)
+        if count > len(self.modes):
+            raise ValueError(f"{count} coefficients, but model {self.name} has {len(self.modes)} modes")
+        flat = self.modes[:count].reshape(count, self.mean.size)
+        return (self.mean.ravel() + np.asarray(coefficients, float) @ flat).reshape(-1, 3)
+
+    def vertices(self, coefficients: Float[np.ndarray, " m"], level: str = "full") -> Float[np.ndarray, "V 3"]:
+        """Vertices of a level, float64, head frame, mm. Raises KeyError for an unknown level."""
+        return self.levels[level].operator @ self.cage(coefficients)
+
+    def basis(
+        self, level: str, count: int, vertices: Int[np.ndarray, " S"] | None = None
+    ) -> Float32[np.ndarray, "m S 3"]:
+        """The first ``count`` modes at a level's vertices (all, or the given ones), mm per standard deviation.
+
+        Only the rows asked for are computed. The basis of a whole level is kept and handed out read-only.
+        """
+        if vertices is not None:
+            return self._rows(self.levels[level].operator[np.asarray(vertices)], count)
+        key = (level, count)
+        if key not in self._bases:
+            self._bases[key] = _frozen(self._rows(self.levels[level].operator, count))
+        return self._bases[key]
+
+    def _rows(self, operator: sparse.csr_array, count: int) -> Float32[np.ndarray, "m S 3"]:
+        stacked = self.modes[:count].transpose(1, 0, 2).reshape(self.mean.shape[0], -1)
+        rows = operator.astype(np.float32) @ stacked
+        return np.ascontiguousarray(rows.reshape(-1, count, 3).transpose(1, 0, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelParts:
+    """What a model file holds; ``assemble`` makes the HeadModel of it."""
+
+    name: str
+    licence: str
+    source: str
+    notice: str
+    subjects: Mapping[str, int]
+    mean: Float[np.ndarray, "V0 3"]
+    modes: Float[np.ndarray, "M V0 3"]
+    sigma: Float[np.ndarray, " M"]
+    landmarks: Mapping[str, int]
+    faces: Int[np.ndarray, "F 3"]  # of the cage
+    face_region: Bool[np.ndarray, " V0"]
+    subdivisions: int
+    decimated: Mapping[str, tuple[Int[np.ndarray, " K"], Int[np.ndarray, "G 3"]]]  # rows of full, faces
+    figures: Mapping[str, float] = field(default_factory=dict)
+    scores: Float[np.ndarray, "N M"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+
+
+def assemble(parts: ModelParts, sha256: str) -> HeadModel:
+    """The model in memory: operators, borders and landmarks of every level; arrays become read-only."""
+    count = len(parts.mean)
+    full, full_faces = refine(parts.faces, count, parts.subdivisions)
+    region = full @ parts.face_region.astype(float) > 0.5
+    index = {
+        "full": (np.arange(row_count(full)), full_faces),
+        "cage": (np.arange(count), parts.faces),
+        **parts.decimated,
+    }
+    levels = {}
+    for name, (rows, faces) in index.items():
+        # the cage is a level of its own (control points), not rows of the full one
+        operator = sparse.csr_array(sparse.identity(count, format="csr")) if name == "cage" else full
+        operator = operator if name in ("full", "cage") else sparse.csr_array(full[rows])
+        levels[name] = _level(faces, operator, region[rows], rows, parts.landmarks)
+    return HeadModel(
+        name=parts.name,
+        licence=parts.licence,
+        source=parts.source,
+        notice=parts.notice,
+        sha256=sha256,
+        subjects=dict(parts.subjects),
+        mean=_frozen(np.asarray(parts.mean, np.float32)),
+        modes=_frozen(np.asarray(parts.modes, np.float32)),
+        sigma=_frozen(np.asarray(parts.sigma, np.float32)),
+        landmarks=dict(parts.landmarks),
+        levels=levels,
+        figures=dict(parts.figures),
+        scores=_frozen(np.asarray(parts.scores, np.float32)),
+    )
+
+
+def _level(
+    faces: np.ndarray, operator: sparse.csr_array, region: np.ndarray, rows: np.ndarray, landmarks: Mapping[str, int]
+) -> Level:
+    place = {int(row): k for k, row in enumerate(rows)} if len(rows) < 30_000 else {v: v for v in landmarks.values()}
+    return Level(
+        faces=_frozen(np.asarray(faces, np.int32)),
+        operator=operator,
+        face_region=_frozen(np.asarray(region, bool)),
+        boundary=_frozen(boundary_vertices(faces, row_count(operator))),
+        landmarks={name: place[v] for name, v in landmarks.items() if v in place},
+        rows=_frozen(np.asarray(rows, np.int32)),
+    )
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array = array.view()
+    array.flags.writeable = False
+    return array
+
+
+def save_model(path: Path, parts: ModelParts) -> None:
+    """Write a model file (npz, compressed; float32, rounded to 2^-10 mm so that it packs small)."""
+    meta = {
+        "format": FORMAT,
+        "name": parts.name,
+        "licence": parts.licence,
+        "source": parts.source,
+        "notice": parts.notice,
+        "subjects": dict(parts.subjects),
+        "landmarks": {k: int(v) for k, v in parts.landmarks.items()},
+        "subdivisions": parts.subdivisions,
+        "figures": {k: round(float(v), 6) for k, v in parts.figures.items()},
+    }
+    arrays = {
+        "meta": np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8),
+        "mean": _rounded(parts.mean),
+        "modes": _rounded(parts.modes),
+        "sigma": np.asarray(parts.sigma, np.float32),
+        "faces": np.asarray(parts.faces, np.int32),
+        "face_region": np.packbits(parts.face_region),
+        "scores": np.asarray(parts.scores, np.float32),
+    }
+    for name, (rows, faces) in parts.decimated.items():
+        arrays[f"{name}_rows"], arrays[f"{name}_faces"] = np.asarray(rows, np.int32), np.asarray(faces, np.int32)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    part.replace(path)
+
+
+def _rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
+    return (np.round(np.asarray(values, float) * 1024) / 1024).astype(np.float32)
+
+
+def read_parts(path: Path) -> tuple[ModelParts, str]:
+    """The content of a model file and its SHA-256. Raises BadModel."""
+    try:
+        raw = path.read_bytes()
+    except OSError as fault:
+        raise BadModel(path, fault.strerror or "cannot be read") from None
+    try:
+        with np.load(BytesIO(raw), allow_pickle=False) as file:
+            if "meta" not in file:
+                raise BadModel(path, "it does not carry this project's model format")
+            meta = json.loads(file["meta"].tobytes())
+            if meta.get("format") != FORMAT:
+                raise BadModel(path, f"format {meta.get('format')!r}, wanted {FORMAT!r}")
+            parts = _parts(meta, file)
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
+        raise BadModel(path, f"damaged or incomplete ({fault})") from None
+    return parts, hashlib.sha256(raw).hexdigest()
+
+
+def _parts(meta: dict, file: Mapping[str, np.ndarray]) -> ModelParts:
+    mean = file["mean"]
+    return ModelParts(
+        name=meta["name"],
+        licence=meta["licence"],
+        source=meta["source"],
+        notice=meta["notice"],
+        subjects=meta["subjects"],
+        mean=mean,
+        modes=file["modes"],
+        sigma=file["sigma"],
+        landmarks=meta["landmarks"],
+        faces=file["faces"],
+        face_region=np.unpackbits(file["face_region"], count=len(mean)).astype(bool),
+        subdivisions=meta["subdivisions"],
+        decimated={name: (file[f"{name}_rows"], file[f"{name}_faces"]) for name in ("p95", "p99")},
+        figures=meta["figures"],
+        scores=file["scores"],
+    )
+
+
+def models_folder() -> Path:
+    """Where a user's own models live: ``EIGENHEAD_MODELS``, or ~/.local/share/eigenhead/models."""
+    given = os.environ.get("EIGENHEAD_MODELS")
+    return Path(given) if given else Path.home() / ".local" / "share" / "eigenhead" / "models"
+
+
+def list_models() -> dict[str, Path]:
+    """Models at hand by name: the shipped default and the files of the user's folder."""
+    found = {DEFAULT: PACKS / _PACK_FILES[DEFAULT]}
+    folder = models_folder()
+    if folder.is_dir():
+        found |= {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    return found
+
+
+def model_path(name_or_path: str | Path) -> Path:
+    """The file behind a name or path. Raises UnknownModel."""
+    name = str(name_or_path)
+    if name in _PACK_FILES:
+        return PACKS / _PACK_FILES[name]
+    named = list_models().get(name)
+    if named is not None:
+        return named
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    raise UnknownModel(name)
+
+
+def load_model(name_or_path: str | Path = "default") -> HeadModel:
+    """The named model (shipped, or in the user's folder) or the one in a file. Raises UnknownModel or BadModel."""
+    parts, sha256 = read_parts(model_path(name_or_path))
+    return assemble(parts, sha256)
+
+
+def with_modes(model: HeadModel, count: int) -> HeadModel:
+    """The same model with only its first ``count`` modes."""
+    return replace(
+        model, modes=model.modes[:count], sigma=model.sigma[:count], scores=model.scores[:, :count], _bases={}
+    )

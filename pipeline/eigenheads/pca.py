@@ -1,0 +1,87 @@
+"""Alignment of corresponded heads and their principal components (sections 3.1 and 3.2, last step).
+
+Alignment is a rigid Procrustes analysis *without* scale: rigs are metric, and size is a mode of the population
+(figure 2, first mode). Departure from the paper, which does not say: the mean is re-estimated until it settles
+(generalised Procrustes, Gower 1975), so that no single reference head is favoured.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Components:
+    """mean + scores @ modes gives the heads back. Modes are mm per standard deviation and orthogonal."""
+
+    mean: Float[np.ndarray, "V 3"]
+    modes: Float[np.ndarray, "M V 3"]
+    sigma: Float[np.ndarray, " M"]  # sqrt of the eigenvalue of the covariance (1 / (N - 1)), mm
+    scores: Float[np.ndarray, "N M"]  # standard deviations
+
+
+def rigid_fit(
+    source: Float[np.ndarray, "V 3"], target: Float[np.ndarray, "V 3"], weights: Float[np.ndarray, " V"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+    """R, t that minimise sum w |R source + t - target|² (Kabsch 1976; no reflection)."""
+    w = weights / weights.sum()
+    source_centre, target_centre = w @ source, w @ target
+    u, _, vt = np.linalg.svd(((source - source_centre) * w[:, None]).T @ (target - target_centre))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    rotation = (vt.T * sign) @ u.T
+    return rotation, target_centre - rotation @ source_centre
+
+
+def align(
+    heads: Float[np.ndarray, "N V 3"], weights: Float[np.ndarray, " V"], *, rounds: int = 10
+) -> Float[np.ndarray, "N V 3"]:
+    """Every head moved rigidly onto the common mean, which keeps the pose and place of the first head."""
+    aligned, mean = heads.copy(), heads[0]
+    first = heads[0]
+    for _ in range(rounds):
+        for k, head in enumerate(heads):
+            rotation, translation = rigid_fit(head, mean, weights)
+            aligned[k] = head @ rotation.T + translation
+        new = aligned.mean(0)
+        rotation, translation = rigid_fit(new, first, weights)  # else the mean drifts with the first estimates
+        new = new @ rotation.T + translation
+        settled = np.abs(new - mean).max() < 1e-6
+        mean = new
+        if settled:
+            break
+    return aligned
+
+
+def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
+    """N - 1 components of N aligned heads. The sign of a mode makes its largest entry positive: builds repeat."""
+    count, vertices = heads.shape[:2]
+    flat = heads.reshape(count, -1).astype(float)
+    mean = flat.mean(0)
+    # the N x N Gram matrix is far smaller than the 3V x 3V covariance and has the same non-zero spectrum
+    centred = flat - mean
+    values, vectors = np.linalg.eigh(centred @ centred.T / (count - 1))
+    order = np.argsort(values)[::-1][: count - 1]
+    values, vectors = np.maximum(values[order], 0), vectors[:, order]
+    keep = values > values[0] * 1e-12
+    sigma = np.sqrt(values[keep])
+    units = centred.T @ vectors[:, keep] / (sigma * np.sqrt(count - 1))
+    units *= np.sign(units[np.abs(units).argmax(0), np.arange(units.shape[1])])
+    modes = (units * sigma).T.reshape(-1, vertices, 3)
+    return Components(mean.reshape(-1, 3), modes, sigma, (centred @ units) / sigma)
+
+
+def orthogonalised(modes: Float[np.ndarray, "M V 3"]) -> tuple[Float[np.ndarray, "M V 3"], Float[np.ndarray, " M"]]:
+    """Orthogonal modes with exactly the same distribution of heads, and their sigma.
+
+    For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so U S spans the same Gaussian: no
+    variance is lost or moved, only the axes turn.
+    """
+    count, vertices = modes.shape[:2]
+    flat = modes.reshape(count, -1).astype(float)
+    values, vectors = np.linalg.eigh(flat @ flat.T)
+    order = np.argsort(values)[::-1]
+    keep = order[values[order] > values[order[0]] * 1e-12]
+    turned = vectors[:, keep].T @ flat
+    turned *= np.sign(turned[np.arange(len(turned)), np.abs(turned).argmax(1)])[:, None]
+    return turned.reshape(-1, vertices, 3), np.sqrt(values[keep])

@@ -1,0 +1,105 @@
+"""Raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) with a landmark file of the same name beside it.
+
+Landmarks: ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top), MeshLab's picked points
+``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label that covers one point names it). Names are the 26 of
+landmarks.py; case, blanks and hyphens do not matter.
+"""
+
+import json
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.eigenheads.landmarks import NAMES
+from rig.errors import InputError
+from rig.mesh_files import read_mesh
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb")
+LANDMARK_SUFFIXES = (".json", ".pp", ".ljson")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One head as a scanner delivers it: any vertex count, holes, its own frame; landmarks in the same frame."""
+
+    name: str
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]]
+
+
+def find_scans(folder: Path) -> list[Path]:
+    """Mesh files of a folder, by name. Raises InputError where there is none."""
+    found = sorted(p for p in folder.glob("*") if p.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
+    if not found:
+        raise InputError(str(folder), ["holds no .ply, .obj or .glb scans"])
+    return found
+
+
+def read_scan(path: Path) -> Scan:
+    """A scan with its landmarks. Raises InputError."""
+    mesh = read_mesh(path)
+    beside = [path.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES]
+    given = next((p for p in beside if p.is_file()), None)
+    if given is None:
+        raise InputError(path.name, [f"has no landmarks beside it ({', '.join(p.name for p in beside)})"])
+    return Scan(path.stem, mesh.vertices, mesh.faces, read_landmarks(given))
+
+
+def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
+    """Landmarks by our names; other points of the file are left out. Raises InputError."""
+    readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
+    try:
+        named = readers[path.suffix.lower()](path.read_text(encoding="utf-8"))
+        points = {plain_name(name): np.array(point, float) for name, point in named.items()}
+    except (ValueError, KeyError, TypeError, AttributeError, ElementTree.ParseError) as fault:
+        raise InputError(
+            path.name, [f"is no landmark file that can be read ({type(fault).__name__}: {fault})"]
+        ) from None
+    known = {name: point for name, point in points.items() if name in NAMES}
+    bad = [name for name, point in known.items() if point.shape != (3,) or not np.isfinite(point).all()]
+    if bad:
+        raise InputError(path.name, [f"{name} is no point of three finite numbers" for name in bad])
+    return known
+
+
+def write_landmarks(path: Path, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> None:
+    """The ``.json`` form."""
+    points = {name: [round(float(x), 4) for x in point] for name, point in landmarks.items()}
+    path.write_text(json.dumps({"format": "eigenhead-landmarks/1", "points": points}, indent=1), encoding="utf-8")
+
+
+def plain_name(name: str) -> str:
+    """Lower case with underscores."""
+    return "_".join(name.strip().lower().replace("-", " ").replace("_", " ").split())
+
+
+def _from_json(text: str) -> Mapping[str, list[float]]:
+    content = json.loads(text)
+    return content.get("points", {k: v for k, v in content.items() if isinstance(v, list)})
+
+
+def _from_pp(text: str) -> Mapping[str, list[float]]:
+    root = ElementTree.fromstring(text)
+    return {
+        point.attrib["name"]: [float(point.attrib[axis]) for axis in "xyz"]
+        for point in root.iter("point")
+        if point.attrib.get("active", "1") != "0"
+    }
+
+
+def _from_ljson(text: str) -> Mapping[str, list[float]]:
+    content = json.loads(text)
+    if content["version"] == 1:
+        groups = [(g["label"], [p["point"] for p in g["landmarks"]]) for g in content["groups"]]
+        return {label: points[0] for label, points in groups if len(points) == 1}
+    groups = [content] if content["version"] == 2 else list(content["groups"].values())
+    out: dict[str, list[float]] = {}
+    for group in groups:
+        points = group["landmarks"]["points"]
+        out |= {label["label"]: points[label["mask"][0]] for label in group["labels"] if len(label["mask"]) == 1}
+    return out

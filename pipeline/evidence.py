@@ -1,0 +1,80 @@
+"""How well a fitted head explains every camera: the figures of the report."""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.fit import Fit
+from pipeline.fitting.rim import find_rim, make_topology, pack_views
+from pipeline.reconstruction import CameraFigures
+from pipeline.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
+from rig.camera import Camera
+from rig.geometry import Similarity
+from rig.layout import Rig
+
+EXCLUDED_PX = 3.0  # a rim sample farther from the input than this is clutter or misfit, and hardly counts in the fit
+ZONE_MARGIN_PX = 4  # how far the face's zone reaches beyond its own hull, so that a face that is too large shows
+
+Masks = Mapping[str, Bool[np.ndarray, "h w"]]
+
+
+def camera_figures(
+    model: HeadModel,
+    fit: Fit,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    fitted: Masks,
+    started: Masks,
+) -> dict[str, CameraFigures]:
+    """Figures of every camera, in the rig's order; rim figures over the face region, none trimmed.
+
+    The cameras stand where their calibration says, not where the fit has moved them.
+    """
+    level = model.levels["full"]
+    vertices = fit.world_from_head.apply(model.vertices(fit.coefficients))
+    views = pack_views(rig, {camera.name: silhouettes[camera.name].distance for camera in rig})
+    rim = find_rim(make_topology(level.faces, level.face_region), vertices, views)
+    face = vertices[level.face_region]
+    figures = {}
+    for k, camera in enumerate(rig):
+        here = rim.view == k
+        length, residual = rim.length[here], rim.residual[here]
+        observed, spoke = silhouettes[camera.name].mask, float(length.sum()) > 0
+        weights = boundary_weights(observed)
+        figures[camera.name] = CameraFigures(
+            used=fit.used.get(camera.name, False),
+            iou=_overlap(observed, fitted[camera.name], _zone(camera, face)),
+            contour_rms_px=float(np.sqrt((length @ residual**2) / length.sum())) if spoke else None,
+            excluded_share=float(length[np.abs(residual) > EXCLUDED_PX].sum() / length.sum()) if spoke else None,
+            xor_cost=boundary_weighted_xor(observed, fitted[camera.name], weights),
+            xor_cost_start=boundary_weighted_xor(observed, started[camera.name], weights),
+            samples=int(here.sum()),
+        )
+    return figures
+
+
+def _zone(camera: Camera, face_world: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "h w"]:
+    """The hull of the face in the image, a little wider: where hair and shoulders do not decide."""
+    zone = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+    pixels = camera.project(face_world)
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    if len(pixels) > 2:
+        cv2.fillConvexPoly(zone, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
+    size = 2 * ZONE_MARGIN_PX + 1
+    return cv2.dilate(zone, np.ones((size, size), np.uint8)) > 0
+
+
+def _overlap(
+    observed: Bool[np.ndarray, "h w"], fitted: Bool[np.ndarray, "h w"], zone: Bool[np.ndarray, "h w"]
+) -> float | None:
+    """Intersection over union inside the zone."""
+    union = np.count_nonzero((observed | fitted) & zone)
+    return float(np.count_nonzero(observed & fitted & zone) / union) if union else None
+
+
+def start_vertices(model: HeadModel, world_from_head: Similarity) -> Float[np.ndarray, "v 3"]:
+    """The mean head where the alignment put it."""
+    return world_from_head.apply(model.vertices(np.zeros(0)))

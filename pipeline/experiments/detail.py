@@ -1,0 +1,334 @@
+"""Beyond the span: eigenheads alone, with kernel modes, and with photographs, side by side with a visual hull.
+
+Every figure is of the whole reconstruction from photographs: own masks, own alignment, calibration as given. Distances
+are from the true face region, weighted by area, to the surface as delivered, with no realignment. Subjects:
+
+- captures with a truth beside them (``<name>`` and ``<name>.truth``), rendered by another program;
+- random heads of another population, all its modes, photographed in the simulated studio;
+- random heads of the model's own 60 modes in the same studio, which the span can hold: what does more freedom cost?
+
+Beside the errors: each camera held out and predicted from the others, a bumped camera and a wrong mask, and how many
+true vertices the posterior's 95 % intervals hold along the normal.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.eigenheads.closest import SurfaceIndex
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.surface import vertex_areas
+from pipeline.experiments.records import Records, Row
+from pipeline.experiments.span import weighted_quantile
+from pipeline.fitting.fit import Fit
+from pipeline.fitting.posterior import vertex_deviation_mm
+from pipeline.fitting.rim import find_rim, make_topology, pack_views
+from pipeline.reconstruct import align, basis, fit_head, front_camera, without_moved_cameras
+from pipeline.segmentation import segment
+from pipeline.settings import Settings, document_from_settings
+from pipeline.silhouette import Silhouette, silhouette_from_mask
+from pipeline.texture import texture
+from pipeline.visual_hull import visual_hull
+from pipeline.zbuffer import camera_depths, interpolate, rasterise
+from rig.camera import Camera
+from rig.capture import Capture, read_capture
+from rig.errors import InputError
+from rig.layout import Rig
+from rig.mesh import Mesh
+from rig.mesh_files import read_mesh
+from rig.render.renderer import Renderer
+from rig.studio.faults import Fault
+from rig.studio.layout import default_layout
+from rig.studio.preset import PRESET
+from rig.studio.simulate import simulate
+from rig.studio.subject import Subject
+
+Report = Callable[[str, float], None]
+Level = Literal["span", "kernel", "photo"]
+LEVELS: tuple[Level, ...] = ("span", "kernel", "photo")
+IN_SPAN_MODES, IN_SPAN_SPREAD = 60, 0.8  # section 5.2
+FAULTS = {"bumped": Fault("bumped", "cam03", 0.1), "wrong-mask": Fault("wrong-mask", "cam03")}
+FAR_MM = 8.0  # along a normal nothing is looked for beyond
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """A capture whose true surface is known."""
+
+    name: str
+    capture: Capture
+    rig: Rig
+    mesh: Mesh  # world frame
+    face: Bool[np.ndarray, " v"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """What one level of detail made of a capture."""
+
+    fit: Fit
+    model: HeadModel  # with the modes that the fit has
+    level: str
+    seconds: float
+
+    def mesh(self) -> Mesh:
+        vertices = self.fit.world_from_head.apply(self.model.vertices(self.fit.coefficients))
+        return Mesh(vertices, self.model.levels["full"].faces)
+
+
+def run(
+    models: Mapping[str, HeadModel],
+    captures: Mapping[str, Path],
+    *,
+    renderer: Renderer,
+    report: Report,
+    others: HeadModel | None = None,
+    draws: int = 20,
+    in_span: int = 10,
+    held_out: bool = True,
+    folder: Path | None = None,
+) -> dict[str, Any]:
+    """``{"figures": {...}, "rows": [...]}``; ``figures`` is flat, ``<subject>_<model>_<level>_<quantity>``.
+
+    ``models``: by the name that the figures carry; the first one is used for draws, faults and held-out cameras.
+    ``captures``: folders with a truth beside them. ``others``: the population that the draws come from. Rows are kept
+    in ``folder`` and not computed again.
+    """
+    records = Records(folder, "detail", _key(models, others))
+    label, model = next(iter(models.items()))
+    jobs: list[Job] = []
+    for name, path in captures.items():
+        for other, with_model in models.items():
+            jobs.append((f"{name}_{other}", partial(known_row, partial(read_known, path), with_model, renderer)))
+        jobs.append((f"{name}_hull", partial(hull_row, partial(read_known, path))))
+    if others is not None:
+        drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer)
+        jobs += [(f"draw-{i:02}_{label}", partial(known_row, partial(drawn, i), model, renderer)) for i in range(draws)]
+        for kind, fault in FAULTS.items() if draws else ():
+            jobs.append((f"{kind}_{label}", partial(known_row, partial(drawn, 0, fault=fault), model, renderer)))
+    own = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer)
+    jobs += [(f"inspan-{i:02}_{label}", partial(known_row, partial(own, i), model, renderer)) for i in range(in_span)]
+    for name, path in captures.items() if held_out else ():
+        for camera in read_capture(path)[1].names:
+            compute = partial(held_out_row, path, camera, model, renderer)
+            jobs.append((f"heldout-{name}-{camera}_{label}", compute))
+    rows = []
+    for done, (name, compute) in enumerate(jobs):
+        report(name, done / len(jobs))
+        rows.append({"name": name, **records.row(name, compute)})
+    report("done", 1.0)
+    return {"figures": figures(rows), "rows": rows}
+
+
+Job = tuple[str, Callable[[], Row]]
+
+
+def read_known(folder: Path) -> Known:
+    """A capture folder and the truth beside it. Raises InputError."""
+    capture, rig = read_capture(folder)
+    truth = folder.with_name(folder.name + ".truth")
+    return Known(folder.name, capture, rig, read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy"))
+
+
+def photographed(
+    population: HeadModel,
+    modes: int,
+    spread: float,
+    seed: int,
+    *,
+    renderer: Renderer,
+    fault: Fault | None = None,
+) -> Known:
+    """A random head in the simulated studio. The same seed makes the same head, look and pose, whatever the fault."""
+    rng = np.random.default_rng((9, seed))
+    coefficients = spread * rng.standard_normal(modes)
+    level = population.levels["full"]
+    head = Mesh(population.vertices(coefficients), level.faces)
+    marks = {name: head.vertices[row] for name, row in population.landmarks.items()}
+    subject = Subject(head, marks, level.face_region, f"seed-{seed}")
+    faults = () if fault is None else (fault,)
+    shot = simulate(subject, default_layout(), PRESET, rng, renderer=renderer, faults=faults)
+    return Known(subject.name, shot.capture, shot.rig, shot.scene.head, level.face_region)
+
+
+def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
+    """Every level of detail on one subject: ``{level: {quantity: value}}``."""
+    subject = known()
+    return {
+        level: {
+            "reached": fitted.level,
+            **surface_error(subject, fitted.mesh()),
+            **posterior_cover(subject, fitted),
+            "fit_s": fitted.seconds,
+        }
+        for level, fitted in every_level(subject.capture, subject.rig, model, LEVELS, renderer).items()
+    }
+
+
+def every_level(
+    capture: Capture, rig: Rig, model: HeadModel, levels: tuple[Level, ...], renderer: Renderer
+) -> dict[Level, Fitted]:
+    """``reconstruct``'s own steps, masks and alignment made once for all levels."""
+    settings = Settings()
+    silhouettes = segment(capture, rig, settings.segmentation, report=_silent)
+    silhouettes, _ = without_moved_cameras(silhouettes, rig)
+    wide = basis(model, settings)
+    start, _ = align(wide, capture, silhouettes, rig, settings, front_camera(rig, settings), _silent)
+    found = {}
+    for level in levels:
+        asked = replace(settings, detail=level)
+        began = time.perf_counter()
+        fit, deep, detail = fit_head(basis(model, asked), start, capture, silhouettes, rig, asked, renderer, _silent)
+        found[level] = Fitted(fit, deep, detail.level, time.perf_counter() - began)
+    return found
+
+
+def _silent(stage: str, fraction: float) -> None:
+    pass
+
+
+def hull_row(known: Callable[[], Known]) -> Row:
+    subject = known()
+    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=_silent)
+    return {"hull": surface_error(subject, visual_hull(silhouettes, subject.rig))}
+
+
+def surface_error(known: Known, found: Mesh) -> dict[str, float]:
+    """Distances (mm) of the true face to the found surface, weighted by area."""
+    distances = SurfaceIndex(found.vertices, found.faces, 1.0).closest(known.mesh.vertices[known.face]).distances
+    areas = vertex_areas(known.mesh.vertices, known.mesh.faces)[known.face]
+    return {
+        "median_mm": weighted_quantile(distances, areas, 0.5),
+        "mean_mm": float(distances @ areas / areas.sum()),
+        "p95_mm": weighted_quantile(distances, areas, 0.95),
+    }
+
+
+def posterior_cover(known: Known, fitted: Fitted) -> dict[str, float]:
+    """Share of the face's vertices whose 95 % interval along the normal holds the true surface."""
+    mesh = fitted.mesh()
+    rows = np.flatnonzero(fitted.model.levels["full"].face_region)[::5]
+    deviation = vertex_deviation_mm(fitted.model, fitted.fit)[rows]
+    across, found = along_normal(known, mesh.vertices[rows], mesh.normals()[rows])
+    inside = np.abs(across[found]) < 1.96 * deviation[found]
+    return {"cover_95": float(inside.mean()), "deviation_mm": float(np.median(deviation))}
+
+
+def along_normal(
+    known: Known, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Signed distance (mm) along each normal to the true face, and where there is one."""
+    kept = known.face[known.mesh.faces].all(axis=1)
+    index = SurfaceIndex(known.mesh.vertices, known.mesh.faces[kept], 1.0)
+    across = np.zeros(len(points))
+    for _ in range(4):
+        place = points + across[:, None] * normals
+        hit = index.closest(place)
+        slope = np.einsum("nc,nc->n", hit.normals, normals)
+        step = np.einsum("nc,nc->n", hit.points - place, hit.normals) / np.maximum(slope, 0.3)
+        across = np.clip(across + step, -FAR_MM, FAR_MM)
+    end = index.closest(points + across[:, None] * normals)
+    return across, (end.distances < 0.1) & (np.abs(across) < FAR_MM)
+
+
+def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) -> Row:
+    """Fit with all cameras but one, and predict that one: contour RMS over the face's rim against the true outline of
+    the bare head (a photograph's own outline is hair), PSNR over the face."""
+    capture, rig = read_capture(path)
+    settings = Settings()
+    silhouettes = segment(capture, rig, settings.segmentation, report=_silent)
+    bare = bare_head(path, camera)
+    rest = rig.subset(other for other in rig.names if other != camera)
+    found: Row = {}
+    for level, fitted in every_level(_without(capture, camera), rest, model, ("span", "photo"), renderer).items():
+        mesh, full = fitted.mesh(), model.levels["full"]
+        seen = {name: silhouettes[name] for name in rest.names}
+        coloured = texture(mesh, mesh.normals(), capture, seen, rest, settings.texture, renderer=renderer)
+        views = pack_views(rig.subset([camera]), {camera: bare.distance})
+        rim = find_rim(make_topology(full.faces, full.face_region), mesh.vertices, views)
+        found[level] = {
+            "contour_rms_px": float(np.sqrt((rim.length @ rim.residual**2) / max(float(rim.length.sum()), 1e-9))),
+            "psnr_db": colour_psnr(
+                rig[camera], capture.images[camera], mesh, coloured.colours, full.face_region, silhouettes[camera].mask
+            ),
+        }
+    return found
+
+
+def bare_head(path: Path, camera: str) -> Silhouette:
+    """The true outline without hair and clothes. Raises InputError."""
+    file = path.with_name(path.name + ".truth") / "head_silhouettes" / f"{camera}.png"
+    mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise InputError(path.name, [f"{file.name} of head_silhouettes is missing"])
+    return silhouette_from_mask(mask > 0)
+
+
+def _without(capture: Capture, camera: str) -> Capture:
+    return replace(
+        capture,
+        images={name: image for name, image in capture.images.items() if name != camera},
+        backgrounds={name: plates for name, plates in capture.backgrounds.items() if name != camera},
+        masks={name: mask for name, mask in capture.masks.items() if name != camera},
+        features={
+            mark: {name: pixel for name, pixel in seen.items() if name != camera}
+            for mark, seen in capture.features.items()
+        },
+    )
+
+
+def colour_psnr(
+    camera: Camera,
+    image: UInt8[np.ndarray, "h w 3"],
+    mesh: Mesh,
+    colours: UInt8[np.ndarray, "v 3"],
+    face: Bool[np.ndarray, " v"],
+    mask: Bool[np.ndarray, "h w"],
+) -> float:
+    """dB between a photograph and the coloured mesh over the pixels of the face, after one gain a channel: cameras
+    differ in exposure, and a camera that was left out has none."""
+    pixels, depths = camera.project(mesh.vertices), camera_depths(camera, mesh.vertices)
+    _, seen = rasterise(pixels, depths, mesh.faces, *image.shape[:2])
+    drawn = interpolate(seen, pixels, depths, mesh.faces, colours.astype(np.float32))
+    shown = (seen >= 0) & np.all(face[mesh.faces], axis=1)[np.maximum(seen, 0)] & mask
+    ours, theirs = drawn[shown].astype(float), image[shown].astype(float)
+    gain = (ours * theirs).sum(axis=0) / (ours**2).sum(axis=0)
+    return float(10.0 * np.log10(255.0**2 / ((gain * ours - theirs) ** 2).mean()))
+
+
+def figures(rows: list[Row]) -> dict[str, float]:
+    """Of a subject its own values; of draws, in-span heads and held-out cameras means and worst ones."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        subject, _, label = row["name"].rpartition("_")
+        kind = subject.split("-")[0]
+        group = {"draw": "draws", "inspan": "inspan", "heldout": "heldout"}.get(
+            kind if subject[-1].isdigit() else "", subject
+        )
+        for level, quantities in row.items():
+            if isinstance(quantities, Mapping):
+                for quantity, value in quantities.items():
+                    if isinstance(value, int | float):
+                        values.setdefault(f"{group}_{label}_{level}_{quantity}", []).append(float(value))
+    found = {}
+    for name, of in values.items():
+        found[name] = round(float(np.mean(of)), 4)
+        if len(of) > 1:
+            found[f"{name}_largest"], found[f"{name}_smallest"] = round(max(of), 4), round(min(of), 4)
+    return found
+
+
+def _key(models: Mapping[str, HeadModel], others: HeadModel | None) -> str:
+    """What the rows depend on beside their names."""
+    parts = {name: model.sha256 for name, model in models.items()} | {"others": others.sha256 if others else ""}
+    parts["settings"] = json.dumps(document_from_settings(Settings()), sort_keys=True)
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,31 @@
+"""Rows of long experiments, kept as they come, so that a run that was stopped goes on where it was."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rig.files import write_atomically
+
+Row = dict[str, Any]
+
+
+class Records:
+    """Rows by key in one JSON file; ``None`` as a folder keeps them in memory alone."""
+
+    def __init__(self, folder: Path | None, name: str, key: str) -> None:
+        """``key`` names all that the rows depend on (model, settings, code version): another key starts anew."""
+        self._path = None if folder is None else folder / f"{name}.json"
+        self._key = key
+        self._rows: dict[str, Row] = {}
+        if self._path is not None and self._path.is_file():
+            kept = json.loads(self._path.read_text())
+            self._rows = kept["rows"] if kept.get("key") == key else {}
+
+    def row(self, name: str, compute: Callable[[], Row]) -> Row:
+        """The kept row, or the computed one, kept from now on."""
+        if name not in self._rows:
+            self._rows[name] = compute()
+            if self._path is not None:
+                write_atomically(self._path, json.dumps({"key": self._key, "rows": self._rows}).encode())
+        return self._rows[name]

@@ -1,0 +1,28 @@
+"""What a solver returns; the same for both."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.geometry import Similarity
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A head that fits the silhouettes.
+
+    ``coefficients`` are in standard deviations, z ~ N(0, 1). ``covariance`` is over (coefficients, rotation (rad, left
+    perturbation about the head's place in the world), translation (mm), log scale); None where a solver has none.
+    """
+
+    method: str
+    coefficients: Float[np.ndarray, " m"]
+    world_from_head: Similarity
+    evaluations: int
+    stopped_because: str
+    covariance: Float[np.ndarray, "p p"] | None = None
+    misfit_mm: Float[np.ndarray, " v0"] | None = None  # by cage vertex: relief that no mode follows
+    used: Mapping[str, bool] = field(default_factory=dict)  # by camera: did it speak?
+    camera_shift: Mapping[str, Float[np.ndarray, " 6"]] = field(default_factory=dict)  # left perturbation, rad and mm

@@ -1,0 +1,97 @@
+"""Photographs as evidence inside the outline, in the contour solver's own problem.
+
+Enters: a solved contour problem and the photographs. Leaves: the same problem with a finer basis and with observations
+of the surface, solved again. Three rounds, coarse to fine: each patch of the current surface (``patches``) moves along
+its normals through the images of the cameras that see it; where its views look most alike, the surface is said to be
+(``consistency``), and how far the views would rather slide says where the cameras are (``registration``). No peak
+inside the reach, or a low one (occluded, specular, textureless), is silence, and so is hair (``hairline``). The
+observations enter the normal equations beside rims, features and priors (``surface``), robustly; where they are silent
+the kernels carry on smoothly.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.eigenheads.kernel import with_fine_kernel
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.consistency import Round, hair_patches, look, observe
+from pipeline.fitting.contour import Problem, Solved, Stage, State, level_basis, run_stage
+from pipeline.fitting.patches import Patches, make_patches
+from pipeline.fitting.photographs import load_photographs
+from pipeline.fitting.surface import surface_residual
+from pipeline.reconstruction import Detail
+from pipeline.settings import PhotoSettings
+
+ROUNDS = (Round(3.0, 0.8, 4.0, 17), Round(2.5, 0.55, 2.0, 13), Round(2.0, 0.45, 1.0, 9))
+RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
+LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is the full level's anyway
+VIEWS_LEAST = 3
+NEIGHBOURS, NEAR_MM = 24, 4.0  # patches about a vertex: two windows
+LOST_MM = 2.5  # off by at least that where nothing matches: what two photographs still recognise
+MISFIT_FACTOR = 1.1  # chosen so that 95 % intervals hold 90 to 98 % of two scans and two draws, by two populations
+
+
+def refine_with_photographs(
+    solved: Solved, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], settings: PhotoSettings
+) -> tuple[Solved, Detail]:
+    """Goes on from the contours' solution with what the photographs show inside the outline, in a finer basis.
+
+    Where they show too little, the solution is left as it is; the second value says which and why.
+    """
+    problem = solved.problem
+    photographs = load_photographs(images, problem.views)
+    speaking = int(np.count_nonzero(photographs.speaks))
+    if speaking < VIEWS_LEAST:
+        why = f"{speaking} of {len(problem.views.names)} views have a photograph with texture, {VIEWS_LEAST} are needed"
+        return solved, Detail("kernel", why)
+    model = with_fine_kernel(problem.model, length_mm=settings.fine_length_mm, amplitude_mm=settings.fine_amplitude_mm)
+    problem = widened(problem, model, (LEVEL,))
+    patches = patches_for(problem, settings)
+    stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
+    state, evaluations, reason, share = solved.state, solved.evaluations, solved.stopped_because, 0.0
+    silent, lost = None, np.zeros(0, int)
+    for each in ROUNDS:
+        looks = look(problem, state, patches, photographs.speaks, settings)
+        if silent is None:
+            silent = hair_patches(problem, state, patches, photographs, looks)
+        surface, lost = observe(problem, state, photographs, patches, looks, silent, each, settings)
+        share = len(surface.vertex) / max(len(patches.centre), 1)
+        if share < settings.least_share:
+            why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"
+            return solved, Detail("kernel", why)
+        problem = replace(problem, surface=surface)
+        state, used, reason = run_stage(problem, state, stage, lambda fraction: None)
+        evaluations += used
+    why = f"{share:.0%} of the face look alike in two or more of {speaking} photographs"
+    misfit = unfollowed(problem, state, lost)
+    return Solved(problem, state, stage, evaluations, reason, misfit), Detail("photo", why)
+
+
+def unfollowed(problem: Problem, state: State, lost: Int[np.ndarray, " u"]) -> Float[np.ndarray, " v0"]:
+    """How far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).
+
+    Where several cameras see a place (vertex ``lost``) and find no match within reach, it is off by more than they can
+    tell: eyes that the model has open and the subject closed. Nothing is said beyond the patches.
+    """
+    seen, model = problem.surface, problem.model
+    assert seen is not None
+    off, _ = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)
+    full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)
+    square = np.concatenate([np.minimum(np.abs(off), LOST_MM), np.full(len(lost), LOST_MM)]) ** 2
+    distance, near = KDTree(full[np.concatenate([seen.vertex, lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
+    weight = np.exp(-0.5 * (distance / NEAR_MM) ** 2)
+    return MISFIT_FACTOR * np.sqrt((weight * square[near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 0.1))
+
+
+def widened(problem: Problem, model: HeadModel, levels: tuple[str, ...]) -> Problem:
+    """The same problem with more modes, solved on ``levels``."""
+    return replace(problem, model=model, bases={name: level_basis(model, name) for name in levels})
+
+
+def patches_for(problem: Problem, settings: PhotoSettings) -> Patches:
+    radius = RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS)
+    return make_patches(problem.model, sample_mm=settings.sample_mm, centre_mm=settings.centre_mm, radius_mm=radius)

@@ -1,0 +1,115 @@
+"""The result folder of the contract, and the pictures beside it.
+
+    head.ply  head.glb  report.json  overlays/<camera>.png     fixed by the contract
+    contact_sheet.png   input, silhouette difference before and after the fit (section 5.4), the head from new views
+    turntable.png       the head from the right to the left profile
+    head.obj            on request
+
+Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.overlays import contact_sheet, difference, overlay, turntable
+from pipeline.reconstruction import Reconstruction
+from pipeline.report import report_document
+from pipeline.settings import document_from_settings
+from rig.capture import Capture, write_image
+from rig.files import write_atomically
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh
+from rig.mesh_files import obj_bytes, write_glb, write_ply
+
+SHEET_ROWS = 4  # cameras on the contact sheet
+
+
+def write_result(folder: Path, result: Reconstruction, capture: Capture, *, obj: bool = False) -> None:
+    """Writes every file of the result; each under a temporary name first. Raises OSError where the disk is full."""
+    head = head_mesh(result)
+    head_normals = result.normals @ result.fit.world_from_head.rotation
+    write_ply(
+        folder / "head.ply",
+        result.mesh_world,
+        normals=result.normals,
+        colours=result.colours,
+        quality=result.quality_mm.astype(np.float32),
+        views=result.views,
+        comments=ply_comments(result),
+    )
+    write_glb(folder / "head.glb", head, normals=head_normals, colours=result.colours)
+    if obj:
+        coloured = Mesh(result.mesh_world.vertices, result.mesh_world.faces, result.colours)
+        write_atomically(folder / "head.obj", obj_bytes(coloured))
+    _write_pictures(folder, result, capture, head)
+    text = json.dumps(report_document(result), indent=1, allow_nan=False)
+    write_atomically(folder / "report.json", text.encode())
+
+
+def head_mesh(result: Reconstruction) -> Mesh:
+    """The result mesh in the head frame, at its true size: the pose is undone, the scale is not, so that the GLB's
+    metres are metres."""
+    place = result.fit.world_from_head
+    head_from_world = RigidTransform(place.rotation, place.translation).inverse()
+    return Mesh(head_from_world.apply(result.mesh_world.vertices), result.mesh_world.faces, result.colours)
+
+
+def ply_comments(result: Reconstruction) -> list[str]:
+    """What the mesh is and what the job that made it was given: no ids, no times, so that the bytes repeat."""
+    return [
+        "unit mm",
+        "frame world",
+        f"model {_ascii(result.model_name)} sha256 {result.model_sha256}",
+        f"job inputs sha256 {document_sha256(result.digests)}",
+        f"job settings sha256 {document_sha256(document_from_settings(result.settings))}",
+        f"version eigenhead {version('eigenhead')}",
+        "quality is the posterior standard deviation in mm, views the number of images that coloured a vertex",
+    ]
+
+
+def document_sha256(document: Mapping[str, Any]) -> str:
+    """sha256 of the canonical JSON of a document."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _ascii(text: str) -> str:
+    """A PLY header is lines of ASCII."""
+    return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
+
+
+def _write_pictures(folder: Path, result: Reconstruction, capture: Capture, head: Mesh) -> None:
+    shown = [name for name in result.silhouettes if name in capture.images and name in result.fitted_masks]
+
+    def draw(name: str) -> None:
+        silhouette = result.silhouettes[name]
+        drawn = overlay(capture.images[name], silhouette.distance, result.fitted_masks[name], name)
+        write_image(folder / "overlays" / f"{name}.png", drawn)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # cv2 and NumPy release the interpreter lock
+        list(pool.map(draw, shown))
+    panels = turntable(head, result.colours)
+    write_image(folder / "turntable.png", np.hstack(panels))
+    write_image(folder / "contact_sheet.png", _sheet(result, capture, shown, panels))
+
+
+def _sheet(result: Reconstruction, capture: Capture, shown: list[str], panels: list[np.ndarray]) -> np.ndarray:
+    """A row a camera: the front one first, then others spread over the rig's order."""
+    others = [name for name in shown if name != result.front]
+    front = [result.front] if result.front in shown else []
+    spread = np.linspace(0, len(others) - 1, min(SHEET_ROWS - len(front), len(others))).round().astype(int)
+    views = np.linspace(len(panels) - 1, 0, SHEET_ROWS).round().astype(int)
+    rows = []
+    for name, view in zip(front + [others[i] for i in spread], views, strict=False):
+        image, observed = capture.images[name], result.silhouettes[name].mask
+        start = result.start_masks.get(name)
+        before = [] if start is None else [("before the fit", difference(image, observed, start))]
+        after = ("after the fit", difference(image, observed, result.fitted_masks[name]))
+        rows.append([(name, image), *before, after, ("", panels[view])])
+    return contact_sheet(rows or [[("", panel) for panel in panels]])

@@ -1,0 +1,126 @@
+"""Pictures of a result: input and fitted contour over each image, the contact sheet, the turntable strip.
+
+A contour is painted straight from a signed distance, ``alpha = half width + 1/2 - |d|``, so that it is antialiased and
+lies where the sub-pixel contour lies. Vermilion and sky blue are told apart by every kind of colour vision
+(Okabe and Ito, *Color Universal Design*,
+https://jfly.uni-koeln.de/color/); a dark rim keeps them readable on any image.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from pipeline.silhouette import signed_distance
+from pipeline.zbuffer import picture
+from rig.camera import Camera, Intrinsics
+from rig.geometry import look_at
+from rig.mesh import Mesh
+
+INPUT_COLOUR = (70, 215, 255)  # sky blue, a little lighter
+FITTED_COLOUR = (255, 110, 20)  # vermilion, a little lighter
+AZIMUTHS_DEG = (-80, -60, -40, -20, 0, 20, 40, 60, 80)
+PANEL = (480, 360)  # width and height of one panel of the contact sheet
+PAPER = (245, 245, 245)
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+
+
+def overlay(
+    image: ImageRgb, input_distance: Float32[np.ndarray, "h w"], fitted_mask: Bool[np.ndarray, "h w"], label: str = ""
+) -> ImageRgb:
+    """The image with the input contour (sky blue) and the fitted head's contour (vermilion)."""
+    line = max(1.0, 1.5 * image.shape[1] / 1024)
+    canvas = image.astype(np.float32)
+    contours = ((input_distance, INPUT_COLOUR), (_smooth_distance(fitted_mask), FITTED_COLOUR))
+    for distance, _ in contours:
+        _paint(canvas, distance, (0, 0, 0), line + 1.0, 0.45)
+    for distance, colour in contours:
+        _paint(canvas, distance, colour, line, 1.0)
+    painted = np.clip(np.round(canvas), 0, 255).astype(np.uint8)
+    entries = [(label, (255, 255, 255))] if label else []
+    return legend(painted, [*entries, ("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)])
+
+
+def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> ImageRgb:
+    """Eq. (4) as a picture: sky blue where only the input is, vermilion where only the model is, over a pale image."""
+    grey = image.mean(axis=2, dtype=np.float32, keepdims=True) * 0.35 + 150.0
+    canvas = np.repeat(grey, 3, axis=2)
+    canvas[observed & model] -= 60.0
+    for where, colour in ((observed & ~model, INPUT_COLOUR), (model & ~observed, FITTED_COLOUR)):
+        canvas[where] = 0.25 * canvas[where] + 0.75 * np.array(colour, np.float32)
+    return np.clip(np.round(canvas), 0, 255).astype(np.uint8)
+
+
+def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
+    """Lines of text in the top left corner, each in its colour on a darkened ground."""
+    if not entries:
+        return image
+    scale = max(0.5, image.shape[1] / 1280)
+    line, pad = round(28 * scale), round(8 * scale)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    width = max(cv2.getTextSize(text, font, scale * 0.8, 1)[0][0] for text, _ in entries) + 2 * pad
+    out = image.copy()
+    ground = out[: line * len(entries) + pad, :width]
+    ground[:] = (ground * 0.3).astype(np.uint8)
+    for i, (text, colour) in enumerate(entries):
+        cv2.putText(out, text, (pad, (i + 1) * line - pad // 2), font, scale * 0.8, colour, 1, cv2.LINE_AA)
+    return out
+
+
+def turntable(
+    mesh_head: Mesh, colours: UInt8[np.ndarray, "v 3"], panel: tuple[int, int] = (280, 360)
+) -> list[ImageRgb]:
+    """The head from ``AZIMUTHS_DEG`` around its own y axis, as drawn panels (width, height); twice supersampled."""
+    low, high = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    width, height = 2 * panel[0], 2 * panel[1]
+    distance = 6.0 * radius
+    focal = 0.5 * min(width * 1.25, height) * distance / (0.9 * radius)
+    lens = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    panels = []
+    for azimuth in np.radians(AZIMUTHS_DEG):
+        eye = centre + distance * np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
+        camera = Camera("turntable", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
+        drawn = picture(camera, mesh_head.vertices, mesh_head.faces, colours, PAPER)
+        panels.append(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA))
+    return panels
+
+
+def contact_sheet(rows: Sequence[Sequence[tuple[str, ImageRgb]]]) -> ImageRgb:
+    """Rows of labelled pictures, each fitted into a panel of ``PANEL``."""
+    width = max(len(row) for row in rows)
+    blank = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
+    drawn = [[legend(_panel(image), [(text, (255, 255, 255))] if text else []) for text, image in row] for row in rows]
+    return np.vstack([np.hstack(row + [blank] * (width - len(row))) for row in drawn])
+
+
+def _panel(image: ImageRgb) -> ImageRgb:
+    scale = min(PANEL[0] / image.shape[1], PANEL[1] / image.shape[0])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    out = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
+    left, top = (PANEL[0] - size[0]) // 2, (PANEL[1] - size[1]) // 2
+    out[top : top + size[1], left : left + size[0]] = small
+    return out
+
+
+def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """The distance to a binary mask's contour without its stairs, which would make a thin line look broken."""
+    if not mask.any():
+        return np.full(mask.shape, np.inf, np.float32)
+    return cv2.GaussianBlur(signed_distance(mask), (0, 0), 1.0)
+
+
+def _paint(
+    canvas: Float32[np.ndarray, "h w 3"],
+    distance: Float[np.ndarray, "h w"],
+    colour: tuple[int, int, int],
+    width: float,
+    strength: float,
+) -> None:
+    alpha = strength * np.clip(width / 2 + 0.5 - np.abs(distance), 0.0, 1.0)
+    where = alpha > 0
+    share = alpha[where][:, None]
+    canvas[where] += share * (np.array(colour, np.float32) - canvas[where])

@@ -1,0 +1,182 @@
+"""Every tunable of the pipeline, with its source. Values are frozen; unknown keys of a document are refused."""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
+
+from rig.errors import InputError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentationSettings:
+    """Background subtraction (section 5.4). Sources: measured on the two captures rendered by another program, whose
+    plates differ from the shots by 2 % of light, and on the faults that the tests plant."""
+
+    coarse_columns: int = 256  # decisions are taken there: 16 pixels a decision quarter the noise, and edges stay sharp
+    field_share: float = 0.12  # sigma of the illumination field by image width: drift of lamps is smoother than that
+    tolerance_levels: float = 0.8  # what a plate is off where nothing happened: 8-bit rounding, bounced light
+    tolerance_share: float = 0.006  # the same, by level
+    evidence: float = 9.0  # log odds that a pixel must show against the plate: log of the plate's density over that of
+    # any colour at all, (2 pi)^-1.5 / 1.2^3 levels^-3 against 64^-3
+    smoothness: float = 1.0  # log odds that a neighbour of the same kind is worth
+    darkest_shadow: float = 0.55  # a soft shadow leaves this share of the sRGB code (a quarter of the light); less is a
+    # dark subject
+    shadow_chroma: float = 0.05  # how far its colour may shift, by the light it takes
+    band_px: float = 6.0  # half width of the band in which alpha is solved, beyond the coarse level's 4 px
+    alpha_blur_px: float = (
+        0.7  # an edge blurred by optics and pixel already has that; it halves the noise of the contour
+    )
+    least_area: float = 0.01  # of the image; a smaller subject is none
+    hole_share: float = 0.02  # of the subject: smaller holes that are not quite the plate are filled
+    weak_contrast: float = 4.0  # standard deviations between subject and background below which a contour piece is weak
+    other_pieces_warned: float = 0.01  # of the subject: area that differs from the plate but hangs on nothing
+    other_pieces_unusable: float = 0.15
+    weak_share_warned: float = 0.05  # of the contour
+    weak_share_unusable: float = 0.25
+    strange_share_warned: float = 0.003  # of the mask: area that the other cameras say is empty; 0 in 22 good views
+    strange_share_unusable: float = 0.01
+    missing_share_warned: float = 0.005  # of the mask: area deep inside all the others; 0 in 22 good views
+    missing_share_unusable: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentSettings:
+    """Section 4.2, and the search that replaces it when there are no feature points."""
+
+    feature_noise_px: float = 1.5  # a person's click, measured on ../shared captures
+    landmark_noise_mm: float = 1.5  # a model's landmark against the same point on another head
+
+
+@dataclass(frozen=True, slots=True)
+class FittingSettings:
+    """Sections 4.3 and 4.4."""
+
+    modes: int = 60  # section 3.1: the first 60 eigenheads are used in fitting
+    modes_first: int = 15  # coarse stage of the contour solver; 10 to 20 measured alike
+    robust_px: float = 1.5  # last Geman-McClure scale of the contour solver; 3 lets hair at the temples pull
+    contour_noise_px: float | None = (
+        None  # of a contour; None: estimated from the residuals, misfit of the model included
+    )
+    contour_correlation_px: float | None = None  # of that noise along the contour; None: estimated
+    calibration_px: float = 0.2  # prior of a camera without a covariance of its own (contract)
+    scale_spread: float = 0.01  # prior of log scale: rigs are metric, size is a mode
+    feature_noise_px: float = 1.5  # a person's click
+    landmark_noise_mm: float = 2.0  # a landmark's place against the same landmark of another head
+    bare_px: float = 2.0  # cranium, ears and neck agree with the input to this after a fit to the whole head ...
+    bare_share: float = 0.8  # ... over this share of their outline: the head is bare, and all of its rim speaks
+    bare_loss: float = 1.25  # and the rim of the face may lose no more than this factor by it
+    tolerance: float = 0.05  # predicted fall of the cost at which the contour solver stops: a step of 0.2 sigma
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoSettings:
+    """Photo-consistency inside the outline. Chosen on two captures rendered by another program."""
+
+    sample_mm: float = 1.0  # distance of samples on the surface: two pixels of the usual rig
+    centre_mm: float = 3.0  # distance of patches
+    views_most: int = 5  # a patch is compared between its most frontal views
+    least_seen: float = 0.85  # of a patch's weight: a view that sees less of it does not count
+    least_correlation: float = 0.6  # a lower peak is silence
+    least_share: float = 0.15  # of the patches that must be found again in other views, or photographs are no use
+    floor_mm: float = 0.15  # error of an observation that no correlation shows: highlights, the patch's own relief
+    rig_scale_spread: float = 2e-4  # what all distances of a calibrated rig may err alike: 0.05 mm on a board of 250
+    hidden_mm: float = 1.5  # a nearer surface hides a sample beyond this: a silhouette fit's own error
+    contour_margin_px: float = 2.0  # nothing is read nearer to the background
+    fine_length_mm: float = 9.0  # of the kernel that photographs add in the face region ...
+    fine_amplitude_mm: float = 0.5  # ... and its standard deviation
+
+
+@dataclass(frozen=True, slots=True)
+class TextureSettings:
+    """Section 4.5. Chosen by the colour error over the visible face of captures rendered by another program."""
+
+    blend: Literal["default", "reference"] = "default"  # reference: the paper's weighted mean
+    sharpness: float = 2.0  # exponent of normal . viewing direction; the paper's weight has 1, 2 to 8 are within 0.3 dB
+    balance: bool = True  # gain and offset of each camera
+    contour_margin_px: float = 2.0  # nothing is sampled nearer to the background: 3 sigma of a 0.7 px defocus
+    hidden_mm: float = 1.0  # a nearer surface hides a vertex beyond this: a fit's own error, and no nose is thinner
+    least_facing: float = 0.15  # cosine: at a flatter angle than 81 degrees a pixel smears over 6 mm
+    footprint_px: float = 0.45  # sigma of the sampling window; 0.7 loses 0.3 dB of detail, 0.4 lets 1.5 dB more noise
+    highlight: float = 0.12  # excess over the median of the views, by its level, at which a view counts half
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """All settings of one reconstruction."""
+
+    method: Literal["contour", "simplex"] = "contour"
+    detail: Literal["span", "kernel", "photo"] | None = None  # None: as deep as the images carry
+    front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
+    segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
+    alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
+    fitting: FittingSettings = field(default_factory=FittingSettings)
+    photo: PhotoSettings = field(default_factory=PhotoSettings)
+    texture: TextureSettings = field(default_factory=TextureSettings)
+
+
+def settings_from_document(document: Mapping[str, Any], subject: str = "settings") -> Settings:
+    """Settings from decoded JSON or TOML. Raises InputError naming every unknown key and every wrong value."""
+    faults: list[str] = []
+    settings = _read(Settings, document, "", faults)
+    if faults:
+        raise InputError(subject, faults)
+    return settings
+
+
+def document_from_settings(settings: Settings) -> dict[str, Any]:
+    return dataclasses.asdict(settings)
+
+
+def _read(kind: type[T], document: Any, where: str, faults: list[str]) -> T:
+    if not isinstance(document, Mapping):
+        faults.append(f"{where or 'settings'} is no object")
+        return kind()
+    hints = typing.get_type_hints(kind)
+    for key in document:
+        if key not in hints:
+            near = difflib.get_close_matches(str(key), hints, n=1)
+            faults.append(f"unknown key {where}{key!s:.80}" + (f"; did you mean {near[0]!r}?" if near else ""))
+    values = {key: _value(hints[key], document[key], where + key, faults) for key in hints if key in document}
+    return kind(**{key: value for key, value in values.items() if value is not ...})
+
+
+def _value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return _read(typing.cast(type, hint), value, where + ".", faults)
+    options = (
+        typing.get_args(hint)
+        if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+        else (hint,)
+    )
+    for option in options:
+        if option is type(None) and value is None:
+            return None
+        if typing.get_origin(option) is Literal and isinstance(value, str) and value in typing.get_args(option):
+            return value
+        if option is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+        if option in (int, bool, str) and type(value) is option:
+            return value
+    faults.append(f"{where} is {value!r:.80}, wanted {_wanted(options)}")
+    return ...
+
+
+def _wanted(options: tuple[Any, ...]) -> str:
+    words = []
+    for option in options:
+        if typing.get_origin(option) is Literal:
+            words += [repr(word) for word in typing.get_args(option)]
+        else:
+            words.append(
+                {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}.get(
+                    option, "null"
+                )
+            )
+    return " or ".join(words)

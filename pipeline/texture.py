@@ -1,0 +1,215 @@
+"""Texture (section 4.5): one colour a vertex, no atlas.
+
+Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour a vertex and how many images gave it.
+``blend = "reference"`` is the paper's: a vertex counts in an image if it projects inside the silhouette and nothing
+lies before it; its weight is the dot product of normal and viewing direction; its colour the weighted mean.
+
+The default departs from it, because real cameras differ and real edges are blurred: margins at contours and occluding
+edges (``pipeline.visibility``), gain and offset of each camera (``pipeline.colour_balance``), sharper weights so that
+detail is not averaged away, a mean in linear light that gives little to what is brighter than the other views say (a
+highlight moves with the camera), and a smooth fill where no camera looks.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from numba import njit
+
+from pipeline.colour_balance import balance
+from pipeline.fill import fill_unknown
+from pipeline.reconstruction import ReportWarning
+from pipeline.settings import TextureSettings
+from pipeline.silhouette import Silhouette
+from pipeline.visibility import Sight, see_vertices
+from pipeline.zbuffer import camera_depths
+from rig.camera import Camera
+from rig.capture import Capture
+from rig.layout import Rig
+from rig.mesh import Mesh
+from rig.mesh_files import srgb_from_linear
+from rig.render.renderer import Renderer
+
+REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
+LEAST_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it
+GREY = 0.22  # linear: what a head gets that no camera saw
+STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """sRGB colours, the number of images behind each (0 = filled), and what was found of the cameras."""
+
+    colours: UInt8[np.ndarray, "v 3"]
+    views: UInt8[np.ndarray, " v"]
+    gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
+    filled: int = 0
+    warnings: tuple[ReportWarning, ...] = ()
+
+
+def texture(
+    mesh_world: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    settings: TextureSettings,
+    *,
+    renderer: Renderer | None,
+) -> Texture:
+    """Colours of the mesh from the photographs of the usable views.
+
+    ``renderer`` draws the depth maps of the reference blend, and is not asked by the default one.
+    """
+    usable = [name for name in rig.names if name in capture.images and silhouettes[name].quality.usable]
+    if settings.blend == "reference":
+        if renderer is None:
+            raise ValueError("the reference blend needs a renderer for its depth maps")
+        return _reference(mesh_world, normals, capture, silhouettes, rig.subset(usable), renderer)
+    sights = _sights(mesh_world, normals, capture, silhouettes, rig.subset(usable), settings)
+    if not sights:
+        return _untextured(len(normals))
+    weights = np.stack([sight.weights for sight in sights])
+    colours = np.stack([sight.colours for sight in sights])
+    gains, offsets = balance(weights, colours) if settings.balance else (np.ones((len(sights), 3)), np.zeros((1, 3)))
+    colours = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    linear, views = _blend(weights, colours, settings.highlight)
+    by_camera = {name: (float(g[0]), float(g[1]), float(g[2])) for name, g in zip(usable, gains, strict=True)}
+    return _finished(linear, views, mesh_world, by_camera)
+
+
+def _finished(
+    linear: Float[np.ndarray, "v 3"],
+    views: UInt8[np.ndarray, " v"],
+    mesh: Mesh,
+    gains: Mapping[str, tuple[float, float, float]],
+) -> Texture:
+    known = views > 0
+    if not known.any():
+        return _untextured(len(views))
+    colours = np.rint(255 * srgb_from_linear(fill_unknown(linear, known, mesh.faces))).astype(np.uint8)
+    warnings = [
+        ReportWarning("camera_gain", f"{name} is {1 / min(gain):.2f} times as bright as the others: check its exposure")
+        for name, gain in gains.items()
+        if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
+    ]
+    return Texture(colours, views, gains, int(np.count_nonzero(~known)), tuple(warnings))
+
+
+def _untextured(count: int) -> Texture:
+    code = round(255 * float(srgb_from_linear(np.array(GREY))))
+    warning = ReportWarning("no_texture", "no camera with a usable silhouette sees the head, so that it is grey")
+    return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), {}, count, (warning,))
+
+
+def _sights(
+    mesh: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    settings: TextureSettings,
+) -> list[Sight]:
+    def look(camera: Camera) -> Sight:
+        image, silhouette = capture.images[camera.name], silhouettes[camera.name]
+        return see_vertices(camera, image, silhouette, mesh.vertices, normals, mesh.faces, settings)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # the compiled kernels release the interpreter lock
+        return list(pool.map(look, rig))
+
+
+@njit(cache=True, nogil=True)
+def _blend(weights: np.ndarray, colours: np.ndarray, highlight: float) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted mean of each vertex, views that are brighter than its weighted median counting less; and their number.
+
+    ``highlight`` is the excess over the median, by its level, at which a view counts half.
+    """
+    cameras, count = weights.shape
+    out = np.zeros((count, 3))
+    views = np.zeros(count, np.uint8)
+    luminance, order = np.zeros(cameras), np.zeros(cameras, np.int64)
+    for v in range(count):
+        n, total = 0, 0.0
+        for k in range(cameras):
+            if weights[k, v] > 0:
+                luminance[n] = 0.21 * colours[k, v, 0] + 0.72 * colours[k, v, 1] + 0.07 * colours[k, v, 2]
+                order[n] = k
+                total += weights[k, v]
+                n += 1
+        if n == 0:
+            continue
+        ranks = np.argsort(luminance[:n])
+        middle, passed = luminance[ranks[n - 1]], 0.0
+        for r in ranks:
+            passed += weights[order[r], v]
+            if passed >= 0.5 * total:
+                middle = luminance[r]
+                break
+        norm = 0.0
+        for i in range(n):
+            excess = max(0.0, luminance[i] - middle) / (highlight * middle + 0.005)
+            weight = weights[order[i], v] / (1.0 + excess * excess)
+            norm += weight
+            for c in range(3):
+                out[v, c] += weight * colours[order[i], v, c]
+        out[v] /= norm
+        for i in range(n):
+            views[v] += weights[order[i], v] > LEAST_SHARE * total
+    return out, views
+
+
+def _reference(
+    mesh: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    renderer: Renderer,
+) -> Texture:
+    """Section 4.5 to the letter, in the images' own codes; vertices that no camera sees are filled."""
+    total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
+    views = np.zeros(len(normals), np.uint8)
+    depths = renderer.depth(rig, mesh.vertices, mesh.faces)
+    for camera in rig:
+        pixels = camera.project(mesh.vertices)
+        seen = _visible(camera, mesh.vertices, pixels, depths[camera.name], silhouettes[camera.name])
+        towards = camera.centre_world - mesh.vertices
+        facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        weight = np.where(seen, np.clip(facing, 0.0, None), 0.0)
+        total += weight[:, None] * _sampled(capture.images[camera.name], pixels)
+        weights += weight
+        views += weight > 0
+    known = weights > 0
+    if not known.any():
+        return _untextured(len(normals))
+    colours = fill_unknown(total / np.where(known, weights, 1.0)[:, None], known, mesh.faces)
+    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+
+
+def _visible(
+    camera: Camera,
+    vertices: Float[np.ndarray, "v 3"],
+    pixels: Float[np.ndarray, "v 2"],
+    depth: Float32[np.ndarray, "h w"],
+    silhouette: Silhouette,
+) -> Bool[np.ndarray, " v"]:
+    """Inside the silhouette, and nothing before the vertex."""
+    height, width = depth.shape
+    framed = np.logical_and(pixels >= 0, pixels <= (width - 1, height - 1)).all(axis=1)  # NaN is not
+    columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
+    free = camera_depths(camera, vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
+    return framed & silhouette.mask[rows, columns] & free
+
+
+def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v 3"]:
+    """Bilinear samples; the nearest border pixel outside the image."""
+    height, width = image.shape[:2]
+    safe = np.clip(np.nan_to_num(pixels), 0, (width - 1.001, height - 1.001))
+    low = safe.astype(int)
+    fx, fy = (safe - low).T[:, :, None]
+    x, y = low.T
+    top = image[y, x] * (1 - fx) + image[y, x + 1] * fx
+    bottom = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
+    return top * (1 - fy) + bottom * fy

@@ -1,0 +1,157 @@
+"""A camera: pinhole with Brown-Conrady distortion, at a known place.
+
+``x = X / Z`` in the camera frame is distorted to ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential`` (OpenCV's
+order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.geometry import RigidTransform
+
+
+@dataclass(frozen=True, slots=True)
+class Distortion:
+    """Brown-Conrady coefficients. https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html"""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @property
+    def is_zero(self) -> bool:
+        return not (self.k1 or self.k2 or self.p1 or self.p2 or self.k3)
+
+    def opencv(self) -> Float[np.ndarray, " 5"]:
+        return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
+
+    def turning_radius(self) -> float:
+        """Radius (of ``X / Z``) where the radial model stops growing: farther points would fold back into the image."""
+        cubic = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
+        squares = cubic.real[(np.abs(cubic.imag) < 1e-12) & (cubic.real > 0)]
+        return float(np.sqrt(squares.min())) if len(squares) else np.inf
+
+    def apply(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        x, y = normalised[:, 0], normalised[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return np.stack(
+            [
+                x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
+                y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
+            ],
+            axis=1,
+        )
+
+    def jacobian(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
+        """d(distorted) / d(normalised)."""
+        x, y = normalised[:, 0], normalised[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        slope = 2 * (self.k1 + r2 * (2 * self.k2 + 3 * r2 * self.k3))  # d(radial) / d(r^2) * 2
+        cross = slope * x * y + 2 * self.p1 * x + 2 * self.p2 * y
+        xx = radial + slope * x * x + 2 * self.p1 * y + 6 * self.p2 * x
+        yy = radial + slope * y * y + 6 * self.p1 * y + 2 * self.p2 * x
+        return np.stack([np.stack([xx, cross], 1), np.stack([cross, yy], 1)], axis=1)
+
+    def remove(self, distorted: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Inverse of ``apply`` by Newton's method; NaN where no point inside the turning radius maps there."""
+        if self.is_zero:
+            return distorted.copy()
+        limit = self.turning_radius()
+        guess = distorted.copy()
+        for _ in range(20):
+            miss = self.apply(guess) - distorted
+            if not len(miss) or np.abs(miss).max() < 1e-13:
+                break
+            step = np.linalg.solve(self.jacobian(guess), miss[:, :, None])[:, :, 0]
+            guess = guess - step
+            radius = np.linalg.norm(guess, axis=1)
+            far = radius > 0.999 * limit  # step back inside, where the map is one to one
+            guess[far] *= (0.999 * limit / radius[far])[:, None]
+        lost = np.abs(self.apply(guess) - distorted).max(axis=1) > 1e-9
+        guess[lost] = np.nan
+        return guess
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """Image size and projection of one camera, in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Distortion = field(default_factory=Distortion)
+
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def scaled(self, factor: float) -> "Intrinsics":
+        """The same camera at another resolution: pixel centres move, ``u' = (u + 1/2) factor - 1/2``."""
+        width, height = round(self.width * factor), round(self.height * factor)
+        sx, sy = width / self.width, height / self.height
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return Intrinsics(width, height, self.fx * sx, self.fy * sy, cx, cy, self.distortion)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A calibrated camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm), of a left perturbation."""
+
+    name: str
+    intrinsics: Intrinsics
+    camera_from_world: RigidTransform
+    covariance: Float[np.ndarray, "6 6"] | None = None
+
+    @property
+    def centre_world(self) -> Float[np.ndarray, " 3"]:
+        return self.camera_from_world.inverse().translation
+
+    @property
+    def axis_world(self) -> Float[np.ndarray, " 3"]:
+        """Unit vector along which the camera looks."""
+        return self.camera_from_world.rotation[2]
+
+    def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Pixels of world points (mm); NaN behind the camera and past the turning point of the distortion."""
+        return self._image(self.camera_from_world.apply(points_world))[0]
+
+    def project_with_jacobian(
+        self, points_world: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+        """Pixels, and their derivative by the world point (px / mm)."""
+        points = self.camera_from_world.apply(points_world)
+        pixels, normalised = self._image(points)
+        x, y, z = normalised[:, 0], normalised[:, 1], points[:, 2]
+        zero = np.zeros_like(z)
+        pinhole = np.stack([np.stack([1 / z, zero, -x / z], 1), np.stack([zero, 1 / z, -y / z], 1)], axis=1)
+        lens = self.intrinsics.distortion.jacobian(normalised)
+        focal = np.array([[self.intrinsics.fx], [self.intrinsics.fy]])
+        return pixels, focal * (lens @ pinhole) @ self.camera_from_world.rotation
+
+    def rays_world(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+        """Unit directions, in the world frame, of the rays through ``pixels``."""
+        normalised = self.undistort(pixels)
+        rays = np.concatenate([normalised, np.ones((len(pixels), 1))], axis=1) @ self.camera_from_world.rotation
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def undistort(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """``X / Z, Y / Z`` of ``pixels``."""
+        k = self.intrinsics
+        return k.distortion.remove((pixels - (k.cx, k.cy)) / (k.fx, k.fy))
+
+    def _image(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+        k = self.intrinsics
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normalised = points[:, :2] / points[:, 2:]
+            pixels = k.distortion.apply(normalised) * (k.fx, k.fy) + (k.cx, k.cy)
+            bad = (points[:, 2] <= 0) | (np.linalg.norm(normalised, axis=1) > k.distortion.turning_radius())
+        pixels[bad] = np.nan
+        return pixels, normalised

@@ -1,0 +1,202 @@
+"""Is a picture fit to be used? Exposure, sharpness, noise, and whether the camera still sees what its clean plate saw.
+
+Pure functions of images. Brightness is in the image's values (0 to 255), lengths in pixels.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+Grey = Float[np.ndarray, "h w"]
+
+BLUR_MOST_PX = 10.0  # what blur_px says of anything softer
+
+_GAUSS_SMALL_PX, _GAUSS_LARGE_PX = 1.0, 2.0
+_WORKING_WIDTH_PX = 640  # registration halves larger images until they are below twice this
+_PATCH_PX = 33
+_REACH_PX = 24  # how far a patch is searched for
+_PATCHES_MOST = 60
+_ALIKE = 0.7  # normalised correlation from which a patch counts as found
+_AGREE_PX = 1.5
+_PATCHES_LEAST = 5
+_SCALE_MOST = 0.03  # a camera 1.2 m away would have to be moved 36 mm along its axis
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Mean value and the shares of pixels at both ends (every channel 255; every channel at most 2)."""
+
+    mean: float
+    clipped_share: float
+    black_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """How the background of a picture lies on a clean plate.
+
+    ``found`` is the share of the plate's textured patches that are found again, all moved alike; ``moved_px`` the
+    largest movement that their common similarity gives to a corner of the image, 0 where nothing was found.
+    """
+
+    patches: int
+    found: float
+    moved_px: float
+
+    @property
+    def conclusive(self) -> bool:
+        """Whether the plate has texture enough to say anything."""
+        return self.patches >= _PATCHES_LEAST
+
+
+def exposure(image: ImageRgb) -> Exposure:
+    """Exposure of a picture."""
+    red, green, blue = cv2.split(image)
+    low, high = cv2.min(cv2.min(red, green), blue), cv2.max(cv2.max(red, green), blue)
+    clipped, lit = np.count_nonzero(low == 255), np.count_nonzero(high > 2)
+    return Exposure(sum(cv2.mean(image)[:3]) / 3, clipped / low.size, 1 - lit / low.size)
+
+
+def noise_of(plates: Sequence[ImageRgb]) -> float | None:
+    """Standard deviation of the temporal noise, from pictures of one still scene; None of a single one.
+
+    From differences of neighbours in time (variance 2 sigma^2): the variance within blocks of 16 px, which light that
+    drifts leaves alone, and the median over the blocks, which something that moves in a corner leaves alone.
+    """
+    variances = [_block_variance(after, before) for before, after in itertools.pairwise(plates)]
+    return float(np.sqrt(np.median(variances) / 2)) if variances else None
+
+
+def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
+    """Whether something moved between the clean plates: a 16 px block that changed by 8 standard deviations."""
+    first = cv2.resize(plates[0].astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
+    limit = max(8.0 * noise * np.sqrt(2) / 16, 4.0)  # a block's mean has 1/16 of the noise; 4 values are no person
+    for plate in plates[1:]:
+        small = cv2.resize(plate.astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
+        change = small - first
+        if np.abs(change - np.median(change, axis=(0, 1))).max() > limit:
+            return True
+    return False
+
+
+def blur_px(image: ImageRgb) -> float | None:
+    """Standard deviation of the edge spread; None where the picture has no edges.
+
+    A step of height A blurred to a standard deviation s has the gradient energy A^2 / (2 sqrt(pi) s) across it. Two
+    more blurs of known size, s1 and s2, give energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 + s1^2)) no longer
+    depends on A; it is solved for s. Only the strongest gradients count, where the steps are, and the energy that the
+    noise has everywhere is taken off.
+    """
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32)
+    small, large = _gradient_energy(grey, _GAUSS_SMALL_PX), _gradient_energy(grey, _GAUSS_LARGE_PX)
+    edges = large > np.quantile(large[::4, ::4], 0.98)
+    edges = cv2.dilate(edges.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0  # the whole profile of the step
+    if edges.all() or not edges.any():
+        return None
+    floor_small, floor_large = (float(np.median(energy[~edges])) for energy in (small, large))
+    top, bottom = float(small[edges].mean()) - floor_small, float(large[edges].mean()) - floor_large
+    if bottom <= 0 or float(large[edges].mean()) < 4 * floor_large:
+        return None
+    ratio2 = (top / bottom) ** 2
+    if ratio2 <= 1:
+        return BLUR_MOST_PX  # wider than the two blurs can tell apart
+    # the central difference sees the picture through a box 2 px wide, of variance 1/3
+    squared = (_GAUSS_LARGE_PX**2 - ratio2 * _GAUSS_SMALL_PX**2) / (ratio2 - 1) - 1 / 3
+    return float(min(np.sqrt(max(squared, 0.0)), BLUR_MOST_PX))
+
+
+def register(image: ImageRgb, plate: ImageRgb) -> Registration:
+    """Looks for the background of ``plate`` in ``image``, which a subject may hide in part.
+
+    Textured patches of the plate are searched for near their places by normalised correlation, which brightness and
+    contrast do not change; those that a common similarity explains (RANSAC) were found.
+    """
+    if image.shape != plate.shape:
+        return Registration(_PATCHES_MOST, 0.0, 0.0)
+    factor = 1.0
+    while image.shape[1] * factor >= 2 * _WORKING_WIDTH_PX:
+        factor /= 2
+    here, there = _working(plate, factor), _working(image, factor)
+    points = _textured_points(here)
+    moved = [(point, place) for point in points if (place := _find(here, there, point)) is not None]
+    if len(points) < _PATCHES_LEAST or len(moved) < 3:
+        return Registration(len(points), 0.0, 0.0)
+    source, target = (np.asarray(side, np.float64) for side in zip(*moved, strict=True))
+    similarity, agree = cv2.estimateAffinePartial2D(source, target, ransacReprojThreshold=_AGREE_PX, maxIters=500)
+    if similarity is None or agree is None or int(agree.sum()) < 3:
+        return Registration(len(points), 0.0, 0.0)
+    moved_px = _largest_move(similarity, here.shape)
+    if abs(np.hypot(similarity[0, 0], similarity[1, 0]) - 1) > _SCALE_MOST or moved_px > 2 * _REACH_PX:
+        return Registration(len(points), 0.0, 0.0)  # no camera moves so: the patches agree by chance
+    return Registration(len(points), float(agree.sum()) / len(points), moved_px / factor)
+
+
+def _block_variance(after: ImageRgb, before: ImageRgb) -> float:
+    """Median over blocks of 16 px, and over the channels, of the variance of the difference of two pictures."""
+    size = 16 if min(after.shape[:2]) >= 16 else 1
+    height, width = (length // size * size for length in after.shape[:2])
+    difference = after[:height, :width].astype(np.float32) - before[:height, :width]
+    blocks = difference.reshape(height // size, size, width // size, size, 3)
+    return float(np.median(blocks.var(axis=(1, 3), ddof=1 if size > 1 else 0)))
+
+
+def _gradient_energy(grey: Grey, sigma_px: float) -> Grey:
+    smooth = cv2.GaussianBlur(grey, (0, 0), sigma_px)
+    dx = cv2.filter2D(smooth, cv2.CV_32F, np.array([[-0.5, 0, 0.5]], np.float32))
+    dy = cv2.filter2D(smooth, cv2.CV_32F, np.array([[-0.5], [0], [0.5]], np.float32))
+    return dx * dx + dy * dy
+
+
+def _working(image: ImageRgb, factor: float) -> Grey:
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    if factor < 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.5), np.float32)
+
+
+def _textured_points(grey: Grey) -> list[tuple[int, int]]:
+    margin = _PATCH_PX // 2 + _REACH_PX + 1
+    if min(grey.shape) <= 2 * margin:
+        return []
+    inside = np.zeros(grey.shape, np.uint8)
+    inside[margin:-margin, margin:-margin] = 1
+    corners = cv2.goodFeaturesToTrack(
+        grey, _PATCHES_MOST, qualityLevel=0.02, minDistance=_PATCH_PX * 0.7, mask=inside, blockSize=9
+    )
+    return [] if corners is None else [(round(float(x)), round(float(y))) for x, y in corners.reshape(-1, 2)]
+
+
+def _find(here: Grey, there: Grey, point: tuple[int, int]) -> tuple[float, float] | None:
+    x, y = point
+    half, reach = _PATCH_PX // 2, _PATCH_PX // 2 + _REACH_PX
+    patch = here[y - half : y + half + 1, x - half : x + half + 1]
+    window = there[y - reach : y + reach + 1, x - reach : x + reach + 1]
+    likeness = cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)
+    _, best, _, (column, row) = cv2.minMaxLoc(likeness)
+    if best < _ALIKE:
+        return None
+    return (
+        x + column - _REACH_PX + _peak(likeness[row, :], column),
+        y + row - _REACH_PX + _peak(likeness[:, column], row),
+    )
+
+
+def _peak(values: Float[np.ndarray, " n"], at: int) -> float:
+    """Offset of the vertex of the parabola through the highest value and its neighbours."""
+    if not 0 < at < len(values) - 1:
+        return 0.0
+    left, middle, right = (float(values[at + step]) for step in (-1, 0, 1))
+    curve = left - 2 * middle + right
+    return 0.0 if curve >= 0 else max(-0.5, min(0.5, 0.5 * (left - right) / curve))
+
+
+def _largest_move(similarity: Float[np.ndarray, "2 3"], shape: tuple[int, ...]) -> float:
+    height, width = shape[:2]
+    corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], float)
+    moved = corners @ similarity[:, :2].T + similarity[:, 2]
+    return float(np.linalg.norm(moved - corners, axis=1).max())

@@ -1,0 +1,117 @@
+"""What every camera driver offers, and how it fails.
+
+``grab`` waits for the camera's next frame and says when it came; ``retrieve`` decodes that frame. They are two calls
+because a stream delivers many frames that nobody looks at: decoding them all would cost the time that the arrival
+stamps must not lose. ``grab_frame`` is both. A driver belongs to one thread at a time (rig.drivers.feed).
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.config import CameraConfig
+from rig.errors import EigenheadError
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """When a frame came (time.monotonic, s; the earliest moment that the driver can know) and its running number."""
+
+    time_s: float
+    sequence: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One picture: RGB, upright, with its arrival."""
+
+    image: ImageRgb
+    time_s: float
+    sequence: int
+
+
+class Driver(Protocol):
+    """One camera. Everything but ``close`` may raise DriverError; ``close`` never does and may be called twice."""
+
+    live: bool
+    """Its pictures come from a sensor, so that two equal ones mean a frozen stream."""
+
+    def open(self, timeout_s: float) -> None:
+        """Finds the camera by its identity and starts it."""
+        ...
+
+    def configure(self) -> tuple[str, ...]:
+        """Applies the settings of rig.toml; one line for each that the camera did not take."""
+        ...
+
+    def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next frame. Raises GrabTimeout, after which grab may be called again, or CameraLost.
+
+        Where a library knows no such timeout it may take up to a second longer.
+        """
+        ...
+
+    def retrieve(self) -> ImageRgb:
+        """The frame of the last grab, as the camera sees it (not rotated)."""
+        ...
+
+    def trigger(self) -> None:
+        """Asks for a picture now: cameras whose ``trigger`` is "software". Others ignore it."""
+        ...
+
+    def close(self) -> None:
+        """Lets the camera go."""
+        ...
+
+
+class DriverError(EigenheadError):
+    """A camera does not do what it should; the message starts with its name."""
+
+    def __init__(self, camera: str, message: str) -> None:
+        self.camera = camera
+        super().__init__(f"{camera}: {message}")
+
+
+class CameraNotFound(DriverError):
+    """No camera with this identity."""
+
+    def __init__(self, camera: CameraConfig, why: str) -> None:
+        super().__init__(
+            camera.name, f"no camera {camera.identity!r} ({why}); check its cable and power, and identity in rig.toml"
+        )
+
+
+class CameraLost(DriverError):
+    """The camera went away, or sends what is no picture."""
+
+    def __init__(self, camera: CameraConfig, why: str) -> None:
+        super().__init__(camera.name, f"lost ({why}); check its cable and power")
+
+
+class GrabTimeout(DriverError):
+    """No frame in time; the camera may still be well."""
+
+    def __init__(self, camera: CameraConfig, timeout_s: float) -> None:
+        super().__init__(camera.name, f"no frame within {timeout_s:.2f} s")
+
+
+class DriverMissing(DriverError):
+    """The vendor's library is not installed."""
+
+    def __init__(self, camera: CameraConfig, needs: str) -> None:
+        super().__init__(camera.name, f"driver {camera.driver!r} needs {needs}")
+
+
+def grab_frame(driver: Driver, timeout_s: float) -> Frame:
+    """The next frame, decoded. Raises as ``grab`` and ``retrieve`` do."""
+    arrival = driver.grab(timeout_s)
+    return Frame(driver.retrieve(), arrival.time_s, arrival.sequence)
+
+
+def upright(image: ImageRgb, rotation_deg: int) -> ImageRgb:
+    """The picture turned clockwise by a multiple of 90 degrees."""
+    return np.ascontiguousarray(np.rot90(image, -rotation_deg // 90)) if rotation_deg else image

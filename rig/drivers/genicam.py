@@ -1,0 +1,207 @@
+"""GigE Vision and USB3 Vision cameras through Aravis (Debian: libaravis-0.8-0; rig.drivers.aravis).
+
+``identity`` is the serial number, or the device's id or MAC address as `arv-tool-0.8` lists them. With ``trigger =
+"external"`` the camera waits for Line1, with ``"software"`` for a command, with ``"free"`` it runs at ``fps``.
+"""
+
+import contextlib
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.config import CameraConfig
+from rig.drivers.aravis import AUTO_OFF, BUFFER_SUCCESS, PACKET_SOCKET_DISABLED, Aravis, AravisError, library
+from rig.drivers.base import (
+    Arrival,
+    CameraLost,
+    CameraNotFound,
+    Driver,
+    DriverError,
+    DriverMissing,
+    GrabTimeout,
+    ImageRgb,
+)
+
+_BUFFERS = 4
+_SOURCES = {"external": b"Line1", "software": b"Software"}
+# Pixel format naming convention 2.4 (EMVA): code to what cv2.cvtColor has to do. GenICam and OpenCV's long names both
+# name a Bayer pattern by its first row.
+_CONVERSIONS = {
+    0x01080001: cv2.COLOR_GRAY2RGB,  # Mono8
+    0x01080008: cv2.COLOR_BayerGRBG2RGB,
+    0x01080009: cv2.COLOR_BayerRGGB2RGB,
+    0x0108000A: cv2.COLOR_BayerGBRG2RGB,
+    0x0108000B: cv2.COLOR_BayerBGGR2RGB,
+    0x02180014: None,  # RGB8
+    0x02180015: cv2.COLOR_BGR2RGB,
+}
+_discovery = threading.Lock()  # the device list is one for the whole process
+
+
+def make(camera: CameraConfig, folder: Path) -> Driver:
+    """The driver for a GenICam camera. Raises DriverMissing."""
+    try:
+        return GenicamDriver(camera, library())
+    except OSError as error:
+        raise DriverMissing(camera, "Aravis: apt-get install libaravis-0.8-0") from error
+
+
+class GenicamDriver:
+    """One camera of Aravis."""
+
+    live = True
+
+    def __init__(self, camera: CameraConfig, aravis: Aravis) -> None:
+        self._camera = camera
+        self._aravis = aravis
+        self._device: int | None = None
+        self._stream: int | None = None
+        self._buffer: int | None = None
+        self._unmet: tuple[str, ...] = ()
+        self._sequence = 0
+
+    def open(self, timeout_s: float) -> None:
+        self.close()
+        try:
+            self._device = self._aravis.call("arv_camera_new", self._find().encode())
+            self._unmet = self._apply()
+            self._start()
+        except AravisError as error:
+            self.close()
+            raise CameraNotFound(self._camera, str(error)) from error
+
+    def configure(self) -> tuple[str, ...]:
+        return self._unmet  # applied before the acquisition started: sizes cannot change after it
+
+    def grab(self, timeout_s: float) -> Arrival:
+        if self._stream is None:
+            raise CameraLost(self._camera, "not open")
+        deadline_s = time.monotonic() + timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            buffer = self._aravis.call("arv_stream_timeout_pop_buffer", self._stream, round(left_s * 1e6))
+            if not buffer:
+                break
+            if self._aravis.call("arv_buffer_get_status", buffer) != BUFFER_SUCCESS:
+                self._aravis.call("arv_stream_push_buffer", self._stream, buffer)  # lost packets: no frame
+                continue
+            self._give_back()
+            self._buffer = buffer
+            self._sequence += 1
+            return Arrival(self._stamp_s(buffer), self._sequence)
+        raise GrabTimeout(self._camera, timeout_s)
+
+    def retrieve(self) -> ImageRgb:
+        if self._buffer is None:
+            raise CameraLost(self._camera, "no frame was grabbed")
+        width = self._aravis.call("arv_buffer_get_image_width", self._buffer)
+        height = self._aravis.call("arv_buffer_get_image_height", self._buffer)
+        pixel_format = self._aravis.call("arv_buffer_get_image_pixel_format", self._buffer)
+        return self._decode(self._aravis.pixels(self._buffer), width, height, pixel_format)
+
+    def trigger(self) -> None:
+        if self._camera.trigger != "software" or self._device is None:
+            return
+        try:
+            self._aravis.call("arv_camera_software_trigger", self._device)
+        except AravisError as error:
+            raise CameraLost(self._camera, f"does not release: {error}") from error
+
+    def close(self) -> None:
+        device, stream = self._device, self._stream
+        self._give_back()
+        self._device = self._stream = None
+        if device is not None and stream is not None:
+            with contextlib.suppress(AravisError):  # a camera whose cable is out cannot be told
+                self._aravis.call("arv_camera_stop_acquisition", device)
+            self._aravis.release(stream)
+        if device is not None:
+            self._aravis.release(device)
+
+    def _give_back(self) -> None:
+        if self._buffer is not None and self._stream is not None:
+            self._aravis.call("arv_stream_push_buffer", self._stream, self._buffer)
+        self._buffer = None
+
+    def _find(self) -> str:
+        wanted = self._camera.identity
+        with _discovery:
+            self._aravis.call("arv_update_device_list")
+            found = []
+            for index in range(self._aravis.call("arv_get_n_devices")):
+                device_id = self._aravis.call("arv_get_device_id", index)
+                serial = self._aravis.call("arv_get_device_serial_nbr", index)
+                if wanted in (device_id, serial, self._aravis.call("arv_get_device_physical_id", index)):
+                    return device_id
+                found.append(serial or device_id)
+        raise CameraNotFound(self._camera, f"serial numbers found: {', '.join(found) or 'none'}")
+
+    def _apply(self) -> tuple[str, ...]:
+        camera, unmet = self._camera, []
+        settings: list[tuple[str, object, list[tuple]]] = []
+        if camera.pixel_format is not None:
+            text = camera.pixel_format.encode()
+            settings.append(("pixel_format", camera.pixel_format, [("set_pixel_format_from_string", text)]))
+        if camera.width is not None and camera.height is not None:
+            region = ("set_region", 0, 0, camera.width, camera.height)
+            settings.append(("width x height", f"{camera.width} x {camera.height}", [region]))
+        if camera.exposure_ms is not None:
+            self._switch_off("exposure_time_auto")
+            settings.append(("exposure_ms", camera.exposure_ms, [("set_exposure_time", camera.exposure_ms * 1000)]))
+        if camera.gain_db is not None:
+            self._switch_off("gain_auto")
+            settings.append(("gain_db", camera.gain_db, [("set_gain", camera.gain_db)]))
+        if camera.white_balance_k is not None:
+            unmet.append("white_balance_k is no GenICam feature: balance the camera with its vendor's tool")
+        source = _SOURCES.get(camera.trigger)
+        if source is not None:
+            settings.append(("trigger", camera.trigger, [("set_trigger", source)]))
+        else:
+            rate = [] if camera.fps is None else [("set_frame_rate", camera.fps)]
+            settings.append(("trigger", camera.trigger, [("clear_triggers",), *rate]))
+        for key, value, calls in settings:
+            try:
+                for name, *arguments in calls:
+                    self._aravis.call(f"arv_camera_{name}", self._device, *arguments)
+            except AravisError as error:
+                unmet.append(f"{key} {value} was not taken ({error})")
+        return tuple(unmet)
+
+    def _switch_off(self, automatic: str) -> None:
+        with contextlib.suppress(AravisError):  # many cameras have no automatic to switch off
+            self._aravis.call(f"arv_camera_set_{automatic}", self._device, AUTO_OFF)
+
+    def _start(self) -> None:
+        if self._aravis.call("arv_camera_is_gv_device", self._device):
+            # Packet sockets need CAP_NET_RAW and see nothing on the loopback; plain UDP works everywhere.
+            self._aravis.call("arv_camera_gv_set_stream_options", self._device, PACKET_SOCKET_DISABLED)
+        self._stream = self._aravis.call("arv_camera_create_stream", self._device, None, None)
+        payload = self._aravis.call("arv_camera_get_payload", self._device)
+        for _ in range(_BUFFERS):
+            self._aravis.call(
+                "arv_stream_push_buffer", self._stream, self._aravis.call("arv_buffer_new_allocate", payload)
+            )
+        self._aravis.call("arv_camera_start_acquisition", self._device)
+
+    def _stamp_s(self, buffer: int) -> float:
+        """The host's stamp of the buffer, taken in Aravis's own thread, on the clock of time.monotonic."""
+        now_s = time.monotonic()
+        age_s = (time.time_ns() - self._aravis.call("arv_buffer_get_system_timestamp", buffer)) * 1e-9
+        return now_s - age_s if 0 <= age_s < 1.0 else now_s
+
+    def _decode(self, data: UInt8[np.ndarray, " n"], width: int, height: int, pixel_format: int) -> ImageRgb:
+        if pixel_format not in _CONVERSIONS:
+            raise DriverError(
+                self._camera.name,
+                f"pixel format 0x{pixel_format:08X} is not read; set pixel_format to Mono8, RGB8 or BayerRG8",
+            )
+        channels = pixel_format >> 16 & 0xFF
+        if len(data) < width * height * channels // 8:
+            raise CameraLost(self._camera, "a frame is incomplete")
+        shape = (height, width, 3) if channels == 24 else (height, width)
+        image = data[: width * height * channels // 8].reshape(shape)
+        conversion = _CONVERSIONS[pixel_format]
+        return image if conversion is None else np.asarray(cv2.cvtColor(image, conversion), np.uint8)

@@ -1,0 +1,177 @@
+"""DSLRs and other PTP cameras through python-gphoto2 (extra ``gphoto``).
+
+``identity`` is the camera's serial number, or a network address ``ptpip:192.168.1.7``. A picture is a file that the
+camera adds: at the trigger box's remote cable (``trigger = "external"``) or at a command (``"software"``).
+Set the camera to JPEG; its memory card is not used.
+"""
+
+import importlib
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from rig.config import CameraConfig
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout, ImageRgb
+from rig.drivers.opencv import decode_jpeg
+
+# Two cameras that open at once would both walk the USB bus and claim each other's interface.
+_bus = threading.Lock()
+_ports_by_serial: dict[str, str] = {}
+
+
+def make(camera: CameraConfig, folder: Path) -> Driver:
+    """The driver for a DSLR. Raises DriverMissing."""
+    try:
+        return GphotoDriver(camera, importlib.import_module("gphoto2"))
+    except ImportError as error:
+        raise DriverMissing(camera, "python-gphoto2: pip install 'eigenhead[gphoto]'") from error
+
+
+class GphotoDriver:
+    """One camera of libgphoto2."""
+
+    live = True
+
+    def __init__(self, camera: CameraConfig, gphoto: Any) -> None:
+        self._camera = camera
+        self._gp = gphoto
+        self._device: Any = None
+        self._file: tuple[str, str] | None = None
+        self._sequence = 0
+
+    def open(self, timeout_s: float) -> None:
+        self.close()
+        try:
+            with _bus:
+                self._device = self._open_port(self._port())
+        except self._gp.GPhoto2Error as error:
+            raise CameraNotFound(self._camera, str(error)) from error
+
+    def configure(self) -> tuple[str, ...]:
+        camera = self._camera
+        wanted: list[tuple[str, str, Any]] = [("capturetarget", "capturetarget", "Internal RAM")]
+        if camera.pixel_format is not None:
+            wanted.append(("pixel_format", "imageformat", camera.pixel_format))
+        if camera.exposure_ms is not None:
+            wanted.append(("exposure_ms", "shutterspeed", camera.exposure_ms / 1000))
+        if camera.white_balance_k is not None:
+            wanted.append(("white_balance_k", "colortemperature", camera.white_balance_k))
+        unmet = [] if camera.gain_db is None else ["gain_db is not a setting of this camera: set its ISO on the body"]
+        for key, name, value in wanted:
+            if not self._set(name, value):
+                unmet.append(f"{key} {value} was not taken")
+        return tuple(line for line in unmet if not line.startswith("capturetarget"))
+
+    def grab(self, timeout_s: float) -> Arrival:
+        deadline_s = time.monotonic() + timeout_s
+        try:
+            while (left_s := deadline_s - time.monotonic()) > 0:
+                kind, data = self._opened().wait_for_event(max(1, round(left_s * 1000)))
+                if kind == self._gp.GP_EVENT_FILE_ADDED:
+                    self._file = (data.folder, data.name)
+                    self._sequence += 1
+                    return Arrival(time.monotonic(), self._sequence)
+        except self._gp.GPhoto2Error as error:
+            raise CameraLost(self._camera, str(error)) from error
+        raise GrabTimeout(self._camera, timeout_s)
+
+    def retrieve(self) -> ImageRgb:
+        if self._file is None:
+            raise CameraLost(self._camera, "no picture was grabbed")
+        try:
+            file = self._opened().file_get(*self._file, self._gp.GP_FILE_TYPE_NORMAL)
+            return decode_jpeg(self._camera, bytes(memoryview(file.get_data_and_size())))
+        except self._gp.GPhoto2Error as error:
+            raise CameraLost(self._camera, str(error)) from error
+
+    def trigger(self) -> None:
+        if self._camera.trigger != "software":
+            return
+        try:
+            self._opened().trigger_capture()
+        except self._gp.GPhoto2Error as error:
+            raise CameraLost(self._camera, f"does not release: {error}") from error
+
+    def close(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            # the result is of no use: the cable may be out already
+            self._gp.gp_camera_exit(device)
+
+    def _opened(self) -> Any:
+        if self._device is None:
+            raise CameraLost(self._camera, "not open")
+        return self._device
+
+    def _port(self) -> str:
+        identity = self._camera.identity
+        if identity.startswith("ptpip:"):
+            return identity
+        if identity not in _ports_by_serial:
+            cameras = self._gp.Camera.autodetect()
+            for port in [cameras.get_value(index) for index in range(cameras.count())]:
+                serial = self._serial(port)
+                if serial is not None:
+                    _ports_by_serial[serial.lstrip("0")] = port
+        port = _ports_by_serial.get(identity.lstrip("0"))
+        if port is None:
+            found = ", ".join(sorted(_ports_by_serial)) or "none"
+            raise CameraNotFound(self._camera, f"serial numbers found: {found}")
+        return port
+
+    def _serial(self, port: str) -> str | None:
+        try:
+            device = self._open_port(port)
+        except self._gp.GPhoto2Error:
+            return None  # busy: it belongs to a camera that is open already
+        try:
+            return str(device.get_single_config("serialnumber").get_value()).strip()
+        except self._gp.GPhoto2Error:
+            return None
+        finally:
+            self._gp.gp_camera_exit(device)
+
+    def _open_port(self, port: str) -> Any:
+        ports = self._gp.PortInfoList()
+        ports.load()
+        device = self._gp.Camera()
+        device.set_port_info(ports[ports.lookup_path(port)])
+        if port.startswith("ptpip:"):  # nothing is detected over a network: the protocol has to be named
+            models = self._gp.CameraAbilitiesList()
+            models.load()
+            device.set_abilities(models[models.lookup_model("PTP/IP Camera")])
+        device.init()
+        return device
+
+    def _set(self, name: str, value: Any) -> bool:
+        """Sets one configuration value, to the nearest of its choices where it is a number."""
+        try:
+            widget = self._opened().get_single_config(name)
+            choices = list(widget.get_choices()) if widget.get_type() == self._gp.GP_WIDGET_RADIO else []
+            choice = _nearest_choice(value, choices) if choices else value
+            if choice is None:
+                return False
+            widget.set_value(choice)
+            self._opened().set_single_config(name, widget)
+        except self._gp.GPhoto2Error:
+            return False
+        return True
+
+
+def _nearest_choice(value: Any, choices: list[str]) -> str | None:
+    """The choice that is ``value``, or for a number the one within a third of a stop of it."""
+    if isinstance(value, str):
+        return value if value in choices else None
+    numbers = [(abs(number / value - 1), choice) for choice in choices if (number := _number(choice)) is not None]
+    best = min(numbers, default=None)
+    return best[1] if best is not None and best[0] < 2 ** (1 / 3) - 1 else None
+
+
+def _number(text: str) -> float | None:
+    """A shutter speed or temperature as cameras write it: "1/125", "0.5", "5200"; None for "bulb" and the like."""
+    numerator, _, denominator = text.strip().rstrip("s").partition("/")
+    try:
+        return float(numerator) / float(denominator or 1)
+    except (ValueError, ZeroDivisionError):
+        return None

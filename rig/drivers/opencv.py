@@ -1,0 +1,180 @@
+"""Cameras through OpenCV: UVC and other V4L2 cameras by their stable path, RTSP by address; motion JPEG over HTTP is
+read by rig.drivers.mjpeg and decoded by OpenCV.
+
+V4L2 stamps its buffers with CLOCK_MONOTONIC, which is time.monotonic; that stamp is used where it is plausible.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rig.config import CameraConfig
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, GrabTimeout, ImageRgb
+from rig.drivers.mjpeg import MjpegStream, StreamBroken, StreamTimeout
+
+_READ_LIMIT_S = 1.0  # of VideoCapture.grab, which takes no timeout of its own: it may overstay by that much
+_STALE_S = 1.0  # a kernel stamp further from now than this is of another clock
+_ADDRESSES = ("http://", "https://")
+
+
+def make(camera: CameraConfig, folder: Path) -> Driver:
+    """The driver for an address or a device path."""
+    return MjpegDriver(camera) if camera.identity.startswith(_ADDRESSES) else VideoCaptureDriver(camera)
+
+
+class MjpegDriver:
+    """A motion-JPEG stream over HTTP."""
+
+    live = True
+
+    def __init__(self, camera: CameraConfig) -> None:
+        self._camera = camera
+        self._stream: MjpegStream | None = None
+        self._jpeg = b""
+        self._sequence = 0
+
+    def open(self, timeout_s: float) -> None:
+        self.close()
+        try:
+            self._stream = MjpegStream(self._camera.identity, timeout_s)
+        except (OSError, StreamBroken, StreamTimeout, ValueError) as error:
+            raise CameraNotFound(self._camera, _reason(error, "no answer")) from error
+
+    def configure(self) -> tuple[str, ...]:
+        asked = [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None]
+        return tuple(f"{key} cannot be set over HTTP: set it on the camera's own page" for key in asked)
+
+    def grab(self, timeout_s: float) -> Arrival:
+        if self._stream is None:
+            raise CameraLost(self._camera, "not open")
+        try:
+            time_s, self._jpeg = self._stream.next_part(timeout_s)
+        except StreamTimeout as error:
+            raise GrabTimeout(self._camera, timeout_s) from error
+        except (OSError, StreamBroken) as error:
+            raise CameraLost(self._camera, _reason(error, "connection lost")) from error
+        self._sequence += 1
+        return Arrival(time_s, self._sequence)
+
+    def retrieve(self) -> ImageRgb:
+        return decode_jpeg(self._camera, self._jpeg)
+
+    def trigger(self) -> None:
+        return
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+
+class VideoCaptureDriver:
+    """What cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
+
+    live = True
+
+    def __init__(self, camera: CameraConfig) -> None:
+        self._camera = camera
+        self._capture: cv2.VideoCapture | None = None
+        self._sequence = 0
+        self._is_device = camera.identity.startswith("/")
+
+    def open(self, timeout_s: float) -> None:
+        self.close()
+        target, backend = self._camera.identity, cv2.CAP_FFMPEG
+        if self._is_device:
+            if not Path(target).exists():
+                raise CameraNotFound(self._camera, "no such device")
+            target, backend = str(Path(target).resolve()), cv2.CAP_V4L2
+        options = [] if self._is_device else [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, max(1, round(timeout_s * 1000))]
+        read = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(_READ_LIMIT_S * 1000)]
+        capture = cv2.VideoCapture(target, backend, [*options, *read])
+        if not capture.isOpened():
+            capture.release()
+            raise CameraNotFound(self._camera, "cannot be opened as a video source")
+        self._capture = capture
+
+    def configure(self) -> tuple[str, ...]:
+        capture = self._opened()
+        unmet = [
+            f"{key} {wanted} was not taken (it is {capture.get(prop):g})"
+            for key, wanted, prop, value in self._settings()
+            if not capture.set(prop, value) or abs(capture.get(prop) - value) > 0.05 * abs(value)
+        ]
+        return tuple(unmet)
+
+    def grab(self, timeout_s: float) -> Arrival:
+        capture = self._opened()
+        started_s = time.monotonic()
+        if not capture.grab():
+            # OpenCV tells a timeout and a lost camera apart by nothing but the time that they took.
+            if time.monotonic() - started_s >= 0.9 * _READ_LIMIT_S:
+                raise GrabTimeout(self._camera, timeout_s)
+            raise CameraLost(self._camera, "it delivers no more frames")
+        self._sequence += 1
+        return Arrival(self._stamp_s(capture), self._sequence)
+
+    def retrieve(self) -> ImageRgb:
+        done, image = self._opened().retrieve()
+        if not done or image is None:
+            raise DriverError(self._camera.name, "a frame could not be decoded")
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB)
+
+    def trigger(self) -> None:
+        return
+
+    def close(self) -> None:
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+    def _opened(self) -> cv2.VideoCapture:
+        if self._capture is None:
+            raise CameraLost(self._camera, "not open")
+        return self._capture
+
+    def _stamp_s(self, capture: cv2.VideoCapture) -> float:
+        now_s = time.monotonic()
+        kernel_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000 if self._is_device else 0.0
+        return kernel_s if 0 <= now_s - kernel_s < _STALE_S else now_s
+
+    def _settings(self) -> list[tuple[str, Any, int, float]]:
+        camera = self._camera
+        settings: list[tuple[str, Any, int, float]] = []
+        if camera.pixel_format is not None:
+            code = cv2.VideoWriter.fourcc(*camera.pixel_format[:4].ljust(4))
+            settings.append(("pixel_format", camera.pixel_format, cv2.CAP_PROP_FOURCC, code))
+        for key, prop in (
+            ("width", cv2.CAP_PROP_FRAME_WIDTH),
+            ("height", cv2.CAP_PROP_FRAME_HEIGHT),
+            ("fps", cv2.CAP_PROP_FPS),
+        ):
+            if getattr(camera, key) is not None:
+                settings.append((key, getattr(camera, key), prop, getattr(camera, key)))
+        if camera.exposure_ms is not None:
+            settings.append(("manual exposure", 1, cv2.CAP_PROP_AUTO_EXPOSURE, 1))  # V4L2_EXPOSURE_MANUAL
+            # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us
+            settings.append(("exposure_ms", camera.exposure_ms, cv2.CAP_PROP_EXPOSURE, camera.exposure_ms * 10))
+        if camera.gain_db is not None:
+            settings.append(("gain_db", camera.gain_db, cv2.CAP_PROP_GAIN, camera.gain_db))
+        if camera.white_balance_k is not None:
+            settings.append(("manual white balance", 0, cv2.CAP_PROP_AUTO_WB, 0))
+            settings.append(
+                ("white_balance_k", camera.white_balance_k, cv2.CAP_PROP_WB_TEMPERATURE, camera.white_balance_k)
+            )
+        return settings
+
+
+def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
+    """RGB pixels of an encoded picture. Raises DriverError where it is damaged."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
+    if image is None:
+        raise DriverError(camera.name, f"a frame of {len(data)} bytes is no picture that OpenCV can decode")
+    return image
+
+
+def _reason(error: Exception, otherwise: str) -> str:
+    return str(error).splitlines()[0] if str(error) else otherwise

@@ -1,0 +1,24 @@
+"""The beat of a camera that is no device: frames at a steady rate."""
+
+import time
+
+
+class Pace:
+    """Beats ``fps`` times a second from its making; beats that nobody waited for are lost, as frames are."""
+
+    def __init__(self, fps: float) -> None:
+        self._period_s = 1.0 / fps
+        self._started_s = time.monotonic()
+        self.beat = 0
+
+    def wait(self, timeout_s: float) -> bool:
+        """Sleeps until the next beat, or for ``timeout_s``; whether there was one."""
+        passed = int((time.monotonic() - self._started_s) / self._period_s)
+        due = max(self.beat + 1, passed)
+        wait_s = self._started_s + due * self._period_s - time.monotonic()
+        if wait_s > timeout_s:
+            time.sleep(timeout_s)
+            return False
+        time.sleep(max(0.0, wait_s))
+        self.beat = due
+        return True

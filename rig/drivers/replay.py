@@ -1,0 +1,67 @@
+"""A capture folder in place of a camera: its picture comes again and again at the camera's rate.
+
+``identity`` is the folder, relative to rig.toml, and after a # the camera in it if it has another name there. With
+``plates = "FOLDER/background"`` in rig.toml a recorded shot goes through the whole session.
+"""
+
+import time
+from pathlib import Path
+
+from rig.capture import IMAGE_SUFFIXES, read_image
+from rig.config import CameraConfig
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, ImageRgb
+from rig.drivers.pace import Pace
+from rig.errors import InputError
+
+_FPS = 10.0
+
+
+def make(camera: CameraConfig, folder: Path) -> Driver:
+    """The driver for a camera of a recorded capture."""
+    return ReplayDriver(camera, folder)
+
+
+class ReplayDriver:
+    """One recorded picture at a steady rate."""
+
+    live = False
+
+    def __init__(self, camera: CameraConfig, folder: Path) -> None:
+        self._camera = camera
+        capture, _, recorded = camera.identity.partition("#")
+        self._images = folder / capture / "images"
+        self._recorded = recorded or camera.name
+        self._image: ImageRgb | None = None
+        self._pace: Pace | None = None
+
+    def open(self, timeout_s: float) -> None:
+        paths = [self._images / (self._recorded + suffix) for suffix in IMAGE_SUFFIXES]
+        path = next((path for path in paths if path.is_file()), None)
+        if path is None:
+            raise CameraNotFound(self._camera, f"no picture of {self._recorded} in {self._images.parent.name}/images")
+        try:
+            self._image = read_image(path)
+        except InputError as error:
+            raise CameraNotFound(self._camera, str(error)) from error
+        self._pace = Pace(self._camera.fps or _FPS)
+
+    def configure(self) -> tuple[str, ...]:
+        return ()
+
+    def grab(self, timeout_s: float) -> Arrival:
+        if self._pace is None:
+            raise CameraLost(self._camera, "not open")
+        if not self._pace.wait(timeout_s):
+            raise GrabTimeout(self._camera, timeout_s)
+        return Arrival(time.monotonic(), self._pace.beat)
+
+    def retrieve(self) -> ImageRgb:
+        if self._image is None:
+            raise CameraLost(self._camera, "not open")
+        return self._image
+
+    def trigger(self) -> None:
+        return
+
+    def close(self) -> None:
+        self._image = self._pace = None

@@ -1,0 +1,75 @@
+"""A camera of the simulated studio inside this process: no network, no box.
+
+``identity`` is a head's mesh file, relative to rig.toml, and after a # the studio's camera if it has another name:
+the head sits in the default studio, and each camera photographs it at its rate. For cameras that are devices, with a
+trigger box, serve the studio (rig.studio.serve).
+"""
+
+import time
+from pathlib import Path
+
+from rig.config import CameraConfig
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, ImageRgb
+from rig.drivers.pace import Pace
+from rig.errors import InputError
+from rig.studio.sources import ImageSource, SceneImages, scene_of_file
+
+_FPS = 10.0
+
+
+def make(camera: CameraConfig, folder: Path) -> Driver:
+    """The driver for a camera of the studio around a mesh file."""
+    file, _, name = camera.identity.partition("#")
+    return SimulatedDriver(camera, name or camera.name, mesh_file=folder / file)
+
+
+class SimulatedDriver:
+    """Photographs an ``ImageSource``, or the studio around ``mesh_file``, which is built when it is opened."""
+
+    live = True
+
+    def __init__(
+        self, camera: CameraConfig, view: str, *, mesh_file: Path | None = None, source: ImageSource | None = None
+    ) -> None:
+        self._camera = camera
+        self._view = view
+        self._mesh_file = mesh_file
+        self._source = source
+        self._pace: Pace | None = None
+
+    def open(self, timeout_s: float) -> None:
+        if self._source is None:
+            self._source = self._build()
+        self._pace = Pace(self._camera.fps or _FPS)
+
+    def configure(self) -> tuple[str, ...]:
+        asked = [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None]
+        return tuple(f"{key} is no setting of a simulated camera" for key in asked)
+
+    def grab(self, timeout_s: float) -> Arrival:
+        if self._pace is None:
+            raise CameraLost(self._camera, "not open")
+        if not self._pace.wait(timeout_s):
+            raise GrabTimeout(self._camera, timeout_s)
+        return Arrival(time.monotonic(), self._pace.beat)
+
+    def retrieve(self) -> ImageRgb:
+        if self._source is None or self._pace is None:
+            raise CameraLost(self._camera, "not open")
+        return self._source(self._view, time.monotonic())
+
+    def trigger(self) -> None:
+        return
+
+    def close(self) -> None:
+        self._pace = None
+
+    def _build(self) -> ImageSource:
+        assert self._mesh_file is not None, "a source or a file"
+        try:
+            scene = scene_of_file(self._mesh_file)
+        except InputError as error:
+            raise CameraNotFound(self._camera, str(error)) from error
+        if self._view not in scene.rig:
+            raise CameraNotFound(self._camera, f"the studio has {', '.join(scene.rig.names)}")
+        return SceneImages(scene, seated=True)

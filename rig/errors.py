@@ -1,0 +1,23 @@
+"""The one exception tree. Every message says what is wrong and what to do; nothing raises a bare Exception."""
+
+from collections.abc import Iterable
+
+
+class EigenheadError(Exception):
+    """Root of every error this project raises on purpose; its text is fit for an operator."""
+
+
+class Cancelled(EigenheadError):
+    """The owner of the work asked it to stop; raised by a progress report."""
+
+    def __init__(self) -> None:
+        super().__init__("cancelled on request")
+
+
+class InputError(EigenheadError):
+    """Input that cannot be used. ``faults`` names every fault found, not only the first."""
+
+    def __init__(self, subject: str, faults: Iterable[str]) -> None:
+        self.subject = subject
+        self.faults = tuple(faults)
+        super().__init__(f"{subject}: " + "; ".join(self.faults))

@@ -1,0 +1,109 @@
+"""Rigid motions and similarities, named ``b_from_a``."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidTransform:
+    """b_from_a: ``x_b = rotation @ x_a + translation`` (mm)."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, " 3"]
+
+    @classmethod
+    def identity(cls) -> "RigidTransform":
+        return cls(np.eye(3), np.zeros(3))
+
+    def __matmul__(self, other: "RigidTransform") -> "RigidTransform":
+        return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    def inverse(self) -> "RigidTransform":
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        return points @ self.rotation.T + self.translation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """b_from_a: ``x_b = scale * rotation @ x_a + translation`` (mm); the paper's ``T(x) = s (R x + t')``, t = s t'."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, " 3"]
+
+    @classmethod
+    def identity(cls) -> "Similarity":
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_rigid(cls, transform: RigidTransform) -> "Similarity":
+        return cls(1.0, transform.rotation, transform.translation)
+
+    def __matmul__(self, other: "Similarity | RigidTransform") -> "Similarity":
+        inner = other.scale if isinstance(other, Similarity) else 1.0
+        return Similarity(self.scale * inner, self.rotation @ other.rotation, self.apply(other.translation))
+
+    def inverse(self) -> "Similarity":
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        return self.scale * (points @ self.rotation.T) + self.translation
+
+
+def cross_matrix(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """``[v]x``, so that ``cross_matrix(v) @ w == cross(v, w)``."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_from_vector(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """Rodrigues' formula: rotation by ``|vector|`` radians about ``vector``."""
+    angle = float(np.linalg.norm(vector))
+    skew = cross_matrix(vector)
+    # Below 1e-4 rad the series keeps full precision where sin(a)/a and (1-cos a)/a^2 lose digits.
+    first = np.sin(angle) / angle if angle > 1e-4 else 1.0 - angle**2 / 6.0
+    second = (1.0 - np.cos(angle)) / angle**2 if angle > 1e-4 else 0.5 - angle**2 / 24.0
+    return np.eye(3) + first * skew + second * skew @ skew
+
+
+def vector_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
+    """Inverse of ``rotation_from_vector``, with the angle in [0, pi]."""
+    # Through the unit quaternion (x, y, z, w): the largest of its four squared entries is at least 1/4, so that the
+    # division below is safe at every angle, pi included.
+    r = rotation
+    trace = np.trace(r)
+    products = np.array(
+        [
+            [1 + 2 * r[0, 0] - trace, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+            [r[0, 1] + r[1, 0], 1 + 2 * r[1, 1] - trace, r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 + 2 * r[2, 2] - trace, r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + trace],
+        ]
+    )
+    row = products[np.argmax(np.diag(products))]
+    x, y, z, w = row / np.linalg.norm(row)
+    axis, w = np.array([x, y, z]) * np.copysign(1.0, w), abs(w)
+    sine = float(np.linalg.norm(axis))
+    return axis * (2.0 * np.arctan2(sine, w) / sine if sine > 1e-12 else 2.0)
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation closest to ``matrix`` in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
+def look_at(
+    centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
+) -> RigidTransform:
+    """camera_from_world of a camera at ``centre`` that looks at ``target``, ``up`` towards the top of its image."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return RigidTransform(rotation, -rotation @ centre)

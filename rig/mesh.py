@@ -1,0 +1,46 @@
+"""Triangle meshes as values."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Vertices (mm) and counter-clockwise triangles, seen from outside; ``colours`` are sRGB, one a vertex."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    colours: UInt8[np.ndarray, "v 3"] | None = None
+
+    def normals(self) -> Float[np.ndarray, "v 3"]:
+        """Unit vertex normals, each the area-weighted mean of its faces'; (0, 0, 1) where no face has an area."""
+        return vertex_normals(self.vertices, self.faces)
+
+
+def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Normals whose length is twice the face's area."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
+    """Unit, area-weighted vertex normals."""
+    per_face = face_normals(vertices, faces)
+    normals = np.empty_like(vertices)
+    corners = faces.ravel()
+    for axis in range(3):  # bincount is 20 times faster than np.add.at
+        normals[:, axis] = np.bincount(corners, np.repeat(per_face[:, axis], 3), minlength=len(vertices))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.where(length > 0, length, 1.0)
+    normals[length[:, 0] == 0] = (0.0, 0.0, 1.0)
+    return normals
+
+
+def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """Directed edges that only one face has: the open rim of the mesh."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    keys = np.sort(edges, axis=1)
+    _, first, count = np.unique(keys, axis=0, return_index=True, return_counts=True)
+    return edges[first[count == 1]]

@@ -1,0 +1,160 @@
+"""Light that reaches the lens from a painted and lit subject: what the simulated studio photographs.
+
+Paint and irradiance come per vertex from the caller; finer structure is a function of place on the subject, evaluated
+per pixel (``shaders/grain.glsl``), so that all views agree on every pore; a mild highlight moves with the view.
+Radiance is linear, edges are the mean of several samples.
+
+llvmpipe runs both sides of every branch: shading brows and lips per pixel cost 2.5 us a pixel, three times this.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from rig.camera import Camera
+from rig.layout import Rig
+from rig.render.atlas import INSTANCE_FORMAT, INSTANCE_NAMES, box_points, depth_range, instances, pack
+from rig.render.context import GlContext, Owned
+
+NOISE_CELLS = 64
+VERTEX_ROW = 1024
+
+Vector4 = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Grain:
+    """Cell sizes of the two octaves along the axes of ``Part.places`` (mm), and what their four values add."""
+
+    coarse_mm: tuple[float, float, float]
+    coarse_weights: Vector4
+    fine_mm: tuple[float, float, float]
+    fine_weights: Vector4
+    freckles: float = 0.0
+    gloss: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A piece of the subject, in the world frame. ``places`` are what its grain is a function of; ``paint`` is linear
+    albedo and strength of the grain; ``irradiance`` is linear RGB (1: white paper comes out white)."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]
+    places: Float[np.ndarray, "v 3"]
+    paint: Float[np.ndarray, "v 4"]
+    irradiance: Float[np.ndarray, "v 3"]
+    grain: Grain
+    one_sided: bool = False  # nobody can look at its inside: half the triangles need not be drawn
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gallery:
+    """What all parts share: the noise volume, and the two lamps that make highlights (world frame, linear RGB)."""
+
+    noise: UInt8[np.ndarray, "64 64 64 4"]
+    lamps: Float[np.ndarray, "2 3"]
+    lamp_colours: Float[np.ndarray, "2 3"]
+
+
+def draw_photographs(
+    context: GlContext, rig: Rig, parts: Sequence[Part], gallery: Gallery, samples: int
+) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
+    """Linear RGB multiplied by coverage, and coverage, per camera (float32). One camera at a time: 25 MB of samples."""
+    origin = rig.centre_world()
+    box = np.concatenate([box_points(part.vertices) for part in parts])
+    found = {}
+    with context.current() as gl, Owned() as owned:
+        owned(_noise_texture(gl, gallery)).use(0)
+        program = context.program("studio.vert", "studio.frag")
+        pieces = [(part, _upload(gl, owned, part, origin)) for part in parts]
+        for camera in rig:
+            found[camera.name] = _draw(context, program, camera, pieces, gallery, origin, box, samples)
+    return found
+
+
+def draw_vertex_radiance(context: GlContext, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:
+    """What ``draw_photographs`` shows of each vertex, without highlights: linear RGB (float32)."""
+    count = len(part.vertices)
+    size = (VERTEX_ROW, -(-count // VERTEX_ROW))
+    with context.current() as gl, Owned() as owned:
+        owned(_noise_texture(gl, gallery)).use(0)
+        program = context.program("vertices.vert", "vertices.frag")
+        program["target_size"] = (float(size[0]), float(size[1]))
+        _set_uniforms(program, part.grain, gallery)
+        table = np.ascontiguousarray(np.concatenate([part.places, part.paint, part.irradiance], axis=1), np.float32)
+        content = (owned(gl.buffer(table.tobytes())), "3f 4f 3f", "place", "paint", "irradiance")
+        draw = owned(gl.vertex_array(program, [content]))
+        target = owned(gl.framebuffer([owned(gl.texture(size, 4, dtype="f4"))]))
+        with context.drawing(target, clip=False):
+            draw.render(moderngl.POINTS, vertices=count)
+        raw = target.read(components=4, dtype="f4")
+    return np.frombuffer(raw, np.float32).reshape(-1, 4)[:count, :3].copy()
+
+
+def _noise_texture(gl: moderngl.Context, gallery: Gallery) -> moderngl.Texture3D:
+    texture = gl.texture3d((NOISE_CELLS, NOISE_CELLS, NOISE_CELLS), 4, gallery.noise.tobytes())
+    texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+    return texture
+
+
+def _upload(gl: moderngl.Context, owned: Owned, part: Part, origin: Float[np.ndarray, " 3"]) -> list[moderngl.Buffer]:
+    columns = (part.vertices - origin, part.normals, part.places, part.paint, part.irradiance)
+    table = np.ascontiguousarray(np.concatenate(columns, axis=1), np.float32)
+    indices = np.ascontiguousarray(part.faces, np.int32)
+    return [owned(gl.buffer(array.tobytes())) for array in (table, indices)]
+
+
+def _set_uniforms(program: moderngl.Program, grain: Grain, gallery: Gallery) -> None:
+    values = {
+        "noise": 0,
+        "coarse_per_mm": tuple(1 / (NOISE_CELLS * size) for size in grain.coarse_mm),
+        "fine_per_mm": tuple(1 / (NOISE_CELLS * size) for size in grain.fine_mm),
+        "coarse_weights": grain.coarse_weights,
+        "fine_weights": grain.fine_weights,
+        "freckles": grain.freckles,
+        "gloss": grain.gloss,
+        "lamps": [tuple(row) for row in gallery.lamps.tolist()],
+        "lamp_colours": [tuple(row) for row in gallery.lamp_colours.tolist()],
+    }
+    for name, value in values.items():
+        if name in program:  # one program of the two has no highlights
+            program[name] = value
+
+
+def _draw(
+    context: GlContext,
+    program: moderngl.Program,
+    camera: Camera,
+    pieces: Sequence[tuple[Part, list[moderngl.Buffer]]],
+    gallery: Gallery,
+    origin: Float[np.ndarray, " 3"],
+    box: Float[np.ndarray, "p 3"],
+    samples: int,
+) -> Float[np.ndarray, "h w 4"]:
+    gl = context.gl
+    (page,) = pack([camera], context.largest_texture)
+    size = (page.width, page.height)
+    samples = min(samples, context.most_samples)
+    with Owned() as owned:
+        row = instances([camera], page, origin, np.array([depth_range(camera, box)]))
+        camera_row = (owned(gl.buffer(row.tobytes())), INSTANCE_FORMAT, *INSTANCE_NAMES)
+        image = owned(gl.renderbuffer(size, 4, samples=samples, dtype="f2"))
+        target = owned(gl.framebuffer([image], owned(gl.depth_renderbuffer(size, samples=samples))))
+        resolved = owned(gl.framebuffer([owned(gl.renderbuffer(size, 4, dtype="f2"))]))
+        program["atlas_size"] = (float(page.width), float(page.height))
+        for turn, (part, (table, indices)) in enumerate(pieces):
+            with context.drawing(target, depth=True, cull=part.one_sided):
+                if turn == 0:
+                    target.clear()
+                _set_uniforms(program, part.grain, gallery)
+                layout = (table, "3f 3f 3f 4f 3f", "position", "normal", "place", "paint", "irradiance")
+                draw = owned(gl.vertex_array(program, [layout, camera_row], index_buffer=indices))
+                draw.render(instances=1)
+        gl.copy_framebuffer(resolved, target)
+        raw = resolved.read(components=4, dtype="f2")
+    return page.cut(np.frombuffer(raw, np.float16).reshape(page.height, page.width, 4), 0).astype(np.float32)

@@ -1,0 +1,235 @@
+"""Model silhouettes of all cameras, and the boundary-weighted XOR with the input's (section 4.3, eqs. 4 and 5).
+
+All cameras share one atlas that one instanced draw fills. The sum of ``w |S - Sm|`` is taken in two levels: the GPU
+adds blocks of 8 x 8 pixels in single precision, in a fixed order; what is read back, one number a block, is added in
+double precision. So the relative error of a cost is below 64 * 2^-24 = 4e-6, equal masks cost exactly 0, and the same
+input gives the same number every time. Blocks outside the box that the model can reach cost what an empty model costs.
+
+Measured on two cores with Mesa's llvmpipe, eleven views of 512 x 384 and 4,900 triangles: 8 ms to draw, 2 ms to add.
+Atomic adds (an order that changes), a compute shader over a copied mask and mipmaps were slower or no better.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from rig.errors import InputError
+from rig.layout import Rig
+from rig.render.atlas import (
+    BLOCK_PX,
+    INSTANCE_FORMAT,
+    INSTANCE_NAMES,
+    NEAR_MM,
+    Page,
+    box_points,
+    instances,
+    lens_limit,
+    pack,
+)
+from rig.render.context import GlContext, Owned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """The GPU's share of one page: the mask to draw into, the weights, and the block sums."""
+
+    page: Page
+    mask: moderngl.Framebuffer
+    blocks: moderngl.Framebuffer
+    mask_texture: moderngl.Texture
+    weights: moderngl.Texture
+    block_sums: moderngl.Texture
+    boxes: moderngl.Buffer
+    draw: moderngl.VertexArray
+    reduce: moderngl.VertexArray
+
+
+class SilhouetteSet:
+    """Cameras and triangles made ready for many evaluations; only the vertices change. Close it, or use ``with``."""
+
+    def __init__(self, context: GlContext, rig: Rig, faces: Int[np.ndarray, "f 3"]) -> None:
+        """``rig`` at the resolution to draw in."""
+        self.rig = rig
+        self._context = context
+        self._faces = np.ascontiguousarray(faces, np.int32)
+        self._vertices_needed = int(faces.max()) + 1 if len(faces) else 0
+        self._culls = is_closed(faces)
+        self._owned = Owned()
+        self._origin = rig.centre_world()
+        self._limits = [lens_limit(camera) for camera in rig]
+        self._empty_sums: list[Float[np.ndarray, "h w"]] = []
+        with context.current() as gl:
+            self._indices = self._owned(gl.buffer(self._faces.tobytes())) if len(faces) else None
+            self._positions = self._owned(gl.buffer(reserve=max(12 * self._vertices_needed, 12)))
+            self._surfaces = [self._surface(page) for page in pack(rig.cameras, context.largest_texture)]
+
+    def __enter__(self) -> "SilhouetteSet":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Gives the GPU's memory back."""
+        with self._context.current():
+            self._owned.close()
+        self._surfaces = []
+
+    def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
+        """True where the mesh covers a pixel's centre, per camera (H, W)."""
+        found = {}
+        with self._context.current():
+            self._draw(vertices_world)
+            for surface in self._surfaces:
+                page = surface.page
+                raw = surface.mask.read(components=1, alignment=1)
+                image = np.frombuffer(raw, np.uint8).reshape(page.height, page.width) > 0
+                for position, index in enumerate(page.cameras):
+                    found[index] = page.cut(image, position).copy()
+        return {camera.name: found[index] for index, camera in enumerate(self.rig)}
+
+    def set_inputs(
+        self, masks: Mapping[str, Bool[np.ndarray, "_ _"]], weights: Mapping[str, Float[np.ndarray, "_ _"]]
+    ) -> None:
+        """Uploads the input silhouettes and the weight of each pixel, eq. (5)'s ``1 / d^2``; once per capture.
+
+        Raises InputError where a camera of the rig has no mask or weight of its size.
+        """
+        check_images(self.rig, masks, "mask")
+        check_images(self.rig, weights, "weight")
+        self._empty_sums = []
+        with self._context.current():
+            for surface in self._surfaces:
+                page = surface.page
+                signed = np.zeros((page.height, page.width), np.float32)
+                for position, index in enumerate(page.cameras):
+                    name = self.rig.cameras[index].name
+                    page.cut(signed, position)[:] = np.where(masks[name], -weights[name], weights[name])
+                surface.weights.write(signed.tobytes())
+                sums = np.stack([_block_sums(np.maximum(-signed, 0)), _block_sums(np.maximum(signed, 0))], axis=2)
+                surface.block_sums.write(sums.astype(np.float32).tobytes())
+                self._empty_sums.append(sums[:, :, 0])
+
+    def xor_costs(self, vertices_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " k"]:
+        """``sum w |S - Sm|`` per camera, in the rig's order. ``set_inputs`` comes first."""
+        if not self._empty_sums:
+            raise InputError("xor_costs", ["no input silhouettes; call set_inputs first"])
+        costs = np.zeros(len(self.rig))
+        with self._context.current():
+            boxes = self._draw(vertices_world)
+            for surface, empty in zip(self._surfaces, self._empty_sums, strict=True):
+                page = surface.page
+                blocks = np.array([boxes[index] for index in page.cameras]) + np.tile(page.tiles[:, :2] // BLOCK_PX, 2)
+                sums = self._reduce(surface, blocks)
+                for position, index in enumerate(page.cameras):
+                    left, top, right, bottom = blocks[position]
+                    tile = _block_tile(page, position)
+                    reached = np.s_[top:bottom, left:right]
+                    costs[index] = empty[tile].sum() + (sums[reached] - empty[reached]).sum()
+        return costs
+
+    def _draw(self, vertices: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, "k 4"]:
+        """Draws every page's masks; returns the boxes that the model can reach, per camera, in blocks of its tile."""
+        if len(vertices) < self._vertices_needed:
+            raise InputError("vertices", [f"{len(vertices)} of them, but the triangles use {self._vertices_needed}"])
+        if not self._vertices_needed:
+            boxes, in_front = np.zeros((len(self.rig), 4), int), True
+        else:
+            boxes, in_front = self._reach(vertices[: self._vertices_needed])
+            relative = (vertices[: self._vertices_needed] - self._origin).astype(np.float32)
+            self._positions.write(relative.tobytes())
+        for surface in self._surfaces:
+            page = surface.page
+            with self._context.drawing(surface.mask, cull=self._culls and in_front):
+                surface.mask.clear()
+                if self._vertices_needed:
+                    surface.draw.program["atlas_size"] = (float(page.width), float(page.height))
+                    surface.draw.render(instances=len(page.cameras))
+        return boxes
+
+    def _reach(self, vertices: Float[np.ndarray, "v 3"]) -> tuple[Int[np.ndarray, "k 4"], bool]:
+        """Per camera, the blocks (left, top, right, bottom) that the model may touch; and: is all of it in front?"""
+        box = box_points(vertices)
+        boxes, all_in_front = [], True
+        for camera, limit in zip(self.rig, self._limits, strict=True):
+            k = camera.intrinsics
+            whole = np.array([0, 0, -(-k.width // BLOCK_PX), -(-k.height // BLOCK_PX)])
+            points = camera.camera_from_world.apply(box)
+            in_front = bool(points[:, 2].min() > 2 * NEAR_MM)
+            all_in_front &= in_front
+            normalised = points[:, :2] / points[:, 2:] if in_front else np.full((1, 2), np.inf)
+            if (normalised**2).sum(axis=1).max() < limit**2:  # else the lens may bend the box's edges any way
+                pixels = k.distortion.apply(normalised) * (k.fx, k.fy) + (k.cx, k.cy)
+                low, high = np.floor((pixels.min(axis=0) - 2) / BLOCK_PX), np.ceil((pixels.max(axis=0) + 3) / BLOCK_PX)
+                low, high = np.clip(low, 0, whole[2:]), np.clip(high, 0, whole[2:])
+                boxes.append(np.concatenate([low, high]).astype(int))
+            else:
+                boxes.append(whole)
+        return np.array(boxes), all_in_front
+
+    def _reduce(self, surface: _Surface, blocks: Int[np.ndarray, "k 4"]) -> Float[np.ndarray, "h w"]:
+        surface.boxes.write(blocks.astype(np.float32).tobytes())
+        surface.mask_texture.use(0)
+        surface.weights.use(1)
+        surface.block_sums.use(2)
+        surface.reduce.program["target_size"] = (float(surface.blocks.width), float(surface.blocks.height))
+        with self._context.drawing(surface.blocks, clip=False):
+            surface.reduce.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(blocks))
+        raw = surface.blocks.read(components=1, dtype="f4")
+        return np.frombuffer(raw, np.float32).reshape(surface.blocks.height, surface.blocks.width).astype(float)
+
+    def _surface(self, page: Page) -> _Surface:
+        gl, own = self._context.gl, self._owned
+        size, block_size = (page.width, page.height), (page.width // BLOCK_PX, page.height // BLOCK_PX)
+        mask = own(gl.texture(size, 1, alignment=1))
+        blocks = own(gl.framebuffer([own(gl.texture(block_size, 1, dtype="f4"))]))
+        weights, block_sums = own(gl.texture(size, 1, dtype="f4")), own(gl.texture(block_size, 2, dtype="f4"))
+        cameras = own(gl.buffer(instances(self.rig.cameras, page, self._origin).tobytes()))
+        boxes = own(gl.buffer(reserve=16 * len(page.cameras)))
+        drawing = self._context.program("silhouette.vert", "silhouette.frag")
+        reducing = self._context.program("box.vert", "xor.frag")
+        for unit, name in enumerate(("model", "signed_weight", "block_sums")):
+            reducing[name] = unit
+        content = [(self._positions, "3f", "position"), (cameras, INSTANCE_FORMAT, *INSTANCE_NAMES)]
+        draw = own(gl.vertex_array(drawing, content, index_buffer=self._indices))
+        reduce = own(gl.vertex_array(reducing, [(boxes, "4f/i", "box")]))
+        return _Surface(page, own(gl.framebuffer([mask])), blocks, mask, weights, block_sums, boxes, draw, reduce)
+
+
+def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """True where every edge has its counterpart: then front faces alone make the whole silhouette.
+
+    Along any line the surface is entered as often as it is left, so where a back face covers a pixel a front face does.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    base = int(edges.max(initial=0)) + 1
+    return np.array_equal(np.sort(edges[:, 0] * base + edges[:, 1]), np.sort(edges[:, 1] * base + edges[:, 0]))
+
+
+def check_images(rig: Rig, images: Mapping[str, np.ndarray], kind: str) -> None:
+    """Raises InputError where a camera has no image of its size."""
+    faults = []
+    for camera in rig:
+        wanted = (camera.intrinsics.height, camera.intrinsics.width)
+        if camera.name not in images:
+            faults.append(f"no {kind} for camera {camera.name}")
+        elif images[camera.name].shape[:2] != wanted:
+            faults.append(f"{kind} of camera {camera.name} is {images[camera.name].shape}, wanted {wanted}")
+    if faults:
+        raise InputError("silhouettes", faults)
+
+
+def _block_sums(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h8 w8"]:
+    height, width = image.shape
+    return image.reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX).sum(axis=(1, 3), dtype=float)
+
+
+def _block_tile(page: Page, position: int) -> tuple[slice, slice]:
+    left, top, width, height = page.tiles[position]
+    return (
+        slice(top // BLOCK_PX, -(-(top + height) // BLOCK_PX)),
+        slice(left // BLOCK_PX, -(-(left + width) // BLOCK_PX)),
+    )

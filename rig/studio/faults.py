@@ -1,0 +1,47 @@
+"""What can go wrong in a shot, on demand."""
+
+from dataclasses import dataclass
+
+from rig.errors import InputError
+
+KINDS = {
+    "frozen": "the camera's stream stands still: its picture is the last one before the subject came",
+    "dark": "the camera's picture is all but black (amount: what is left of the light)",
+    "lights-off": "the lamps did not fire: every picture is all but black",
+    "bumped": "the camera was knocked after calibration (amount: degrees)",
+    "swapped": "two cameras' cables are swapped (the camera and the one after it)",
+    "exposure": "exposure changed between clean plate and shot (amount: share; no camera: all of them)",
+    "camouflage": "hair and clothes have the backdrop's colour",
+    "shadow": "the subject throws a soft shadow on the backdrop (amount: how dark)",
+    "chair": "a chair behind the subject was moved between clean plate and shot, in one view",
+    "wrong-mask": "an operator's mask that belongs elsewhere, in one view",
+    "blurred": "the camera is out of focus (amount: standard deviation, pixels)",
+}
+DEFAULT_AMOUNT = {"dark": 0.02, "lights-off": 0.02, "bumped": 0.6, "exposure": 0.1, "shadow": 0.3, "blurred": 4.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """``camera`` None: the whole rig where that makes sense, else a camera that the studio draws."""
+
+    kind: str
+    camera: str | None = None
+    amount: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError("fault", [f"{self.kind!r} is none of {', '.join(sorted(KINDS))}"])
+
+    @property
+    def strength(self) -> float:
+        return DEFAULT_AMOUNT.get(self.kind, 1.0) if self.amount is None else self.amount
+
+
+def fault_from_text(text: str) -> Fault:
+    """``kind[:camera][=amount]``, as the command line takes it: ``exposure=0.2``, ``dark:cam03``. Raises InputError."""
+    head, _, amount = text.partition("=")
+    kind, _, camera = head.partition(":")
+    try:
+        return Fault(kind, camera or None, float(amount) if amount else None)
+    except ValueError as error:
+        raise InputError("fault", [f"{text!r}: {amount!r} is no number; wanted kind[:camera][=amount]"]) from error

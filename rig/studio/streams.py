@@ -1,0 +1,240 @@
+"""Cameras of the simulated studio as motion-JPEG streams on one HTTP port (loopback unless told otherwise).
+
+A stream behaves like a network camera with a trigger input: a live view at ``fps``, which it holds back while the box
+is armed, and one frame at once when its input is raised, from where the live view goes on. What a camera sees is a
+``Film``: takes that differ in their noise, shown in turn, and others for releases, so that no released frame is one
+that the live view has shown before.
+
+The loop of the server owns all state; other threads hand it work (``call_soon_threadsafe``).
+"""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+_HEAD = (
+    b"HTTP/1.0 200 OK\r\nCache-Control: no-store\r\nConnection: close\r\n"
+    b"Content-Type: multipart/x-mixed-replace; boundary=frame\r\n\r\n"
+)
+_LINE_MOST = 8192
+
+Control = Callable[[str, str, Mapping[str, str]], tuple[int, str]]
+"""Answers what is no stream: method, path and query to status and text."""
+
+
+@dataclass(frozen=True, slots=True)
+class Film:
+    """JPEG files of one scene as a camera sees it: for the live view, and for releases."""
+
+    live: tuple[bytes, ...]
+    released: tuple[bytes, ...]
+
+
+@dataclass(slots=True, eq=False)
+class _Camera:
+    name: str
+    film: Film | None = None
+    shown: bytes = b""
+    frames: int = 0  # sent so far
+    frozen: bool = False
+    hung: bool = False
+    held: bool = False  # armed: no live view until the input is raised
+    drop_next: bool = False
+    shown_event: asyncio.Event = field(default_factory=asyncio.Event)
+    tick: asyncio.TimerHandle | None = None
+
+
+class StreamServer:
+    """Serves ``/<camera>.mjpeg`` for every name. A context manager; ``close`` leaves no thread and no port."""
+
+    def __init__(
+        self, names: Sequence[str], control: Control, *, fps: float = 5.0, host: str = "127.0.0.1", port: int = 0
+    ) -> None:
+        self._cameras = {name: _Camera(name) for name in names}
+        self._views = {name: name for name in names}  # whose picture a stream shows: cables
+        self._control = control
+        self._period_s = 1.0 / fps
+        self._host = host
+        self._loop = asyncio.new_event_loop()
+        self._clients: set[asyncio.Task[None]] = set()
+        self._closed = False
+        self._server = self._loop.run_until_complete(asyncio.start_server(self._serve, host, port, limit=_LINE_MOST))
+        self.port: int = self._server.sockets[0].getsockname()[1]
+        for index, camera in enumerate(self._cameras.values()):
+            # phases spread over the period, as those of free-running cameras are
+            camera.tick = self._loop.call_later(self._period_s * (index + 1) / len(names), self._tick, camera)
+        self._thread = threading.Thread(target=self._loop.run_forever, name="studio streams", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "StreamServer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def url(self, name: str) -> str:
+        """Address of a camera's stream."""
+        return f"http://{self._host}:{self.port}/{name}.mjpeg"
+
+    def close(self) -> None:
+        """Ends every connection, the port and the thread. Safe to call twice."""
+        if self._closed:
+            return
+        self._closed = True
+        self._run(self._shut_down())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.run_until_complete(self._loop.shutdown_default_executor())
+        self._loop.close()
+
+    def show(self, name: str, film: Film) -> None:
+        """What a camera sees from now on."""
+        self._do(lambda: setattr(self._cameras[name], "film", film))
+
+    def arm(self, armed: bool) -> None:
+        """Holds the live views back, or lets them go on."""
+
+        def hold() -> None:
+            for camera in self._cameras.values():
+                camera.held = armed
+
+        self._do(hold)
+
+    def release(self, at_s: Mapping[str, float]) -> None:
+        """Raises the trigger inputs of cameras, each at its time (time.monotonic); the others' live views go on."""
+
+        def plan() -> None:
+            for name, camera in self._cameras.items():
+                if name in at_s:
+                    self._loop.call_at(at_s[name], self._expose, camera)
+                else:
+                    camera.held = False
+
+        self._do(plan)
+
+    def freeze(self, name: str, frozen: bool = True) -> None:
+        """The camera sends the picture that it sent last over and over."""
+        self._do(lambda: setattr(self._cameras[name], "frozen", frozen))
+
+    def hang(self, name: str, hung: bool = True) -> None:
+        """The camera keeps its connections and sends nothing."""
+        self._do(lambda: setattr(self._cameras[name], "hung", hung))
+
+    def drop_next(self, name: str, drop: bool = True) -> None:
+        """The next triggered frame of a camera gets lost."""
+        self._do(lambda: setattr(self._cameras[name], "drop_next", drop))
+
+    def connect(self, views: Mapping[str, str]) -> None:
+        """Whose picture each address shows: the cables of the rig."""
+        self._do(lambda: self._views.update(views))
+
+    def _do(self, work: Callable[[], Any]) -> None:
+        """Runs ``work`` in the loop and waits until it is done."""
+        done = threading.Event()
+
+        def run() -> None:
+            work()
+            done.set()
+
+        self._loop.call_soon_threadsafe(run)
+        done.wait()
+
+    def _run(self, work: Coroutine[Any, Any, None]) -> None:
+        asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+    async def _shut_down(self) -> None:
+        for camera in self._cameras.values():
+            if camera.tick is not None:
+                camera.tick.cancel()
+        self._server.close()
+        for client in list(self._clients):
+            client.cancel()
+        await asyncio.gather(*self._clients, return_exceptions=True)
+        await self._server.wait_closed()
+
+    def _tick(self, camera: _Camera) -> None:
+        camera.tick = self._loop.call_later(self._period_s, self._tick, camera)
+        if not camera.held and camera.film is not None:
+            self._emit(camera, camera.film.live)
+
+    def _expose(self, camera: _Camera) -> None:
+        camera.held = False
+        if camera.tick is not None:
+            camera.tick.cancel()
+        camera.tick = self._loop.call_later(self._period_s, self._tick, camera)
+        if camera.drop_next:
+            camera.drop_next = False
+        elif camera.film is not None:
+            self._emit(camera, camera.film.released)
+
+    def _emit(self, camera: _Camera, takes: tuple[bytes, ...]) -> None:
+        if camera.hung:
+            return
+        camera.frames += 1
+        if not camera.frozen or not camera.shown:
+            camera.shown = takes[camera.frames % len(takes)]
+        event, camera.shown_event = camera.shown_event, asyncio.Event()
+        event.set()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients.add(task)
+        try:
+            await self._answer(reader, writer)
+        except (ConnectionError, ValueError, asyncio.IncompleteReadError, asyncio.CancelledError):
+            pass  # the client left, or the studio closes
+        finally:
+            self._clients.discard(task)
+            writer.close()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        request = (await reader.readline()).decode("latin-1").split(" ")
+        while (await reader.readline()).strip():
+            pass
+        if len(request) < 2:
+            return
+        target = urlsplit(request[1])
+        name = target.path.removeprefix("/").removesuffix(".mjpeg")
+        if name in self._views and target.path.endswith(".mjpeg"):
+            await self._stream(name, reader, writer)
+            return
+        query = {key: values[-1] for key, values in parse_qs(target.query).items()}
+        status, text = await self._loop.run_in_executor(None, self._control, request[0], target.path, query)
+        body = text.encode()
+        kind = "text/html" if text.startswith("<!") else "text/plain"
+        head = f"HTTP/1.0 {status} -\r\nContent-Type: {kind}; charset=utf-8\r\nContent-Length: {len(body)}\r\n\r\n"
+        writer.write(head.encode("latin-1") + body)
+        await writer.drain()
+
+    async def _stream(self, name: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(_HEAD)
+        left = asyncio.ensure_future(reader.read())  # ends when the client does
+        try:
+            sent = {camera.name: camera.frames for camera in self._cameras.values()}
+            while not left.done():
+                camera = self._cameras[self._views[name]]
+                if camera.frames == sent[camera.name]:
+                    await self._wait(camera, left)
+                    continue
+                sent[camera.name] = camera.frames
+                jpeg = camera.shown
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n"
+                writer.write(f"{head}X-Timestamp: {time.time():.6f}\r\n\r\n".encode("ascii"))
+                await asyncio.sleep(0)  # every camera's header, by which arrivals are stamped, before the first picture
+                writer.write(jpeg + b"\r\n")
+                await writer.drain()
+        finally:
+            left.cancel()
+
+    async def _wait(self, camera: _Camera, left: asyncio.Future[bytes]) -> None:
+        """Until the camera shows a frame or the client leaves. Cables may be swapped meanwhile, so not for ever."""
+        shown = asyncio.ensure_future(camera.shown_event.wait())
+        try:
+            await asyncio.wait({left, shown}, timeout=self._period_s, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            shown.cancel()

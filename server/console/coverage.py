@@ -1,0 +1,82 @@
+"""Where the board was seen, camera by camera: what a person who carries it needs to know for the next shot."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from calibration.board import board_from_document
+from calibration.detection import detect
+from server.child import Bench, Report
+
+CELLS = (4, 3)  # of an image, across and down, that corners should fall into
+CORNERS_SHOWN = 60
+CELLS_ENOUGH = 0.75
+VIEWS_ENOUGH = 6  # per camera: Zhang's method has nothing more to gain from the count of views than that
+
+
+def detect_shot(bench: Bench, report: Report, *, files: str, board: dict[str, Any]) -> dict[str, list[list[float]]]:
+    """Runs in a child: corners of the board in each image of a capture, as shares of width and height; none where the
+    board is not seen. Raises InputError for a board that cannot be."""
+    described = board_from_document(board)
+    found = {}
+    for number, path in enumerate(sorted((Path(files) / "images").iterdir())):
+        report("detect", number / 64)
+        grey = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+        seen = None if grey is None else detect(grey.astype(np.uint8, copy=False), described)
+        if grey is None or seen is None:
+            found[path.stem] = []
+        else:
+            found[path.stem] = (seen.corners / (grey.shape[1], grey.shape[0])).round(4).tolist()
+    return found
+
+
+def covered(corners: Float[np.ndarray, "n 2"]) -> float:
+    """Share of an image's cells that hold a corner."""
+    if len(corners) == 0:
+        return 0.0
+    cells = np.clip((corners * CELLS).astype(int), 0, np.array(CELLS) - 1)
+    return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
+
+
+def summary(cameras: list[str], shots: list[dict[str, list[list[float]]]]) -> list[dict[str, Any]]:
+    """One line a camera: views with the board, share of the image covered, its corners, and whether that is enough."""
+    lines = []
+    for name in cameras:
+        seen = [shot[name] for shot in shots if shot.get(name)]
+        corners = np.array([corner for shot in seen for corner in shot]).reshape(-1, 2)
+        share = covered(corners)
+        last = shots[-1].get(name, []) if shots else []
+        lines.append(
+            {
+                "name": name,
+                "views": len(seen),
+                "covered": round(share, 3),
+                "enough": len(seen) >= VIEWS_ENOUGH and share >= CELLS_ENOUGH,
+                "corners": [c for shot in seen[:-1] for c in _thinned(shot)]
+                if last
+                else [c for s in seen for c in _thinned(s)],
+                "last": _thinned(last),
+            }
+        )
+    return lines
+
+
+def advice(lines: list[dict[str, Any]]) -> str:
+    """The next thing to do."""
+    if not lines or not any(line["views"] for line in lines):
+        return "Hold the board where several cameras see it whole, and take a shot."
+    blind = [line["name"] for line in lines if line["views"] == 0]
+    if blind:
+        return f"No view yet: {', '.join(blind)}. Turn the board towards them."
+    poor = sorted((line for line in lines if not line["enough"]), key=lambda line: (line["covered"], line["views"]))
+    if poor:
+        names = ", ".join(line["name"] for line in poor[:3])
+        return f"Least covered: {names}. Tilt the board, and go to the rim of their images."
+    return "Every camera is covered. Calibrate."
+
+
+def _thinned(corners: list[list[float]]) -> list[list[float]]:
+    return corners[:: max(1, len(corners) // CORNERS_SHOWN)]

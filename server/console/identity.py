@@ -1,0 +1,71 @@
+"""Who sits at a page: on this machine and without keys anybody, else whoever proved an API key.
+
+The key itself is not stored: the user storage of the browser's session (a file in the data folder, named by a signed
+cookie) holds the key's id, and every look asks the database whether that key still exists. So a removed key ends its
+pages, and a sign-in outlives a restart of the service.
+"""
+
+import secrets
+from pathlib import Path
+from typing import Any
+
+from nicegui import app as pages
+from starlette.datastructures import Headers
+from starlette.types import Scope
+
+from server.access import LOCAL, SCOPES, Caller, is_loopback
+from server.problems import Problem
+from server.service import Service
+
+KEY_ID = "key_id"
+
+
+def service_of_pages() -> Service:
+    """The running service: pages live as long as it."""
+    return pages.state.eigenhead.state.service
+
+
+def sign_in(service: Service, token: str) -> Caller | None:
+    """The caller whose key ``token`` is. Blocks."""
+    return service.keys.caller(token.strip())
+
+
+def caller_of(service: Service, stored: dict[str, Any]) -> Caller | None:
+    """Who the browser with this user storage is; None where a key is still to be given. Blocks."""
+    keys = {key["id"]: key for key in service.keys.all()}
+    if not keys and is_loopback(service.settings.host):
+        return Caller(LOCAL, frozenset(SCOPES))
+    key = keys.get(stored.get(KEY_ID, ""))
+    return None if key is None else Caller(key["id"], frozenset(key["scopes"]))
+
+
+def permit(caller: Caller | None, scope: str) -> Caller:
+    """``caller``, if it may do ``scope``. Raises a 401 or 403 problem."""
+    if caller is None:
+        raise Problem(401, "key-missing", "An API key is needed: sign in again.")
+    if not caller.may(scope):
+        raise Problem(403, "scope-missing", f"Your key may not do that: it lacks the scope {scope!r}.")
+    return caller
+
+
+def cookie_secret(data: Path) -> str:
+    """Signs the session cookie; made once, so that a restart signs nobody out."""
+    path = data / "console" / "secret"
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        path.touch(mode=0o600)
+        path.write_text(secrets.token_hex(32))
+    return path.read_text()
+
+
+def is_foreign(scope: Scope) -> bool:
+    """Whether a page elsewhere made a browser send this: its Origin is another host than the one that it asks."""
+    headers = Headers(scope=scope)
+    origin, host = headers.get("origin"), headers.get("host", "")
+    return origin is not None and origin.partition("://")[2] != host
+
+
+def is_rebound(scope: Scope, host: str) -> bool:
+    """Whether a request to a service that listens on loopback alone names another host (DNS rebinding)."""
+    name = Headers(scope=scope).get("host", "").rpartition(":")
+    return is_loopback(host) and not is_loopback(name[0] or name[2])

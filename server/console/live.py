@@ -1,0 +1,147 @@
+"""The live view: one thread looks at the cameras while somebody watches, and every open page gets its pictures."""
+
+import asyncio
+import json
+import struct
+import threading
+import time
+from collections.abc import AsyncIterator
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import structlog
+
+from rig.checks import blur_px, exposure
+from rig.errors import EigenheadError
+from server.child import Child
+from server.problems import problem_from
+from server.service import Service
+
+EVERY_S = 0.25  # four looks a second at most
+IDLE_S = 3.0  # without anybody who watches: then nobody looks at the cameras either
+KEEP_S = 300.0  # and so long the studio stays drawn, for the next who comes
+LOOK_S = 0.05
+
+log = structlog.get_logger()
+
+
+class Source(Protocol):
+    """Where pictures come from. Blocks."""
+
+    def frames(self) -> list[dict[str, Any]]:
+        """One a camera: name, jpeg (None without a picture), mean, clipped, perhaps blur_px and fault."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class StudioSource:
+    def __init__(self) -> None:
+        self._child, self._looks = Child(), 0
+
+    def frames(self) -> list[dict[str, Any]]:
+        self._looks += 1
+        return self._child.run("server.console.studio_view:frames", {"look": self._looks})
+
+    def close(self) -> None:
+        self._child.close()
+
+
+class PreviewSource:
+    """Real cameras, through the rig's previews; one camera a look is judged for sharpness."""
+
+    def __init__(self, service: Service) -> None:
+        self._rig, self._looks = service.rig, 0
+
+    def frames(self) -> list[dict[str, Any]]:
+        names = [camera["name"] for camera in self._rig.describe()["cameras"]]
+        self._looks += 1
+        return [self._frame(name, self._looks % len(names) == i) for i, name in enumerate(names)]
+
+    def _frame(self, name: str, sharp: bool) -> dict[str, Any]:
+        try:
+            data = self._rig.preview(name)
+        except EigenheadError as error:
+            return {"name": name, "jpeg": None, "fault": str(error)}
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+        assert picture is not None  # the rig encoded it
+        picture = picture.astype(np.uint8, copy=False)
+        level = exposure(picture)
+        found = {"name": name, "jpeg": data, "mean": round(level.mean, 1), "clipped": round(level.clipped_share, 4)}
+        return found | ({"blur_px": blur_px(picture)} if sharp else {})
+
+    def close(self) -> None:
+        pass
+
+
+class LiveView:
+    """The newest look, numbered. The thread starts with the first who watches and ends ``KEEP_S`` after the last."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._watched = 0.0
+        self._latest: tuple[int, bytes] = (0, b"")
+        self.fault = ""
+
+    async def stream(self) -> AsyncIterator[bytes]:
+        """Looks as they come: 4 bytes of header length, 4 of body length, a JSON header, the JPEGs in its order."""
+        seen = 0
+        while True:
+            self._watch()
+            number, message = self._latest
+            if number != seen and message:
+                seen = number
+                yield message
+            await asyncio.sleep(LOOK_S)
+
+    def _watch(self) -> None:
+        self._watched = time.monotonic()
+        with self._lock:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._look_around, daemon=True, name="live view")
+                self._thread.start()
+
+    def _look_around(self) -> None:
+        simulated = self._service.rig.describe()["kind"] == "simulated"
+        source: Source = StudioSource() if simulated else PreviewSource(self._service)
+        blur: dict[str, float | None] = {}
+        try:
+            while True:
+                began = time.monotonic()
+                with self._lock:
+                    if began - self._watched > KEEP_S:
+                        self._thread = None
+                        return
+                if began - self._watched > IDLE_S:
+                    self._latest = (self._latest[0], b"")  # who comes next must not take it for the present
+                    time.sleep(LOOK_S)
+                    continue
+                self._latest = (self._latest[0] + 1, self._look(source, blur))
+                time.sleep(max(0.0, EVERY_S - (time.monotonic() - began)))
+        finally:
+            source.close()
+
+    def _look(self, source: Source, blur: dict[str, float | None]) -> bytes:
+        try:
+            found, self.fault = source.frames(), ""
+        except Exception as error:  # the rig may come back
+            problem = problem_from(error)
+            log.warning("no live view", error=problem.detail)
+            found, self.fault = [], problem.detail
+            time.sleep(1.0)
+        for frame in found:
+            if "blur_px" in frame:
+                blur[frame["name"]] = frame["blur_px"]
+            frame["blur_px"] = blur.get(frame["name"])
+        return message_of(found, self.fault)
+
+
+def message_of(frames: list[dict[str, Any]], fault: str) -> bytes:
+    """A look on the wire; ``bytes`` in the header is the length of each camera's JPEG."""
+    header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
+    text = json.dumps({"cameras": header, "fault": fault}).encode()
+    body = b"".join(f["jpeg"] or b"" for f in frames)
+    return struct.pack(">II", len(text), len(body)) + text + body

@@ -1,0 +1,191 @@
+"""What the pages fetch by address: the live view, thumbnails, silhouettes, archives going in, files and mesh
+attributes of results. Each asks who the browser's session is, as the API asks for a key."""
+
+import asyncio
+import threading
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import Depends, Request, Response
+from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
+from nicegui import app as pages
+from PIL import Image
+
+from rig.capture import IMAGE_FORMATS
+from server.access import Caller
+from server.console import comparison
+from server.console.identity import caller_of, permit, service_of_pages
+from server.console.live import LiveView
+from server.console.page import as_problem
+from server.problems import Problem, not_found
+from server.routes.calibrations import get_report, make_calibration
+from server.routes.captures import accept_upload, get_image
+from server.routes.jobs import get_overlay, get_result
+from server.service import Service
+
+THUMBNAIL_WIDTH = 480
+THUMBNAIL_QUALITY = 82
+FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
+
+_live: dict[int, LiveView] = {}
+_drawing = threading.Lock()
+
+
+def session(scope: str) -> Any:
+    """A dependency: the service and the caller of the browser's session, if it may do ``scope``."""
+
+    async def authenticate() -> tuple[Service, Caller]:
+        service, stored = service_of_pages(), dict(pages.storage.user)
+        caller = await asyncio.to_thread(caller_of, service, stored)
+        return service, permit(caller, scope)
+
+    return Depends(authenticate)
+
+
+Reader = Annotated[tuple[Service, Caller], session("read")]
+Taker = Annotated[tuple[Service, Caller], session("capture")]
+
+
+@pages.exception_handler(Problem)
+async def _answer_problem(request: Request, error: Exception) -> Response:
+    return as_problem(error).response()
+
+
+def live_view(service: Service) -> LiveView:
+    return _live.setdefault(id(service), LiveView(service))
+
+
+@pages.get("/console/live")
+async def live(who: Reader) -> StreamingResponse:
+    return StreamingResponse(live_view(who[0]).stream(), media_type="application/octet-stream")
+
+
+@pages.get("/console/captures/{capture_id}/{camera}.jpg")
+def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
+    """A small JPEG of an image; a capture never changes."""
+    service = who[0]
+    name = _image_name(service.store.capture(capture_id), camera)
+    path = _cache(service, capture_id) / "small" / f"{Path(name).stem}.jpg"
+    if not path.is_file():
+        make_thumbnail(service.store.folder("captures", capture_id) / "files" / name, path)
+    return FileResponse(path, headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/{camera}.image")
+def image(who: Reader, request: Request, capture_id: str, camera: str) -> Response:
+    return get_image(who[0], who[1], request, capture_id, camera)
+
+
+@pages.get("/console/captures/{capture_id}/{camera}.silhouette.png")
+def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
+    """The outline of the subject, drawn for all cameras at the first look."""
+    service = who[0]
+    name = Path(_image_name(service.store.capture(capture_id), camera)).stem
+    folder = _cache(service, capture_id) / "outlines"
+    with _drawing:
+        if not (folder / f"{name}.png").is_file():
+            files = service.store.folder("captures", capture_id) / "files"
+            with service.children.one() as child:
+                child.run("server.console.silhouettes:draw", {"capture": str(files), "target": str(folder)})
+    return FileResponse(folder / f"{name}.png", headers=FOREVER)
+
+
+@pages.post("/console/captures")
+async def upload(who: Taker, request: Request) -> Response:
+    try:
+        record, _ = await accept_upload(who[0], request)
+    except Exception as error:
+        return as_problem(error).response()
+    return JSONResponse({"id": record["id"]}, 201)
+
+
+@pages.post("/console/calibrations")
+async def upload_board_pictures(who: Taker, request: Request, response: Response) -> Response:
+    try:
+        made = await make_calibration(who[0], who[1], request, response)
+    except Exception as error:
+        return as_problem(error).response()
+    return JSONResponse({"id": made.id}, 202)
+
+
+@pages.get("/console/jobs/{job_id}/overlays/{name}")
+def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
+    return get_overlay(who[0], who[1], request, job_id, name)
+
+
+@pages.get("/console/jobs/{job_id}/quality.f32")
+def quality(who: Reader, job_id: str) -> Response:
+    """Posterior standard deviation of every vertex (mm, float32)."""
+    return _floats(comparison.quality(_result_folder(who[0], job_id)))
+
+
+@pages.get("/console/jobs/{job_id}/distance.f32")
+def distance(who: Reader, job_id: str, other: str) -> Response:
+    """Distance (mm, float32) of every vertex to the surface of another job's head, or of the truth (``truth``)."""
+    service = who[0]
+    job = service.jobs.get(job_id)
+    mine = _result_folder(service, job_id)
+    if other == "truth":
+        theirs = service.store.folder("captures", job["capture_id"]) / "truth" / "head.ply"
+        if not theirs.is_file():
+            raise not_found("truth of the capture", job["capture_id"])
+        return _floats(comparison.to_surface(mine, theirs))
+    other_job = service.jobs.get(other)
+    same = other_job["capture_id"] == job["capture_id"]
+    return _floats(comparison.to_surface(mine, _result_folder(service, other) / "head.ply", align=not same))
+
+
+@pages.get("/console/jobs/{job_id}/{name}")
+def result_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
+    return get_result(who[0], who[1], request, job_id, name)
+
+
+@pages.get("/console/calibrations/{calibration_id}/report.html")
+def calibration_report(who: Reader, request: Request, calibration_id: str) -> Response:
+    answer = get_report(who[0], who[1], request, calibration_id)
+    answer.headers["Content-Security-Policy"] = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+    return answer
+
+
+@pages.get("/console/calibrations/{calibration_id}/cameras.json")
+def cameras_file(who: Reader, calibration_id: str) -> Response:
+    return FileResponse(who[0].calibrations.cameras_json(calibration_id), media_type="application/json")
+
+
+def make_thumbnail(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = target.with_suffix(f".{threading.get_ident()}")
+    with Image.open(source, formats=IMAGE_FORMATS) as picture:
+        picture.draft("RGB", (THUMBNAIL_WIDTH * 2, THUMBNAIL_WIDTH * 2))  # JPEG decodes at a fraction of its size
+        picture = picture.convert("RGB")
+        picture.thumbnail((THUMBNAIL_WIDTH, THUMBNAIL_WIDTH * 2), reducing_gap=2.0)
+        picture.save(unfinished, "JPEG", quality=THUMBNAIL_QUALITY)
+    unfinished.rename(target)
+
+
+def drop_cache(service: Service, capture_id: str) -> None:
+    """What was drawn of a capture goes with it: it shows a face."""
+    service.store.remove(_cache(service, capture_id))
+
+
+def _cache(service: Service, capture_id: str) -> Path:
+    return service.store.data / "cache" / "console" / capture_id
+
+
+def _image_name(record: dict[str, Any], camera: str) -> str:
+    for name in record["inputs"]:
+        if Path(name).parent.name == "images" and Path(name).stem == camera:
+            return name
+    raise not_found("camera", camera)
+
+
+def _result_folder(service: Service, job_id: str) -> Path:
+    state = service.jobs.state(job_id)
+    if state != "succeeded":
+        raise Problem(409, "no-result", f"The job is {state}; it has no result.")
+    return service.store.folder("jobs", job_id) / "result"
+
+
+def _floats(values: np.ndarray) -> Response:
+    return Response(values.astype("<f4").tobytes(), media_type="application/octet-stream", headers=FOREVER)

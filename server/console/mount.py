@@ -1,0 +1,80 @@
+"""Puts the pages onto the service's app."""
+
+from pathlib import Path
+
+from fastapi import FastAPI
+from nicegui import app as pages
+from nicegui import ui
+from nicegui.storage import Storage
+from starlette._utils import get_route_path
+from starlette.responses import PlainTextResponse
+from starlette.routing import Match, Mount
+from starlette.types import Receive, Scope, Send
+
+from server.console import theme
+from server.console.identity import cookie_secret, is_foreign, is_rebound
+from server.settings import ServiceSettings
+
+COOKIE_DAYS = 30
+PAGES = frozenset({"/", "/captures", "/features", "/jobs", "/result", "/calibration", "/sign-in", "/favicon.ico"})
+FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
+
+
+def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
+    """Serves the pages at ``/``; what is no page of ours is left to the API and its problem documents.
+
+    NiceGUI's own app is one a process, so that a process has one service with pages: the last that was made.
+    """
+    from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
+    from server.console.pages import calibration, captures, features, jobs, result, rig, sign_in  # noqa: F401
+
+    Storage.path = settings.data.resolve() / "console"
+    pages.state.eigenhead = app
+    ui.run_with(
+        app,
+        title="eigenhead",
+        favicon=Path(__file__).with_name("static") / "favicon.svg",
+        dark=True,
+        language="en-US",
+        binding_refresh_interval=None,
+        reconnect_timeout=10.0,
+        message_history_length=200,
+        gzip_middleware_factory=None,  # it would hold the live view back
+        tailwind=False,
+        show_welcome_message=False,
+        storage_secret=cookie_secret(settings.data),
+        session_middleware_kwargs={
+            "session_cookie": "eigenhead_console",
+            "same_site": "strict",
+            "max_age": COOKIE_DAYS * 86400,
+        },
+    )
+    pages.add_static_files("/console/static", Path(__file__).with_name("static"))
+    mounted = app.router.routes.pop()
+    assert isinstance(mounted, Mount)
+    app.router.routes.append(PagesMount(mounted, settings.host))
+    theme.install()
+
+
+class PagesMount(Mount):
+    """The mount of the pages: it answers for their paths alone, and to nobody whom another web page sent."""
+
+    def __init__(self, mounted: Mount, host: str) -> None:
+        super().__init__(mounted.path, app=mounted.app)
+        self._host = host
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        if scope["type"] in ("http", "websocket"):
+            path = get_route_path(scope)
+            if path not in PAGES and not path.startswith(FOLDERS):
+                return Match.NONE, {}
+        return super().matches(scope)
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if is_foreign(scope) or is_rebound(scope, self._host):
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008})
+            else:
+                await PlainTextResponse("This page is not open to other web pages.", 403)(scope, receive, send)
+            return
+        await super().handle(scope, receive, send)

@@ -1,0 +1,154 @@
+"""What all pages share: a component that shows a state document, actions that run in threads, and their messages."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Any
+
+import anyio
+import anyio.to_thread
+from nicegui import app as pages
+from nicegui import ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+
+from server.access import Caller
+from server.child import WorkFailed
+from server.console.identity import caller_of, permit, service_of_pages
+from server.console.theme import Frame
+from server.health import readiness
+from server.problems import Problem, problem_from
+from server.service import Service
+
+REFRESH_S = 0.5
+STATUS_S = 2.0
+MAKE = Callable[[], Any]
+
+_threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a capture holds one for seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """What an event of a page does: ``function(page, event)`` in a thread, for callers with ``scope``.
+
+    What it returns, if anything, is said in the corner.
+    """
+
+    scope: str
+    function: Callable[["Page", dict[str, Any]], str | None]
+
+
+@dataclass
+class Cache:
+    """Values that all open pages share, so that they agree, and ten pages cost what one does."""
+
+    _values: dict[Any, tuple[float, Any]] = field(default_factory=dict)
+    _locks: dict[Any, Lock] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
+
+    def get(self, key: Any, age_s: float, make: MAKE) -> Any:
+        """The value of ``key``, made anew where it is older than ``age_s``. Blocks; raises what ``make`` does."""
+        with self._lock:
+            own = self._locks.setdefault(key, Lock())
+        with own:
+            made, value = self._values.get(key, (0.0, None))
+            if time.monotonic() - made > age_s or key not in self._values:
+                value = make()
+                self._values[key] = (time.monotonic(), value)
+            return value
+
+    def forget(self, key: Any) -> None:
+        self._values.pop(key, None)
+
+
+shared = Cache()
+
+
+class Page(Element):
+    """A Vue component with the property ``state``; its event ``act`` carries {name, ...} to an action."""
+
+    actions: Mapping[str, Action] = {}
+
+    def __init__(self, frame: Frame, caller: Caller, **initial: Any) -> None:
+        super().__init__()
+        self.frame, self.caller, self.service = frame, caller, service_of_pages()
+        self.choice: dict[str, Any] = initial
+        self._props["state"] = {"loading": True}
+        self._in_turn = anyio.Lock()
+        self.on("act", self._act)
+        self.on("choose", self._choose)
+        ui.timer(REFRESH_S, self.refresh, immediate=True)
+        ui.timer(STATUS_S, self._refresh_status, immediate=True)
+
+    def look(self) -> dict[str, Any]:
+        """The state document. Runs in a thread."""
+        raise NotImplementedError
+
+    async def refresh(self) -> None:
+        try:
+            state = await anyio.to_thread.run_sync(self.look, limiter=_threads)
+        except Exception as error:  # the page stays, says so once, and looks again
+            problem = problem_from(error)
+            state = self._props["state"] | {"problem": {"detail": problem.detail, "errors": problem.errors}}
+        if state != self._props["state"]:
+            self._props["state"] = state
+            self.update()
+
+    async def _refresh_status(self) -> None:
+        status = await anyio.to_thread.run_sync(status_of, self.service, self.caller, limiter=_threads)
+        if status is None:
+            ui.navigate.to("/sign-in")
+        else:
+            self.frame.show_status(status)
+
+    async def _choose(self, event: GenericEventArguments) -> None:
+        self.choice |= event.args
+        await self.refresh()
+
+    async def _act(self, event: GenericEventArguments) -> None:
+        async with self._in_turn:  # two quick keys must not overtake each other in the threads
+            await self._do(dict(event.args))
+
+    async def _do(self, arguments: dict[str, Any]) -> None:
+        name = arguments.pop("name")
+        try:
+            said = await anyio.to_thread.run_sync(self._run, self.actions[name], arguments, limiter=_threads)
+            if said:
+                self.frame.say("done", said)
+        except Exception as error:
+            problem = as_problem(error)
+            self.frame.say("fault", problem.detail, problem.errors)
+        await self.refresh()
+        self.run_method("acted", name)
+
+    def _run(self, action: Action, arguments: dict[str, Any]) -> str | None:
+        current = caller_of(self.service, {"key_id": self.caller.key})
+        permit(current, action.scope)
+        return action.function(self, arguments)
+
+
+def as_problem(error: Exception) -> Problem:
+    if isinstance(error, WorkFailed) and error.kind != "bug":
+        return Problem(500, error.kind, error.message, error.faults)
+    return problem_from(error)
+
+
+async def signed_in() -> Caller | None:
+    """Who opens the page; None where a key is to be asked for first."""
+    stored = dict(pages.storage.user)
+    return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
+
+
+def status_of(service: Service, caller: Caller) -> dict[str, Any] | None:
+    """What the frame shows of the service; None where the caller's key is gone."""
+    if caller_of(service, {"key_id": caller.key}) is None:
+        return None
+
+    def make() -> dict[str, Any]:
+        checks = readiness(service)
+        wrong = {name: check.detail for name, check in checks.items() if not check.ok}
+        jobs = service.jobs.active()
+        return {"faults": wrong, "jobs": len(jobs), "disk": checks["disk"].detail.partition(" free")[0] + " free"}
+
+    return shared.get("status", STATUS_S / 2, make) | {"local": caller.key == "local"}

@@ -1,0 +1,86 @@
+// History at the left; at the right the shots that are being taken, or the report of the chosen calibration.
+import { clock, fixed, send } from "/console/static/words.js";
+
+export default {
+  props: { state: Object },
+  emits: ["act"],
+  data: () => ({ chosen: null, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000" }, label: "", busy: "", over: false, upload: null }),
+  computed: {
+    list() { return this.state.calibrations || []; },
+    current() { return this.list.find((c) => c.id === this.chosen) || null; },
+    cameras() { return Object.entries(this.current?.figures?.cameras || {}); },
+    lead() {
+      if (this.state.loading) return "Reading";
+      const used = this.list.find((c) => c.in_use);
+      return used ? `In use: ${used.label || clock(used.created)}` : this.state.rig.calibration ? "In use: the rig's own" : "No calibration in use";
+    },
+  },
+  template: `
+    <section class="page" aria-label="Calibration" @dragover.prevent="over = true" @dragleave="over = false" @drop.prevent="over = false; take($event.dataTransfer.files)">
+      <header><h1>Calibration</h1><span class="lead">{{ lead }}</span>
+        <button class="b" :aria-pressed="!current" @click="chosen = null">New calibration</button>
+        <template v-if="current"><a v-if="current.state === 'succeeded'" class="b" target="_blank" rel="noopener" :href="'/console/calibrations/' + current.id + '/report.html'">Whole report</a><a v-if="current.state === 'succeeded'" class="b" :href="'/console/calibrations/' + current.id + '/cameras.json'" download="cameras.json">cameras.json</a>
+          <button class="b" :disabled="!!busy || ['queued', 'running'].includes(current.state)" @click="act('remove', { id: current.id })">Remove</button>
+          <button class="b main-action" :disabled="!!busy || current.in_use || current.state !== 'succeeded'" @click="act('use', { id: current.id })">{{ current.in_use ? 'In use' : 'Use this' }}</button></template></header>
+      <div class="columns" style="grid-template-columns: 19rem minmax(0, 1fr)">
+        <div class="stack" style="min-height: 0">
+          <div :class="['drop', { over }]">Drop board pictures here: an archive of IMAGES/ and board.toml
+            <div style="margin-top: .4rem"><button class="b" @click="$refs.file.click()">Choose a file</button><input ref="file" type="file" hidden accept=".zip,.tar,.gz,.tgz" aria-label="Archive of board pictures" @change="take($event.target.files); $event.target.value = ''"></div></div>
+          <div v-if="upload" class="panel pad small stack" style="gap: .3rem" role="status"><div class="line"><span class="grow cut">{{ upload.name }}</span><span class="num">{{ upload.state }}</span><button class="b quiet" aria-label="Close" @click="upload = null">&times;</button></div>
+            <template v-if="upload.detail"><p class="fault">{{ upload.detail }}</p><ul class="faults"><li v-for="(e, i) in upload.errors" :key="i">{{ e }}</li></ul></template></div>
+          <div class="panel scroll grow" tabindex="0" role="region" aria-label="History of calibrations">
+            <p v-if="!state.loading && !list.length" class="muted small" style="padding: .8rem">No calibrations yet. Take board shots at the right, or drop an archive above.</p>
+            <button v-for="c in list" :key="c.id" class="row-button" :data-calibration="c.id" :data-state="c.state" :aria-current="current && c.id === current.id" @click="chosen = c.id">
+              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="{ accent: c.in_use || c.state === 'running', fault: c.state === 'failed' }">{{ c.in_use ? 'in use' : c.state }}</span></span>
+              <span class="small muted">{{ clock(c.created) }} &middot; {{ Object.keys(c.pictures).length }} cameras<template v-if="c.figures.rms_px"> &middot; {{ fixed(c.figures.rms_px, 2) }} px</template></span></button>
+          </div>
+        </div>
+        <div v-if="current" class="panel pad scroll stack" tabindex="0" role="region" aria-label="Report">
+          <div class="line wrap"><h2>{{ current.label || clock(current.created) }}</h2><span class="tag" :class="{ accent: current.in_use, fault: current.state === 'failed' }">{{ current.in_use ? 'in use' : current.state }}</span></div>
+          <template v-if="current.error"><p class="fault">{{ current.error.detail }}</p><ul class="faults small"><li v-for="(e, i) in current.error.errors" :key="i">{{ e }}</li></ul></template>
+          <ul v-if="current.warnings.length" class="faults small"><li v-for="(w, i) in current.warnings" :key="i" class="warn">{{ w }}</li></ul>
+          <p v-if="['queued', 'running'].includes(current.state)" class="muted">The calibration is under way; its report appears here.</p>
+          <template v-if="current.state === 'succeeded'">
+            <div class="line wrap" style="gap: 2rem"><div><div class="small muted">Residual</div><div class="mono" style="font-size: 1.4rem">{{ fixed(current.figures.rms_px, 2) }} px</div></div><div><div class="small muted">Corners used</div><div class="mono" style="font-size: 1.4rem">{{ fixed(100 * current.figures.used_share, 1) }} %</div></div><div><div class="small muted">Front camera</div><div class="mono" style="font-size: 1.4rem">{{ current.front }}</div></div></div>
+            <div class="columns" style="grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); flex: none">
+              <div class="stack"><h3>Checks</h3><table class="small"><tbody><tr v-for="c in current.checks" :key="c.name"><td><i :class="['dot', c.passed === null ? '' : c.passed ? 'good' : 'fault']"></i></td><td style="white-space: nowrap">{{ c.name }}</td><td>{{ c.detail }}<div v-if="c.passed === false && c.advice" class="warn">{{ c.advice }}</div></td></tr></tbody></table></div>
+              <div class="stack"><h3>Residual by camera</h3><table class="small"><tbody><tr v-for="[name, f] in cameras" :key="name"><td>{{ name }}</td><td class="num">{{ fixed(f.rms_px, 2) }} px</td><td class="num muted">{{ current.pictures[name] }} pictures</td></tr></tbody></table></div>
+            </div></template>
+        </div>
+        <div v-else class="stack" style="min-height: 0">
+          <form class="panel pad line wrap" style="align-items: end" aria-label="The board" @submit.prevent="act('shoot', { board })">
+            <label class="field">Board<select v-model="board.kind"><option value="charuco">ChArUco</option><option value="checkerboard">checkerboard</option></select></label>
+            <label class="field">Squares across<input v-model.number="board.columns" type="number" min="3" max="100" style="width: 6rem"></label>
+            <label class="field">Squares down<input v-model.number="board.rows" type="number" min="3" max="100" style="width: 6rem"></label>
+            <label class="field">Square, mm<input v-model.number="board.square_mm" type="number" min="0.5" step="any" style="width: 6rem"></label>
+            <template v-if="board.kind === 'charuco'"><label class="field">Marker / square<input v-model.number="board.marker_ratio" type="number" min="0.3" max="0.95" step="any" style="width: 6rem"></label>
+            <label class="field">Dictionary<input v-model="board.dictionary" style="width: 11rem" spellcheck="false"></label></template>
+            <span class="line push"><button type="button" class="b" :disabled="!!busy || !state.shots" @click="act('take_back', {})">Take the last one back</button><button class="b main-action" id="shoot" :disabled="!!busy">{{ busy === 'shoot' ? 'Looking for the board ...' : 'Take shot ' + ((state.shots || 0) + 1) }}</button></span>
+          </form>
+          <div class="panel pad line"><span class="grow" role="status">{{ state.advice }}</span><span class="muted num">{{ state.shots || 0 }} shots</span><input v-model="label" placeholder="name of the calibration" aria-label="Name of the calibration" style="width: 14rem"><button class="b" id="calibrate" :class="{ 'main-action': state.shots >= 3 }" :disabled="!!busy || !(state.shots >= 3)" @click="act('calibrate', { label })">Calibrate</button></div>
+          <div class="panel pad scroll grow" tabindex="0" role="region" aria-label="Coverage by camera"><div class="thumbs">
+            <figure v-for="c in state.coverage" :key="c.name" style="margin: 0" class="stack">
+              <svg viewBox="0 0 4 3" role="img" :aria-label="c.name + ': ' + c.views + ' views, ' + Math.round(100 * c.covered) + ' % covered'" style="background: #08090b; border-radius: 3px; width: 100%; display: block">
+                <path d="M1 0v3M2 0v3M3 0v3M0 1h4M0 2h4" stroke="#2a303a" stroke-width=".01"></path>
+                <circle v-for="(p, i) in c.corners" :key="i" :cx="4 * p[0]" :cy="3 * p[1]" r=".03" fill="#4a5361"></circle>
+                <circle v-for="(p, i) in c.last" :key="'l' + i" :cx="4 * p[0]" :cy="3 * p[1]" r=".035" fill="#6cb2ff"></circle></svg>
+              <figcaption class="line small" style="margin-top: -.3rem"><i :class="['dot', c.enough ? 'good' : '']"></i><span class="grow">{{ c.name }}</span><span class="muted num">{{ c.views }} views, {{ Math.round(100 * c.covered) }} %</span></figcaption></figure>
+          </div></div>
+        </div>
+      </div>
+    </section>`,
+  created() { this.clock = clock; this.fixed = fixed; },
+  methods: {
+    act(name, more) { this.busy = name; this.$emit("act", { name, ...more }); },
+    acted() { this.busy = ""; },
+    async take(files) {
+      const file = files[0];
+      if (!file) return;
+      this.upload = { name: file.name, state: "0 %", detail: "", errors: [] };
+      const mine = this.upload;
+      const { status, document } = await send("/console/calibrations", file, { label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => (mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking"));
+      if (status === 202) { this.upload = null; this.chosen = document.id; window.eigenheadSay("done", "The calibration is queued."); }
+      else { mine.state = "refused"; mine.detail = document.detail; mine.errors = document.errors || []; }
+    },
+  },
+};

@@ -1,0 +1,162 @@
+"""Calibration: board shots with live coverage, the report, switching, history."""
+
+import threading
+from typing import Any
+
+from fastapi import Response
+from nicegui import ui
+from starlette.responses import RedirectResponse
+
+from rig.errors import InputError
+from server.calibrations import from_captures
+from server.console.coverage import advice, detect_shot, summary
+from server.console.page import Action, Page, shared, signed_in
+from server.console.theme import page_frame
+from server.problems import Problem
+from server.routes.calibrations import remove_calibration
+from server.routes.captures import take_capture
+from server.routes.rig import use_calibration
+from server.schemas import NewCapture, UseCalibration
+from server.service import Service
+
+LABEL = "calibration board"
+SHOTS_LEAST = 3
+
+
+class Shots:
+    """The board shots that are being collected: one collection a service, which all pages show."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.board: dict[str, Any] = {}
+        self.taken: list[tuple[str, dict[str, list[list[float]]]]] = []
+
+    def add(self, board: dict[str, Any], capture: str, found: dict[str, list[list[float]]]) -> None:
+        with self._lock:
+            if board != self.board:
+                self.board, self.taken = board, []
+            self.taken = [*self.taken, (capture, found)]
+
+    def drop_last(self) -> None:
+        with self._lock:
+            self.taken = self.taken[:-1]
+
+    def clear(self) -> None:
+        with self._lock:
+            self.taken = []
+
+
+shots = Shots()
+
+
+class CalibrationPage(Page, component="calibration.js"):
+    def look(self) -> dict[str, Any]:
+        return shared.get("calibration page", 0.4, lambda: calibration_state(self.service))
+
+
+def calibration_state(service: Service) -> dict[str, Any]:
+    rig = service.rig.describe()
+    names = [camera["name"] for camera in rig["cameras"]]
+    lines = summary(names, [found for _, found in shots.taken])
+    return {
+        "calibrations": shared.get("calibrations", 1.0, service.calibrations.find),
+        "rig": {
+            "kind": rig["kind"],
+            "calibration": rig["calibration"],
+            "own": service.calibrations.in_use() is not None,
+        },
+        "board": shots.board,
+        "shots": len(shots.taken),
+        "coverage": lines,
+        "advice": advice(lines),
+    }
+
+
+def board_of(event: dict[str, Any]) -> dict[str, Any]:
+    """The board's document from the form. Raises InputError."""
+    form = event.get("board") or {}
+    keys = ("kind", "columns", "rows", "square_mm")
+    board = {key: form[key] for key in keys if form.get(key) not in (None, "")}
+    if board.get("kind") == "charuco":
+        board |= {key: form[key] for key in ("marker_ratio", "dictionary") if form.get(key) not in (None, "")}
+    if len(board) < len(keys):
+        raise InputError("board", [f"{key} is missing" for key in keys if key not in board])
+    return board
+
+
+def shoot(page: Page, event: dict[str, Any]) -> str:
+    from calibration.board import board_from_document
+
+    board, service = board_of(event), page.service
+    board_from_document(board)
+    record = take_capture(
+        service, page.caller, NewCapture(label=LABEL, session=None, expression="", seed=None), Response()
+    )
+    files = service.store.folder("captures", record.id) / "files"
+    with service.children.one() as child:
+        found = child.run("server.console.coverage:" + detect_shot.__name__, {"files": str(files), "board": board})
+    seen = sum(bool(corners) for corners in found.values())
+    if not seen:
+        service.store.remove(service.store.folder("captures", record.id))
+        detail = "No camera saw the board; the shot was not kept. Check columns, rows and kind, and hold it in view."
+        raise Problem(422, "no-board", detail)
+    shots.add(board, record.id, found)
+    shared.forget("calibration page")
+    return f"Shot {len(shots.taken)}: {seen} of {len(found)} cameras see the board."
+
+
+def take_back(page: Page, event: dict[str, Any]) -> None:
+    shots.drop_last()
+    shared.forget("calibration page")
+
+
+def calibrate(page: Page, event: dict[str, Any]) -> str:
+    if len(shots.taken) < SHOTS_LEAST:
+        raise Problem(
+            422, "too-few-shots", f"{len(shots.taken)} shots; at least {SHOTS_LEAST} are needed, 15 are good."
+        )
+    service = page.service
+    with service.store.incoming() as folder:
+        target = folder / "calibration"
+        target.mkdir()
+        from_captures(service.store, target, shots.board, [capture for capture, _ in shots.taken])
+        service.calibrations.add(target, "rig", str(event.get("label") or "")[:500])
+    shots.clear()
+    _forget()
+    return "The calibration is queued."
+
+
+def use(page: Page, event: dict[str, Any]) -> str:
+    use_calibration(page.service, page.caller, UseCalibration(calibration_id=event["id"]))
+    _forget()
+    return "Every capture from now on gets this calibration."
+
+
+def remove(page: Page, event: dict[str, Any]) -> str:
+    remove_calibration(page.service, page.caller, event["id"])
+    _forget()
+    return "Its pictures and its report are removed."
+
+
+def _forget() -> None:
+    for key in ("calibrations", "calibration page", "rig"):
+        shared.forget(key)
+
+
+CalibrationPage.actions = {
+    "shoot": Action("capture", shoot),
+    "take_back": Action("capture", take_back),
+    "calibrate": Action("capture", calibrate),
+    "use": Action("capture", use),
+    "remove": Action("capture", remove),
+}
+
+
+@ui.page("/calibration")
+async def calibration_page() -> RedirectResponse | None:
+    caller = await signed_in()
+    if caller is None:
+        return RedirectResponse("/sign-in")
+    with page_frame("calibration") as frame:
+        CalibrationPage(frame, caller)
+    return None

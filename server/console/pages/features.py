@@ -1,0 +1,131 @@
+"""Features: the seven points of section 4.2, picked in three or four views. Skipping this page is fine: without points
+the pipeline finds the alignment by itself."""
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fastapi import Response
+from nicegui import ui
+from starlette.responses import RedirectResponse
+
+from pipeline.features import SEVEN_POINTS
+from rig.layout import Rig
+from rig.layout_files import find_rig_file, read_rig_file
+from server.console.guides import helps, nearest_views
+from server.console.page import Action, Page, shared, signed_in
+from server.console.theme import page_frame
+from server.routes.captures import get_features, put_features
+from server.routes.jobs import submit_job
+from server.schemas import NewFeatures, NewJob
+from server.service import Service
+
+VIEWS = 4
+
+
+class FeaturesPage(Page, component="features.js"):
+    """The points are the page's own until they are saved."""
+
+    def look(self) -> dict[str, Any]:
+        captures = [
+            {key: c[key] for key in ("id", "label", "created", "features")} for c in self.service.store.captures()
+        ]
+        chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
+        if chosen is None or all(capture["id"] != chosen for capture in captures):
+            return {"captures": captures, "capture": None, "asked": self.choice.get("capture")}
+        return {"captures": captures, "capture": self._picking(chosen)}
+
+    def _picking(self, capture_id: str) -> dict[str, Any]:
+        if self.choice.get("of") != capture_id:
+            saved = get_features(self.service, self.caller, capture_id).points
+            self.choice |= {"of": capture_id, "points": saved, "saved": saved}
+        record = self.service.store.capture(capture_id)
+        rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service, capture_id))
+        points = self.choice["points"]
+        pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in points.items()}
+        return {
+            "id": capture_id,
+            "cameras": record["cameras"],
+            "views": nearest_views(rig, record["front"], VIEWS),
+            "names": list(SEVEN_POINTS),
+            "points": points,
+            "dirty": points != self.choice["saved"],
+            **helps(rig, pixels, landmarks.of(self.service)),
+        }
+
+
+def rig_of(service: Service, capture_id: str) -> Rig:
+    path = find_rig_file(service.store.folder("captures", capture_id) / "files")
+    assert path is not None  # it was accepted with one
+    return read_rig_file(Path(path))
+
+
+class Landmarks:
+    """The seven landmarks of the default model's mean head (head frame, mm). Loading a model takes a second or more:
+    it is asked for once, in a thread, and the page works without until it is there."""
+
+    def __init__(self) -> None:
+        self._asked = threading.Lock()
+        self.found: dict[str, np.ndarray] = {}
+
+    def of(self, service: Service) -> dict[str, np.ndarray]:
+        if not self.found and self._asked.acquire(blocking=False):
+            threading.Thread(target=self._load, args=(service,), daemon=True).start()
+        return self.found
+
+    def _load(self, service: Service) -> None:
+        try:
+            with service.children.one() as child:
+                arguments = {"model": "default", "names": list(SEVEN_POINTS)}
+                found = child.run("server.console.guides:mean_landmarks", arguments)
+            self.found = {name: np.array(point) for name, point in found.items()}
+        finally:
+            self._asked.release()
+
+
+landmarks = Landmarks()
+
+
+def place(page: Page, event: dict[str, Any]) -> None:
+    """Sets one point in one view, or takes it back where ``at`` is null."""
+    points = {name: dict(views) for name, views in page.choice["points"].items()}
+    views = points.setdefault(event["point"], {})
+    if event["at"] is None:
+        views.pop(event["camera"], None)
+    else:
+        views[event["camera"]] = [round(float(value), 2) for value in event["at"]]
+    page.choice["points"] = {name: views for name, views in points.items() if views}
+
+
+def save(page: Page, event: dict[str, Any]) -> str:
+    points = page.choice["points"]
+    put_features(page.service, page.caller, page.choice["of"], NewFeatures(points=points))
+    page.choice["saved"] = points
+    return "Saved. Jobs from now on use these points."
+
+
+def reconstruct(page: Page, event: dict[str, Any]) -> str:
+    if page.choice["points"] != page.choice["saved"]:
+        save(page, event)
+    wanted = NewJob.model_validate({"capture_id": page.choice["of"]})
+    job = submit_job(page.service, page.caller, wanted, Response())
+    return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
+
+
+FeaturesPage.actions = {
+    "place": Action("read", place),
+    "save": Action("capture", save),
+    "reconstruct": Action("submit", reconstruct),
+}
+
+
+@ui.page("/features")
+@ui.page("/features/{capture}")
+async def features_page(capture: str = "") -> RedirectResponse | None:
+    caller = await signed_in()
+    if caller is None:
+        return RedirectResponse("/sign-in")
+    with page_frame("features") as frame:
+        FeaturesPage(frame, caller, capture=capture or None)
+    return None

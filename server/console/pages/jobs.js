@@ -1,0 +1,83 @@
+// The queue at the left, one job at the right.
+import { clock, fixed, span } from "/console/static/words.js";
+
+const MOSTLY = 0.25; // of the rim: beyond it hair or clothes hide the face, and the residual says nothing
+const POOR_PX = 3.0; // contour residual from which a camera is worth a look
+
+export default {
+  props: { state: Object },
+  emits: ["act", "choose"],
+  data: () => ({ form: null, busy: "", show: "" }),
+  computed: {
+    jobs() { return this.state.jobs || []; },
+    job() { return this.jobs.find((j) => j.id === this.state.detail?.id) || null; },
+    active() { return this.job && ["queued", "running"].includes(this.job.state); },
+    sheet() { return `/console/jobs/${this.job.id}/contact_sheet.png`; },
+    lead() {
+      const running = this.jobs.filter((j) => j.state === "running").length, queued = this.jobs.filter((j) => j.state === "queued").length;
+      return this.state.loading ? "Reading" : `${running} running, ${queued} queued, ${this.jobs.length - running - queued} ended`;
+    },
+  },
+  template: `
+    <section class="page" aria-label="Jobs">
+      <header><h1>Jobs</h1><span class="lead">{{ lead }}</span>
+        <template v-if="job">
+          <button class="b" v-if="active" id="cancel" :disabled="!!busy" @click="act('cancel')">Cancel</button>
+          <button class="b" v-else :disabled="!!busy" @click="act('delete')">Remove</button>
+          <button class="b" id="restart" :disabled="!!busy" @click="open">Restart</button>
+          <a class="b main-action" v-if="job.state === 'succeeded'" id="to-result" :href="'/result/' + job.id">Open the head</a>
+        </template></header>
+      <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
+        <div class="panel scroll" tabindex="0" role="region" aria-label="List of jobs">
+          <div v-if="!state.loading && !jobs.length" class="empty"><h2>No jobs yet</h2><p>Choose a capture and press Reconstruct.</p><a class="b main-action" href="/captures">Go to captures</a></div>
+          <button v-for="j in jobs" :key="j.id" class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="$emit('choose', { job: j.id }); form = null">
+            <span class="line"><strong class="cut grow">{{ j.capture || clock(j.captured) }}</strong><span class="tag" :class="kind(j)">{{ j.state }}</span></span>
+            <span class="bar" role="progressbar" :aria-label="'Progress of ' + j.id.slice(-6)" :aria-valuenow="Math.round(100 * j.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * j.progress + '%' }"></i></span>
+            <span class="small muted line"><span class="grow cut">{{ j.state === 'running' ? j.stage : clock(j.created) }}<template v-if="j.restart_of"> &middot; after {{ j.restart_of.slice(-6) }}</template></span>
+              <span class="num">{{ j.state === 'running' && j.eta_s !== null ? span(j.eta_s) + ' left' : took(j) }}</span></span>
+          </button>
+        </div>
+        <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="The chosen job">
+          <template v-if="job">
+            <div class="line wrap"><h2>{{ job.capture || clock(job.captured) }}</h2><span class="tag" :class="kind(job)">{{ job.state }}</span><span class="muted small mono">{{ job.id.slice(-6) }}</span>
+              <span class="muted small push">{{ job.model || 'default model' }} &middot; {{ job.settings.method || 'contour' }} &middot; queue {{ job.queue }}</span></div>
+            <form v-if="form" class="panel pad stack" style="background: var(--raised)" @submit.prevent="restart" aria-label="Restart with other settings">
+              <div class="line wrap" style="align-items: end">
+                <label class="field">Method<select v-model="form.method"><option value="">as set</option><option value="contour">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
+                <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option></select></label>
+                <label class="field">Front camera<input v-model="form.front" placeholder="guessed" size="8"></label></div>
+              <label class="field">Further settings, JSON<textarea v-model="form.more" rows="3" spellcheck="false"></textarea></label>
+              <div class="line"><button class="b main-action" :disabled="!!busy">Queue the new job</button><button type="button" class="b quiet" @click="form = null">Keep it as it is</button></div>
+            </form>
+            <div v-if="job.error" class="stack" role="alert"><p class="fault">{{ job.error.detail }}</p><ul class="faults small"><li v-for="(e, i) in job.error.errors" :key="i">{{ e }}</li></ul></div>
+            <ul v-if="state.detail.warnings.length" class="faults small"><li v-for="(w, i) in state.detail.warnings" :key="i" class="warn">{{ w.message }}</li></ul>
+            <div class="columns" style="grid-template-columns: minmax(0, 1fr) 15rem; flex: none">
+              <div v-if="state.detail.cameras.length" class="scroll" tabindex="0" role="region" aria-label="Residuals by camera"><table>
+                <thead><tr><th>Camera</th><th class="num" title="Overlap of silhouette and fitted head in the face region">IoU</th><th class="num">contour, px</th><th class="num">excluded</th><th class="num" title="Silhouette difference of the starting head">XOR before</th><th class="num">XOR after</th><th></th></tr></thead>
+                <tbody><tr v-for="c in state.detail.cameras" :key="c.name"><td>{{ c.name }}</td><td class="num">{{ fixed(c.iou, 3) }}</td><td class="num" :class="{ warn: c.contour_rms_px > poor && c.excluded_share < mostly }">{{ fixed(c.contour_rms_px, 2) }}</td><td class="num">{{ c.excluded_share === null ? '-' : (100 * c.excluded_share).toFixed(0) + ' %' }}</td><td class="num">{{ fixed(c.xor_cost_start, 0) }}</td><td class="num">{{ fixed(c.xor_cost, 0) }}</td><td :class="{ warn: !c.used }">{{ c.used ? '' : 'left out' }}</td></tr></tbody></table></div>
+              <p v-else class="muted">{{ active ? 'Residuals by camera stand here when the job is done.' : 'The job left no report.' }}</p>
+              <div class="stack"><h3>Log</h3><table class="small"><tbody><tr v-for="(l, i) in state.detail.log" :key="i"><td class="num muted">{{ fixed(l.at_s, 1) }} s</td><td>{{ l.text }}</td></tr></tbody></table>
+                <p v-if="state.detail.stopped_because" class="small muted">{{ state.detail.stopped_because }}, {{ state.detail.evaluations }} evaluations, {{ span(state.detail.seconds.total) }}</p></div>
+            </div>
+            <template v-if="state.detail.pictures">
+              <div class="line"><h3>Silhouette difference before and after</h3></div>
+              <a :href="sheet" target="_blank" rel="noopener" aria-label="Open the contact sheet"><img :src="sheet" alt="Contact sheet: input, silhouette difference before and after the fit, and the head from new views" style="width: 100%; border-radius: 3px; display: block" @error="$event.target.style.display = 'none'"></a>
+              <h3>Input contour and fitted contour</h3>
+              <div class="thumbs"><a v-for="c in state.detail.cameras" :key="c.name" class="thumb" :href="overlay(c.name)" target="_blank" rel="noopener" :aria-label="'Overlay of ' + c.name"><img :src="overlay(c.name)" :alt="'Contours in ' + c.name" loading="lazy"><span>{{ c.name }}</span></a></div>
+            </template>
+          </template>
+          <div v-else-if="!state.loading && jobs.length" class="empty"><p>Choose a job.</p></div>
+        </div>
+      </div>
+    </section>`,
+  created() { Object.assign(this, { clock, fixed, span, poor: POOR_PX, mostly: MOSTLY }); },
+  methods: {
+    kind(j) { return j.state === "failed" ? "fault" : j.state === "running" || j.state === "succeeded" ? "accent" : ""; },
+    took(j) { return j.started && j.finished ? span((new Date(j.finished) - new Date(j.started)) / 1000) : ""; },
+    overlay(name) { return `/console/jobs/${this.job.id}/overlays/${name}.png`; },
+    act(name) { this.busy = name; this.$emit("act", { name, id: this.job.id }); },
+    acted() { this.busy = ""; },
+    open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { method, detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
+    restart() { this.busy = "restart"; this.$emit("act", { name: "restart", id: this.job.id, ...this.form }); this.form = null; },
+  },
+};

@@ -1,0 +1,61 @@
+"""The head: turned, coloured, measured, compared, fetched."""
+
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+from nicegui.elements import scene
+from starlette.responses import RedirectResponse
+
+from server.console.page import Page, shared, signed_in
+from server.console.pages.jobs import jobs_list
+from server.console.pages.rig import read_report
+from server.console.theme import page_frame
+from server.service import Service
+
+THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of three.js
+
+
+class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
+    def look(self) -> dict[str, Any]:
+        results = shared.get("results", 1.0, lambda: finished(self.service))
+        chosen = self.choice.get("job") or (results[0]["id"] if results else None)
+        known = next((job for job in results if job["id"] == chosen), None)
+        return {"results": results, "job": known and head_of(self.service, known), "asked": self.choice.get("job")}
+
+
+def finished(service: Service) -> list[dict[str, Any]]:
+    keys = ("id", "capture", "captured", "capture_id", "created", "finished", "settings", "model")
+    return [{key: job[key] for key in keys} for job in jobs_list(service) if job["state"] == "succeeded"]
+
+
+def head_of(service: Service, job: dict[str, Any]) -> dict[str, Any]:
+    """What stands beside the head: measurements, warnings, files, whether the truth is known."""
+    report = read_report(service, job["id"])
+    truth = service.store.folder("captures", job["capture_id"]) / "truth" / "head.ply"
+    cameras = report.get("cameras", {}).values()
+    residuals = [c["contour_rms_px"] for c in cameras if c.get("used") and c.get("contour_rms_px") is not None]
+    return job | {
+        "measurements": report.get("measurements", {}),
+        "quality": report.get("quality", {}),
+        "warnings": report.get("warnings", []),
+        "seconds": report.get("seconds", {}).get("total"),
+        "contour_px": sum(residuals) / len(residuals) if residuals else None,
+        "method": report.get("method"),
+        "model_name": report.get("model", {}).get("name"),
+        "truth": truth.is_file(),
+        "files": {
+            name: file["bytes"] for name, file in service.jobs.get(job["id"])["files"].items() if "/" not in name
+        },
+    }
+
+
+@ui.page("/result")
+@ui.page("/result/{job}")
+async def result_page(job: str = "") -> RedirectResponse | None:
+    caller = await signed_in()
+    if caller is None:
+        return RedirectResponse("/sign-in")
+    with page_frame("result") as frame:
+        ResultPage(frame, caller, job=job or None)
+    return None

@@ -1,0 +1,165 @@
+// Eleven tiles. Pictures and their exposure and sharpness come by one stream; the rest is the page's state.
+import { clock, fixed, typing } from "/console/static/words.js";
+
+const COUNT_S = 3;
+const STALE_MS = 2500;
+const EXPOSURE = { dark: 50, bright: 205, clipped: 0.02 }; // mean grey level of 255; share of pixels at 255 in all channels
+const SOFT_PX = 2.0; // spread of an edge from which a contour is measurably worse
+
+export default {
+  props: { state: Object },
+  emits: ["act"],
+  data: () => ({ live: {}, fault: "", now: Date.now(), count: 0, busy: "", frames: 0 }),
+  computed: {
+    cameras() { return this.state.cameras || []; },
+    lead() {
+      if (this.state.loading) return "Reading the rig's state";
+      const kind = this.state.kind === "simulated" ? "Simulated studio" : "Rig";
+      return `${kind}, ${this.cameras.length} cameras. ${this.state.last ? "Last capture " + clock(this.state.last.created) : "No capture yet: seat the subject and press the space bar"}`;
+    },
+    calibration() {
+      if (this.state.in_use) return { text: `calibrated ${clock(this.state.in_use.created)}`, kind: "good" };
+      if (this.state.calibration) return { text: this.state.calibration === "studio" ? "studio's own layout" : "calibrated", kind: "good" };
+      return { text: "not calibrated", kind: "fault" };
+    },
+    advice() {
+      const todo = (this.state.faults || []).map((text) => ({ text, kind: "fault" }));
+      const where = (test) => this.cameras.map((c) => c.name).filter((name) => this.live[name] && test(this.live[name])).join(", ");
+      const add = (names, text) => names && todo.push({ text: `${names}: ${text}`, kind: "warn" });
+      add(where((l) => l.clipped > EXPOSURE.clipped), "too bright, skin burns out. Close the aperture or dim the lamps.");
+      add(where((l) => l.mean < EXPOSURE.dark), "too dark. Open the aperture or raise the lamps.");
+      add(where((l) => l.blur_px > SOFT_PX), "soft. Focus on the subject's near eye.");
+      add(this.cameras.filter((c) => c.moved).map((c) => c.name).join(", "), "has moved since the calibration. Calibrate again.");
+      add(this.cameras.filter((c) => this.sync(c).bad).map((c) => c.name).join(", "), "not in sync in the last shot. Check the trigger cable, shoot again.");
+      if (!this.state.loading && !this.state.calibration) todo.push({ text: "No calibration. Make one on the page Calibration and put it to use.", kind: "fault" });
+      return todo;
+    },
+    columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
+  },
+  template: `
+    <section class="page" aria-label="Rig">
+      <header>
+        <h1>Rig</h1><span class="lead">{{ lead }}</span>
+        <button class="b" :disabled="!!busy" @click="plates">{{ busy === 'plates' ? 'Taking plates ...' : 'Clean plates' }} <kbd>B</kbd></button>
+        <button class="b main-action" id="capture" :disabled="!!busy" style="min-width: 10.5rem; justify-content: center" @click="start">{{ busy === 'capture' ? 'Capturing ...' : count ? 'Stop' : 'Capture' }} <kbd>{{ count ? 'Esc' : 'Space' }}</kbd></button>
+      </header>
+      <div class="tiles" :style="{ gridTemplateColumns: 'repeat(' + columns + ', minmax(0, 1fr))', gridTemplateRows: 'repeat(' + Math.ceil((cameras.length + 1) / columns) + ', minmax(0, 1fr))' }">
+        <article v-for="camera in cameras" :key="camera.name" class="panel tile" :data-camera="camera.name" :data-frames="live[camera.name]?.frames || 0" :aria-label="camera.name">
+          <div class="picture"><canvas :ref="el => keep(camera.name, el)" width="320" height="240" role="img" :aria-label="'Live picture of ' + camera.name"></canvas>
+            <p v-if="waiting(camera)">{{ waiting(camera) }}</p></div>
+          <div class="facts">
+            <strong>{{ camera.name }}</strong>
+            <span class="cut muted" :class="{ warn: sync(camera).bad }">{{ sync(camera).text }}</span>
+            <span class="line"><i :class="['dot', camera.moved ? 'warn' : calibration.kind]"></i><span :class="{ warn: camera.moved, fault: calibration.kind === 'fault' }">{{ camera.moved ? 'moved' : calibration.kind === 'good' ? 'calibrated' : 'uncalibrated' }}</span></span>
+            <div class="gauge">
+              <span title="Mean grey level, 0 to 255">exp <b :class="{ warn: light(camera.name).bad }">{{ light(camera.name).text }}</b></span>
+              <span title="Pixels at full white">clip <b :class="{ warn: (live[camera.name]?.clipped || 0) > limit.clipped }">{{ percent(live[camera.name]?.clipped) }}</b></span>
+              <span title="Spread of edges in pixels; smaller is sharper">blur <b :class="{ warn: live[camera.name]?.blur_px > soft }">{{ fixed(live[camera.name]?.blur_px, 1) }}</b></span>
+            </div>
+          </div>
+        </article>
+        <aside class="panel pad stack scroll" aria-label="State of the rig">
+          <h2>{{ advice.length ? 'To do' : 'Ready to capture' }}</h2>
+          <ul v-if="advice.length" class="faults small"><li v-for="(a, i) in advice" :key="i" :class="a.kind">{{ a.text }}</li></ul>
+          <p v-else class="muted small">Exposure, sharpness and sync are in order. Seat the subject, look at the front camera, press the space bar.</p>
+          <div class="small muted stack" style="gap: .2rem; margin-top: auto">
+            <span><i :class="['dot', calibration.kind]"></i> {{ calibration.text }}<template v-if="state.in_use?.rms_px">, {{ fixed(state.in_use.rms_px, 2) }} px</template></span>
+            <a href="/calibration">Calibration</a><a v-if="state.last" href="/captures">Captures</a>
+          </div>
+        </aside>
+      </div>
+      <div v-if="count" class="countdown" role="alert"><span>{{ count }}</span></div>
+    </section>`,
+  created() { this.soft = SOFT_PX; this.limit = EXPOSURE; this.canvas = {}; this.fixed = fixed; },
+  mounted() {
+    window.addEventListener("keydown", this.key);
+    this.clockTimer = setInterval(() => (this.now = Date.now()), 500);
+    this.watch();
+  },
+  unmounted() {
+    window.removeEventListener("keydown", this.key);
+    clearInterval(this.clockTimer); clearInterval(this.counter);
+    this.gone = true; this.reader?.cancel();
+  },
+  methods: {
+    keep(name, element) { if (element) this.canvas[name] = element; },
+    percent(share) { return share === undefined ? "-" : `${(100 * share).toFixed(share < 0.1 ? 1 : 0)}%`; },
+    light(name) {
+      const mean = this.live[name]?.mean;
+      if (mean === undefined || mean === null) return { text: "-", bad: false };
+      return { text: mean.toFixed(0), bad: mean < EXPOSURE.dark || mean > EXPOSURE.bright };
+    },
+    sync(camera) {
+      if (!camera.sync) return { text: "no shot yet", bad: false };
+      const skew = camera.sync.skew_ms === null || camera.sync.skew_ms === undefined ? "" : ` ${camera.sync.skew_ms.toFixed(1)} ms`;
+      return { text: camera.sync.status + skew, bad: !["in sync", "ok"].includes(camera.sync.status) };
+    },
+    waiting(camera) {
+      const seen = this.live[camera.name];
+      if (camera.state === "missing") return "No camera. Check its cable and power.";
+      if (!seen) return this.fault || "Starting the live view ...";
+      if (seen.fault) return seen.fault;
+      return this.now - seen.at > STALE_MS ? "The picture stands still" : "";
+    },
+    start() { if (this.count) this.stop(); else if (!this.busy) this.countDown(); },
+    countDown() {
+      this.count = COUNT_S;
+      this.counter = setInterval(() => { this.count -= 1; if (this.count === 0) { clearInterval(this.counter); this.act("capture"); } }, 1000);
+    },
+    stop() { clearInterval(this.counter); this.count = 0; },
+    plates() { if (!this.busy) this.act("plates"); },
+    act(name) { this.busy = name; this.$emit("act", { name }); },
+    acted() { this.busy = ""; },
+    key(event) {
+      if (typing(event)) return;
+      if (event.key === " ") { event.preventDefault(); if (!event.repeat) this.start(); }
+      else if (event.key === "Escape") this.stop();
+      else if (event.key === "b" || event.key === "B") this.plates();
+    },
+    async watch() {
+      while (!this.gone) {
+        try {
+          const answer = await fetch("/console/live");
+          if (!answer.ok) throw new Error(answer.statusText);
+          this.reader = answer.body.getReader();
+          await this.read(this.reader);
+        } catch (error) { this.fault = "Waiting for the service ..."; }
+        await new Promise((resolve) => setTimeout(resolve, 1000));
+      }
+    },
+    async read(reader) {
+      let kept = new Uint8Array(0);
+      for (;;) {
+        const { done, value } = await reader.read();
+        if (done) return;
+        const joined = new Uint8Array(kept.length + value.length);
+        joined.set(kept); joined.set(value, kept.length); kept = joined;
+        for (;;) {
+          if (kept.length < 8) break;
+          const view = new DataView(kept.buffer, kept.byteOffset);
+          const header = view.getUint32(0), body = view.getUint32(4);
+          if (kept.length < 8 + header + body) break;
+          const document = JSON.parse(new TextDecoder().decode(kept.subarray(8, 8 + header)));
+          await this.show(document, kept.slice(8 + header, 8 + header + body));
+          kept = kept.slice(8 + header + body);
+        }
+      }
+    },
+    async show(document, body) {
+      this.fault = document.fault;
+      let start = 0;
+      const drawn = document.cameras.map(async (camera) => {
+        const data = body.subarray(start, (start += camera.bytes));
+        const before = this.live[camera.name]?.frames || 0;
+        this.live[camera.name] = { ...camera, at: Date.now(), frames: before + (camera.bytes > 0) };
+        const canvas = this.canvas[camera.name];
+        if (!canvas || !camera.bytes) return;
+        const picture = await createImageBitmap(new Blob([data], { type: "image/jpeg" }));
+        if (canvas.width !== picture.width || canvas.height !== picture.height) { canvas.width = picture.width; canvas.height = picture.height; }
+        canvas.getContext("2d").drawImage(picture, 0, 0);
+        picture.close();
+      });
+      await Promise.all(drawn);
+    },
+  },
+};

@@ -1,0 +1,98 @@
+"""The rig: eleven live tiles with exposure, sharpness, sync and calibration, clean plates, the trigger."""
+
+import json
+from typing import Any
+
+from fastapi import Response
+from nicegui import ui
+from starlette.responses import RedirectResponse
+
+from server.console.media import live_view
+from server.console.page import Action, Page, shared, signed_in
+from server.console.theme import page_frame
+from server.routes.captures import take_capture
+from server.routes.rig import take_background
+from server.schemas import NewCapture
+from server.service import Service
+
+
+class RigPage(Page, component="rig.js"):
+    def look(self) -> dict[str, Any]:
+        return shared.get("rig", 0.4, lambda: rig_state(self.service))
+
+
+def rig_state(service: Service) -> dict[str, Any]:
+    """What the tiles say beside the live pictures: the driver's state, the last shot's sync, the calibration."""
+    rig = service.rig.describe()
+    last = next(service.store.captures(), None)
+    shot = (last or {}).get("shot") or {}
+    moved = moved_cameras(service)
+    cameras = [
+        {**camera, "sync": shot.get("cameras", {}).get(camera["name"]), "moved": camera["name"] in moved}
+        for camera in rig["cameras"]
+    ]
+    return {
+        "kind": rig["kind"],
+        "ready": rig["ready"],
+        "cameras": cameras,
+        "faults": rig["faults"] + [fault for fault in [live_view(service).fault] if fault],
+        "calibration": rig["calibration"],
+        "in_use": calibration_in_use(service),
+        "last": None if last is None else {"id": last["id"], "created": last["created"], "source": last["source"]},
+    }
+
+
+def calibration_in_use(service: Service) -> dict[str, Any] | None:
+    """Label, time and residual of the calibration that every capture gets; None for the rig's own."""
+    if service.calibrations.in_use() is None:
+        return None
+    for found in shared.get("calibrations", 2.0, service.calibrations.find):
+        if found["in_use"]:
+            return {"label": found["label"], "created": found["created"], "rms_px": found["figures"].get("rms_px")}
+    return None
+
+
+def moved_cameras(service: Service) -> set[str]:
+    """Cameras that the last result calls moved."""
+    done = service.jobs.find(state="succeeded", limit=1)
+    if not done:
+        return set()
+    report = read_report(service, done[0]["id"])
+    told = " ".join(w["message"] for w in report.get("warnings", []) if "moved" in w["code"])
+    return {name for name in report.get("cameras", {}) if name in told}
+
+
+def read_report(service: Service, job_id: str) -> dict[str, Any]:
+    """report.json of a finished job; empty where it has none. Results do not change, so that it is read once."""
+    path = service.store.folder("jobs", job_id) / "result" / "report.json"
+
+    def read() -> dict[str, Any]:
+        return json.loads(path.read_text()) if path.is_file() else {}
+
+    return shared.get(("report", job_id), 3600.0, read)
+
+
+def capture(page: Page, event: dict[str, Any]) -> str:
+    wanted = NewCapture(label=event.get("label", ""), session=event.get("session"), expression="", seed=None)
+    record = take_capture(page.service, page.caller, wanted, Response())
+    return f"Captured {len(record.cameras)} pictures. They are on the page Captures."
+
+
+def plates(page: Page, event: dict[str, Any]) -> str:
+    taken = take_background(page.service, page.caller)
+    return f"{taken.plates} clean plates of {len(taken.cameras)} cameras." + (
+        f" Note: {taken.note}." * bool(taken.note)
+    )
+
+
+RigPage.actions = {"capture": Action("capture", capture), "plates": Action("capture", plates)}
+
+
+@ui.page("/")
+async def rig_page() -> RedirectResponse | None:
+    caller = await signed_in()
+    if caller is None:
+        return RedirectResponse("/sign-in")
+    with page_frame("rig") as frame:
+        RigPage(frame, caller)
+    return None

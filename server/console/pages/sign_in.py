@@ -1,0 +1,38 @@
+"""Where an API key is asked for. It travels over the page's socket, never in an address."""
+
+import asyncio
+
+import anyio.to_thread
+from nicegui import app as pages
+from nicegui import ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+
+from server.console.identity import KEY_ID, service_of_pages, sign_in
+from server.console.page import signed_in
+
+WRONG_PAUSE_S = 1.0  # after a key that is nobody's
+
+
+class SignIn(Element, component="sign_in.js"):
+    def __init__(self) -> None:
+        super().__init__()
+        self.on("key", self._try)
+
+    async def _try(self, event: GenericEventArguments) -> None:
+        caller = await anyio.to_thread.run_sync(sign_in, service_of_pages(), str(event.args)[:200])
+        if caller is None:
+            await asyncio.sleep(WRONG_PAUSE_S)
+            self.run_method("refuse", "No such key. Make one with: eigenhead keys add NAME")
+        else:
+            pages.storage.user[KEY_ID] = caller.key
+            ui.navigate.to("/")
+
+
+@ui.page("/sign-in")
+async def sign_in_page() -> None:
+    ui.page_title("Sign in - eigenhead")
+    caller = await signed_in()
+    if caller is not None and caller.key == "local":
+        ui.navigate.to("/")
+    SignIn()

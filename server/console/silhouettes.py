@@ -1,0 +1,38 @@
+"""Silhouettes of a capture as pictures to lay over its images; runs in a child process. Kept in the cache folder."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from pipeline.segmentation import segment
+from pipeline.settings import SegmentationSettings
+from rig.capture import read_capture
+from rig.files import write_atomically
+from server.child import Bench, Report
+
+WIDTH = 640
+COLOUR = (108, 178, 255)  # the accent of the pages
+LINE_PX = 3
+
+
+def draw(bench: Bench, report: Report, *, capture: str, target: str) -> None:
+    """Writes ``target``/<camera>.png, the outline with a tint of the subject on nothing. Raises InputError."""
+    shot, rig = read_capture(Path(capture))
+    found = segment(shot, rig, SegmentationSettings(), report=report)
+    for name, silhouette in found.items():
+        done, data = cv2.imencode(".png", outline(silhouette.mask)[:, :, [2, 1, 0, 3]])
+        assert done
+        write_atomically(Path(target) / f"{name}.png", data.tobytes())
+
+
+def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
+    """RGBA of at most ``WIDTH``: the outline solid, the inside lightly tinted."""
+    factor = min(1.0, WIDTH / mask.shape[1])
+    size = (round(mask.shape[1] * factor), round(mask.shape[0] * factor))
+    small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    edges, _ = cv2.findContours(small, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    alpha = small * np.uint8(26)
+    cv2.drawContours(alpha, edges, -1, 255, LINE_PX)
+    return np.dstack([np.full(small.shape, value, np.uint8) for value in COLOUR] + [alpha])

@@ -1,0 +1,63 @@
+// Navigation, the service's state, messages in the corner, and the keys that work on every page.
+import { typing } from "/console/static/words.js";
+
+const MESSAGE_MS = 6000;
+const MESSAGES_MOST = 4;
+
+export default {
+  props: { links: Array, current: String, status: Object },
+  data: () => ({ messages: [], next: 1, help: false }),
+  computed: {
+    faults() { return Object.entries(this.status?.faults || {}); },
+  },
+  template: `
+    <div class="frame">
+      <nav class="rail" aria-label="Pages">
+        <div class="brand"><svg viewBox="0 0 32 32" aria-hidden="true"><path d="M16 4c-5.4 0-9 4-9 9.3 0 3.2.6 5.2 1.8 7.700C10.2 24 12.7 28 16 28s5.8-4 7.2-7c1.2-2.5 1.8-4.5 1.8-7.700C25 8 21.4 4 16 4z" fill="none" stroke="currentColor" stroke-width="1.8"/><path d="M16 4v24M7.5 14h17" stroke="var(--accent)" stroke-width="1.8"/></svg>eigenhead</div>
+        <a v-for="(link, i) in links" :key="link.name" :href="link.path" :aria-current="link.name === current ? 'page' : null">
+          <span>{{ link.title }}</span><kbd aria-hidden="true">{{ i + 1 }}</kbd></a>
+        <div class="foot" role="status">
+          <div class="line"><i :class="['dot', faults.length ? 'warn' : 'good']"></i>{{ faults.length ? 'Needs a look' : 'Ready' }}</div>
+          <div v-for="[name, detail] in faults" :key="name" class="warn">{{ name }}: {{ detail }}</div>
+          <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
+          <div>{{ status.disk || '\\u00a0' }}</div>
+          <a v-if="status.local === false" href="/sign-in" style="padding: 0">Other API key</a>
+          <div><kbd>?</kbd> keys</div>
+        </div>
+      </nav>
+      <main class="main"><slot></slot></main>
+      <div class="messages" role="log" aria-live="polite" aria-label="Messages">
+        <div v-for="m in messages" :key="m.id" :class="['message', m.kind]">
+          <div class="grow"><div>{{ m.text }}</div>
+            <ul v-if="m.faults.length" class="faults small muted"><li v-for="(f, i) in m.faults" :key="i">{{ f }}</li></ul></div>
+          <button class="b quiet" aria-label="Close message" @click="drop(m.id)">&times;</button>
+        </div>
+      </div>
+      <div v-if="help" class="keys" role="dialog" aria-label="Keys" @click="help = false">
+        <div class="panel pad stack"><h2>Keys</h2>
+          <table><tbody><tr v-for="[k, what] in keys" :key="k"><td><kbd>{{ k }}</kbd></td><td>{{ what }}</td></tr></tbody></table></div>
+      </div>
+    </div>`,
+  created() {
+    this.keys = [["1 - 6", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["Esc", "stop a countdown, close"],
+      ["1 - 7", "Features: choose a point"], ["Arrows", "Features: move it by 0.25 px (Shift: 2 px)"], ["Tab", "Features: next view"], ["Enter", "Features: take the suggested place"],
+      ["Del", "Features: take the point back"], ["S", "Features: save"], ["T G C W M", "Result: texture, grey, confidence, wireframe, measure"], ["?", "this list"]];
+    window.eigenheadSay = (kind, text, faults) => this.say(kind, text, faults || []);
+  },
+  mounted() { window.addEventListener("keydown", this.key); },
+  unmounted() { window.removeEventListener("keydown", this.key); },
+  methods: {
+    say(kind, text, faults) {
+      const id = this.next++;
+      this.messages = [...this.messages, { id, kind, text, faults }].slice(-MESSAGES_MOST);
+      if (kind === "done") setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
+    },
+    drop(id) { this.messages = this.messages.filter((m) => m.id !== id); },
+    key(event) {
+      if (typing(event)) return;
+      if (event.key === "?") this.help = !this.help;
+      else if (event.key === "Escape") this.help = false;
+      else if (this.current !== "features" && /^[1-6]$/.test(event.key)) window.location.href = this.links[event.key - 1].path;
+    },
+  },
+};

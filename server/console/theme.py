@@ -1,0 +1,52 @@
+"""The one look of all pages: colours and sizes are in ``static/theme.css``, and every page starts in ``page_frame``."""
+
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from nicegui import ui
+from nicegui.element import Element
+
+ACCENT = "#6cb2ff"
+PAGES = (
+    ("rig", "/", "Rig"),
+    ("captures", "/captures", "Captures"),
+    ("features", "/features", "Features"),
+    ("jobs", "/jobs", "Jobs"),
+    ("result", "/result", "Result"),
+    ("calibration", "/calibration", "Calibration"),
+)
+
+Answer = Callable[[Any], Awaitable[Any]]
+
+
+class Frame(Element, component="static/frame.js"):
+    """Navigation, state of the service, messages, and the keys that work everywhere; a page lies in it."""
+
+    def __init__(self, current: str) -> None:
+        super().__init__()
+        links = [{"name": name, "path": path, "title": title} for name, path, title in PAGES]
+        self._props.update(links=links, current=current, status={})
+
+    def show_status(self, status: dict[str, Any]) -> None:
+        if self._props["status"] != status:
+            self._props["status"] = status
+            self.update()
+
+    def say(self, kind: str, text: str, faults: list[str] | None = None) -> None:
+        """A message in the corner: ``kind`` is done, warning or fault; ``faults`` are all listed."""
+        self.run_method("say", kind, text, faults or [])
+
+
+def install() -> None:
+    ui.add_head_html('<link rel="stylesheet" href="/console/static/theme.css">', shared=True)
+    ui.add_head_html('<meta name="color-scheme" content="dark">', shared=True)
+
+
+@contextmanager
+def page_frame(current: str) -> Iterator[Frame]:
+    title = next((title for name, _, title in PAGES if name == current), "Sign in")
+    ui.page_title(f"{title} - eigenhead")
+    ui.colors(primary=ACCENT, dark="#14171c", dark_page="#0d0f12")
+    with Frame(current) as frame:
+        yield frame

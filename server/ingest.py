@@ -1,0 +1,127 @@
+"""What happens to an uploaded archive or a capture folder before it is accepted; runs in a child process.
+
+Camera by camera, so that a rig of 64 large cameras is checked in the memory of one.
+"""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, UnidentifiedImageError
+
+from rig.archive import ArchiveLimits, extract_archive
+from rig.camera import Camera
+from rig.capture import IMAGE_FORMATS, IMAGE_SUFFIXES, capture_root, features_from_bytes, read_shot
+from rig.errors import InputError
+from rig.files import write_atomically
+from rig.layout_files import find_rig_file, read_rig_file
+from server.child import Bench, Report
+
+
+def ingest_archive(
+    bench: Bench, report: Report, *, archive: str, folder: str, limits: dict[str, Any], image_pixels: int
+) -> dict[str, Any]:
+    """Unpacks ``archive``, checks the capture in it, and leaves ``folder`` with exactly its files.
+
+    Returns what the capture's record says of the content. Raises InputError naming every fault.
+    """
+    target = Path(folder)
+    unpacked = target.with_name(target.name + ".unpacked")
+    extract_archive(Path(archive), unpacked, ArchiveLimits(**limits))
+    root = capture_root(unpacked)
+    described = check_capture(root, image_pixels, report)
+    for name in described["inputs"]:
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).rename(target / name)
+    shutil.rmtree(unpacked)
+    return described
+
+
+def ingest_folder(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> dict[str, Any]:
+    """The same for a folder of our own making (a shot of the rig)."""
+    return check_capture(Path(folder), image_pixels, report)
+
+
+def check_capture(root: Path, image_pixels: int, report: Report) -> dict[str, Any]:
+    rig_file = find_rig_file(root)
+    if rig_file is None:
+        raise InputError("capture", ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+    try:
+        rig = read_rig_file(rig_file)
+    except InputError as error:
+        raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+    faults: list[str] = []
+    digests: dict[str, str] = {}
+    for number, camera in enumerate(rig):
+        report("check", number / len(rig))
+        of_camera = _size_faults(root, camera, image_pixels)
+        if not of_camera:
+            digests |= read_shot(root, rig.subset([camera.name]), of_camera).digests
+        faults += [fault for fault in of_camera if not fault.startswith("features.json")]  # judged below, for all
+    if (root / "features.json").is_file():
+        features_from_bytes((root / "features.json").read_bytes(), rig, faults)
+    if faults:
+        raise InputError("capture", faults)
+    for path in _rig_files(rig_file):
+        digests[path.relative_to(root).as_posix()] = _sha256(path)
+    return {
+        "cameras": [{"name": c.name, "width": c.intrinsics.width, "height": c.intrinsics.height} for c in rig],
+        "front": rig.front_camera(),
+        "inputs": dict(sorted(digests.items())),
+        "bytes": sum((root / name).stat().st_size for name in digests),
+    }
+
+
+def check_features(bench: Bench, report: Report, *, folder: str, document: dict[str, Any]) -> str:
+    """Judges feature points for the capture in ``folder`` and stores them; returns the file's sha256."""
+    rig_file = find_rig_file(Path(folder))
+    assert rig_file is not None  # it was accepted with one
+    faults: list[str] = []
+    data = json.dumps(document, indent=1).encode()
+    features_from_bytes(data, read_rig_file(rig_file), faults)
+    if faults:
+        raise InputError("features.json", faults)
+    write_atomically(Path(folder) / "features.json", data)
+    return _sha256(Path(folder) / "features.json")
+
+
+def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
+    """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
+    faults = []
+    wanted = (camera.intrinsics.width, camera.intrinsics.height)
+    for path in _images_of(root, camera.name):
+        name = path.relative_to(root).as_posix()
+        try:
+            with Image.open(path, formats=IMAGE_FORMATS) as header:
+                width, height = header.size
+        except Image.DecompressionBombError:
+            faults.append(f"{name} claims to be huge; at most {image_pixels:,} pixels are accepted")
+            continue
+        except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
+            faults.append(f"{name} is damaged or no PNG, JPEG, TIFF or WebP image")
+            continue
+        if width * height > image_pixels:
+            faults.append(f"{name} is {width} x {height} pixels; at most {image_pixels:,} pixels are accepted")
+        elif (width, height) != wanted:
+            faults.append(f"{name} is {width} x {height} pixels, but its camera is {wanted[0]} x {wanted[1]}")
+    return faults
+
+
+def _images_of(root: Path, camera: str) -> list[Path]:
+    folders = [root / "images", root / "masks", root / "background", root / "background" / camera]
+    files = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
+    files = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    return [path for path in files if path.stem == camera or path.parent == folders[3]]
+
+
+def _rig_files(rig_file: Path) -> list[Path]:
+    """A COLMAP model is several files of one suffix; the other formats are one file."""
+    if rig_file.suffix in (".bin", ".txt"):
+        return sorted(p for p in rig_file.parent.iterdir() if p.is_file() and p.suffix == rig_file.suffix)
+    return [rig_file]
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

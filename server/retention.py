@@ -1,0 +1,103 @@
+"""What is let go, and when: by age, by count, by space. What a queued or running job needs is never touched, nor is
+anything that the service did not make itself."""
+
+import asyncio
+import time
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Any
+
+import structlog
+
+from rig.errors import EigenheadError
+from server.jobs import DELIVERY, FINISHED
+from server.service import Service
+
+LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
+DAY_S = 86400.0
+
+log = structlog.get_logger()
+
+
+async def sweep_forever(service: Service) -> None:
+    """A sweep now and every ``sweep_s``; a failing one is logged and tried again."""
+    while True:
+        try:
+            await service.threads.disk(sweep, service)
+        except Exception as error:  # a full or missing disk, a database that is away
+            log.error("sweep failed", error=str(error)[:300])
+        await asyncio.sleep(service.settings.sweep_s)
+
+
+def sweep(service: Service) -> dict[str, int]:
+    """One sweep; returns how many of each kind went."""
+    gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
+    gone["jobs"] = _jobs(service)
+    gone["captures"] = _captures(service)
+    gone["orphans"] = _orphans(service)
+    gone["deliveries"] = _deliveries(service)
+    if any(gone.values()):
+        log.info("swept", **gone)
+    return gone
+
+
+def _jobs(service: Service) -> int:
+    s, removed = service.settings, 0
+    if s.keep_results_days is None and s.keep_jobs is None and not s.make_room:
+        return 0
+    finished = [job for state in FINISHED for job in service.jobs.find(state=state, limit=100_000)]
+    finished.sort(key=lambda job: job["created"] or "", reverse=True)
+    for place in range(len(finished) - 1, -1, -1):  # oldest first
+        job = finished[place]
+        old = (
+            s.keep_results_days is not None and _age_s(job["finished"] or job["created"]) > s.keep_results_days * DAY_S
+        )
+        many = s.keep_jobs is not None and place >= s.keep_jobs
+        full = s.make_room and service.store.free_bytes() < s.free_bytes
+        if not (old or many or full):
+            break
+        with suppress(EigenheadError):
+            service.jobs.delete(job["id"])
+            removed += 1
+    return removed
+
+
+def _captures(service: Service) -> int:
+    days, removed = service.settings.keep_captures_days, 0
+    if days is None:
+        return 0
+    for record in list(service.store.captures()):
+        if _age_s(record["created"]) > days * DAY_S and not service.jobs.active(capture=record["id"]):
+            service.store.remove(service.store.folder("captures", record["id"]))
+            removed += 1
+    return removed
+
+
+def _orphans(service: Service) -> int:
+    """Attempts that a killed worker left in a job that ended, and folders of jobs that are not known any more."""
+    removed = 0
+    for job_id in service.store.ids("jobs"):
+        folder = service.store.folder("jobs", job_id)
+        attempts = list(folder.glob("attempt-*"))
+        if not attempts or time.time() - max(path.stat().st_mtime for path in attempts) < LEFTOVER_S:
+            continue
+        with suppress(EigenheadError):
+            if service.jobs.state(job_id) in FINISHED:
+                for path in attempts:
+                    service.store.remove(path)
+                    removed += 1
+    return removed
+
+
+def _deliveries(service: Service) -> int:
+    """Messages to webhooks that were delivered, or given up, a day ago."""
+    before = datetime.fromtimestamp(time.time() - DAY_S, UTC).isoformat()
+    client = service.jobs.client
+    rows = client.list_workflows(name=DELIVERY, completed_before=before, load_input=False, load_output=False)
+    if rows:
+        client.delete_workflows([row.workflow_id for row in rows])
+    return len(rows)
+
+
+def _age_s(moment: Any) -> float:
+    return time.time() - datetime.fromisoformat(moment).timestamp() if moment else 0.0

@@ -1,0 +1,241 @@
+"""The rig behind ``POST /v1/captures``: the simulated studio, or real cameras named by a rig.toml.
+
+A calibration that was put to use lies in ``<data>/rig/cameras.json`` and goes into every capture from then on; until
+then the rig's own one does (the studio's layout, or what rig.toml names).
+"""
+
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from rig.capture import Capture, write_capture
+from rig.config import RigConfig, read_rig_config
+from rig.errors import EigenheadError, InputError
+from rig.layout import Rig, read_rig, write_rig
+from rig.plates import link_plates
+from rig.session import RigSession
+from rig.shot import ShotFailed
+from server.child import Child, WorkFailed
+from server.problems import Problem
+from server.settings import ServiceSettings
+
+PREVIEW_WIDTH = 640
+PREVIEW_QUALITY = 80
+SHOT_BYTES = 64 << 20
+
+
+class RigBackend(Protocol):
+    """What the service asks of a rig. Blocks; call it from a thread."""
+
+    def describe(self) -> dict[str, Any]:
+        """id, kind, ready, cameras, faults, calibration."""
+        ...
+
+    def capture(self, folder: Path, *, seed: int | None) -> dict[str, Any]:
+        """Takes a shot into ``folder/files``; returns its certificate. Raises a 503 problem naming what is missing."""
+        ...
+
+    def preview(self, camera: str) -> bytes:
+        """A JPEG of what the camera sees now. Raises a 404 or 503 problem."""
+        ...
+
+    def take_background(self) -> dict[str, Any]:
+        """New clean plates of the empty studio. Raises a 503 problem."""
+        ...
+
+    def use(self, calibration: Path) -> None:
+        """Uses a cameras.json from now on. Raises a 409 problem where it is another rig's."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class SimulatedRig:
+    """The embedded studio, drawn in a child process with its own GL context. The truth of a shot is kept beside it."""
+
+    def __init__(self, calibration: Path) -> None:
+        self._calibration = calibration
+        self._child = Child(niceness=3)
+        self._one_at_a_time = threading.Lock()
+
+    def describe(self) -> dict[str, Any]:
+        rig = self._rig()
+        cameras = [{"name": name, "driver": "simulated", "state": "ready"} for name in rig.names]
+        calibrated = "own" if self._calibration.is_file() else "studio"
+        return _state("simulated", "simulated", cameras, [], calibrated)
+
+    def capture(self, folder: Path, *, seed: int | None) -> dict[str, Any]:
+        with self._one_at_a_time:
+            try:
+                shot = self._child.run("server.shoot:simulated", {"folder": str(folder), "seed": seed})
+            except WorkFailed as error:
+                raise Problem(503, "shot-failed", error.message, [error.message]) from error
+        if self._calibration.is_file():
+            write_rig(read_rig(self._calibration), folder / "files" / "cameras.json")
+        return shot
+
+    def preview(self, camera: str) -> bytes:
+        if camera not in self._rig():
+            raise Problem(404, "not-found", f"The rig has no camera {camera!r:.80}.")
+        with self._one_at_a_time:
+            return self._child.run("server.shoot:preview", {"camera": camera})
+
+    def take_background(self) -> dict[str, Any]:
+        """The studio takes clean plates with every shot; there is nothing to keep."""
+        return {
+            "cameras": list(self._rig().names),
+            "plates": 2,
+            "note": "the simulated studio takes them with each shot",
+        }
+
+    def use(self, calibration: Path) -> None:
+        _check_names(read_rig(calibration), self._rig().names)
+        self._calibration.parent.mkdir(exist_ok=True)
+        write_rig(read_rig(calibration), self._calibration)
+
+    def close(self) -> None:
+        self._child.close()
+
+    @staticmethod
+    def _rig() -> Rig:
+        from rig.studio.layout import default_layout
+
+        return default_layout()
+
+
+class RealRig:
+    """Cameras of a rig.toml: opened at the first need and kept open; a rig that cannot be opened is tried again."""
+
+    def __init__(self, path: Path, calibration: Path) -> None:
+        self._config: RigConfig = read_rig_config(path)
+        self._path, self._calibration = path, calibration
+        self._session: RigSession | None = None
+        self._lock = threading.RLock()
+
+    def describe(self) -> dict[str, Any]:
+        with self._lock:
+            states = {} if self._session is None else self._session.states()
+            error = None if self._session is None else self._session.trigger_error()
+        cameras, faults = [], [] if error is None else [f"trigger: {error}"]
+        for camera in self._config.cameras:
+            state = states.get(camera.name)
+            known = "closed" if state is None else "open" if state.opened else "missing"
+            cameras.append({"name": camera.name, "driver": camera.driver, "state": known})
+            if state is not None and state.error:
+                faults.append(f"{camera.name}: {state.error}")
+        rig = self._calibrated()
+        if rig is None:
+            faults.append("no calibration: calibrate the rig and put the calibration to use")
+        return _state(self._config.name, "real", cameras, faults, None if rig is None else "own")
+
+    def capture(self, folder: Path, *, seed: int | None) -> dict[str, Any]:
+        if seed is not None:
+            raise InputError("request", ["seed: only the simulated studio takes one"])
+        rig = self._calibrated()
+        if rig is None:
+            raise Problem(503, "not-calibrated", "The rig has no calibration: make one, then PUT it to use.")
+        with self._lock:
+            session = self._opened()
+            shot = session.shoot()
+            if not shot.complete:
+                faults = [str(fault) for fault in shot.faults if fault.is_error]
+                raise Problem(503, "shot-failed", "The shot is no capture: " + "; ".join(faults), faults)
+            images = {name: image for name, image in shot.images.items() if name in rig}
+            write_capture(folder / "files", Capture(images), rig)
+            link_plates(session.plates, folder / "files" / "background")
+        return shot.document()
+
+    def preview(self, camera: str) -> bytes:
+        if camera not in self._config.names:
+            raise Problem(404, "not-found", f"The rig has no camera {camera!r:.80}.")
+        with self._lock:
+            image = self._opened().look().get(camera)
+        if image is None:
+            raise Problem(503, "camera-missing", f"{camera} delivers no picture; GET /v1/rig says why.", [camera])
+        return jpeg(image)
+
+    def take_background(self) -> dict[str, Any]:
+        with self._lock:
+            try:
+                plates = self._opened().take_plates()
+            except ShotFailed as error:
+                faults = [str(fault) for fault in error.faults]
+                raise Problem(503, "plates-failed", str(error), faults) from error
+        return {"cameras": sorted(plates.files), "plates": self._config.shot.plates, "note": ""}
+
+    def use(self, calibration: Path) -> None:
+        rig = read_rig(calibration)
+        _check_names(rig, self._config.names)
+        self._calibration.parent.mkdir(exist_ok=True)
+        write_rig(rig, self._calibration)
+        with self._lock:
+            if self._session is not None:
+                self._session.rig = rig
+
+    def close(self) -> None:
+        with self._lock:
+            if self._session is not None:
+                self._session.close()
+                self._session = None
+
+    def _opened(self) -> RigSession:
+        if self._session is None:
+            session = RigSession(self._config)
+            try:
+                session.open()
+                session.warm_up()
+            except EigenheadError as error:
+                session.close()
+                raise Problem(503, "rig-unavailable", str(error), [str(error)]) from error
+            if self._calibration.is_file():
+                session.rig = read_rig(self._calibration)
+            self._session = session
+        return self._session
+
+    def _calibrated(self) -> Rig | None:
+        if self._calibration.is_file():
+            return read_rig(self._calibration)
+        with suppress(InputError):
+            if self._config.calibration_file is not None:
+                return read_rig(self._config.calibration_file)
+        return None
+
+
+def open_rig(settings: ServiceSettings) -> RigBackend:
+    """Raises InputError naming every fault of rig.toml."""
+    calibration = settings.data / "rig" / "cameras.json"
+    return SimulatedRig(calibration) if settings.rig is None else RealRig(settings.rig, calibration)
+
+
+def jpeg(image: np.ndarray) -> bytes:
+    """RGB pixels as a JPEG of at most ``PREVIEW_WIDTH``."""
+    factor = min(1.0, PREVIEW_WIDTH / image.shape[1])
+    small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+    done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
+    assert done
+    return data.tobytes()
+
+
+def _check_names(rig: Rig, names: tuple[str, ...]) -> None:
+    if set(rig.names) != set(names):
+        differing = sorted(set(rig.names) ^ set(names))
+        detail = "The calibration is of other cameras than the rig has."
+        raise Problem(409, "other-rig", detail, [f"{name}: only in one of the two" for name in differing])
+
+
+def _state(
+    identity: str, kind: str, cameras: list[dict[str, Any]], faults: list[str], calibration: str | None
+) -> dict[str, Any]:
+    ready = not faults and all(camera["state"] != "missing" for camera in cameras)
+    return {
+        "id": identity,
+        "kind": kind,
+        "ready": ready,
+        "cameras": cameras,
+        "faults": faults,
+        "calibration": calibration,
+    }

@@ -1,0 +1,81 @@
+"""Settings of the service: from the command line, from EIGENHEAD_* variables, or these defaults."""
+
+import json
+import os
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+PREFIX = "EIGENHEAD_"
+
+
+def default_data() -> Path:
+    """``$XDG_DATA_HOME/eigenhead``, by default ~/.local/share/eigenhead."""
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share") / "eigenhead"
+
+
+class ServiceSettings(BaseSettings):
+    """What an operator may set; each field is also the variable ``EIGENHEAD_<FIELD>``."""
+
+    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid")
+
+    data: Path = Field(default_factory=default_data, description="folder of captures, results and the job database")
+    database_url: str | None = Field(default=None, description="postgresql://...; without it SQLite in the data folder")
+    host: str = "127.0.0.1"
+    port: int = Field(default=8600, ge=0, le=65535)
+    rig: Path | None = Field(default=None, description="rig.toml; without it the simulated studio")
+
+    queue: str = Field(
+        default="cpu", pattern="^[a-z0-9_-]{1,32}$", description="the queue that jobs go to and a worker serves"
+    )
+    queues: tuple[str, ...] = Field(default=("cpu", "gpu"), description="queues that a job may name")
+    concurrency: int = Field(default=1, ge=1, le=64, description="jobs that one worker runs at once")
+    work: str = Field(
+        default="server.work:reconstruct_capture", description="what a job runs in the worker's child process"
+    )
+    heartbeat_s: float = Field(default=3.0, gt=0)
+    silent_s: float = Field(
+        default=15.0, gt=0, description="a worker that is silent for longer is dead; its jobs are taken over"
+    )
+    poll_s: float = Field(default=0.25, gt=0, description="how often a worker looks for jobs, and a stream for events")
+    attempts: int = Field(default=50, ge=1, description="a job that took so many workers down with it fails")
+
+    body_bytes: int = Field(default=8 << 30, ge=1, description="the largest upload")
+    archive_members: int = Field(default=5000, ge=1)
+    archive_bytes: int = Field(default=16 << 30, ge=1, description="the most that one archive unpacks to")
+    archive_ratio: float = Field(default=100.0, gt=1)
+    image_pixels: int = Field(default=64_000_000, ge=1, description="the largest image of a capture")
+    free_bytes: int = Field(default=256 << 20, ge=0, description="disk space that uploads and jobs must leave")
+    jobs_per_key: int = Field(default=200, ge=1, description="queued and running jobs of one API key")
+    checks_at_once: int = Field(default=2, ge=1, description="processes that unpack and check uploads")
+    upload_hours: float = Field(default=48.0, gt=0, description="how long an unfinished resumable upload is kept")
+
+    keep_results_days: float | None = Field(
+        default=None, gt=0, description="age at which finished jobs go; None keeps them"
+    )
+    keep_captures_days: float | None = Field(
+        default=None, gt=0, description="age at which captures go; None keeps them"
+    )
+    keep_jobs: int | None = Field(default=None, ge=0, description="the number of finished jobs kept")
+    make_room: bool = Field(
+        default=False, description="drop the oldest finished results when the disk falls below free_bytes"
+    )
+    sweep_s: float = Field(default=60.0, gt=0)
+
+    log_json: bool = Field(default=False, description="log lines as JSON")
+
+    @property
+    def url(self) -> str:
+        """The database's URL in SQLAlchemy's form."""
+        if self.database_url is None:
+            return f"sqlite:///{self.data.resolve() / 'eigenhead.sqlite'}"
+        scheme, _, rest = self.database_url.partition("://")
+        return f"postgresql+psycopg://{rest}" if scheme in ("postgres", "postgresql") else self.database_url
+
+    def environment(self) -> dict[str, str]:
+        """The variables with which another process reads the same settings."""
+        values = self.model_dump(mode="json", exclude_defaults=True) | {"data": str(self.data.resolve())}
+        return {
+            PREFIX + k.upper(): v if isinstance(v, str) else json.dumps(v) for k, v in values.items() if v is not None
+        }

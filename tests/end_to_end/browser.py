@@ -1,0 +1,108 @@
+"""A real browser for the operator's pages, and what every page must hold to in it."""
+
+import importlib.util
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+SIZES = {"1366x768": (1366, 768), "3840x2160": (3840, 2160)}
+SEVERE = ("serious", "critical")
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """Debian's Chromium with an empty profile; skips where it is absent."""
+    path = os.environ.get("EIGENHEAD_CHROMIUM") or shutil.which("chromium")
+    if path is None:
+        pytest.skip("Chromium is not installed (apt-get install chromium)")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@dataclass
+class Visit:
+    """One page of the browser, with everything it complained about and every address it asked for."""
+
+    page: Page
+    base: str
+    errors: list[str] = field(default_factory=list)
+    addresses: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.page.on("console", self._console)
+        self.page.on("pageerror", lambda error: self.errors.append(f"uncaught: {error}"))
+        self.page.on("request", lambda request: self.addresses.append(request.url))
+        self.page.on("websocket", lambda socket: self.addresses.append(socket.url))
+
+    def _console(self, message: ConsoleMessage) -> None:
+        if message.type == "error":
+            self.errors.append(message.text)
+
+    def go(self, path: str) -> Page:
+        self.page.goto(self.base + path, wait_until="domcontentloaded")
+        self.page.wait_for_selector("section.page", timeout=60_000)
+        return self.page
+
+    def check_clean(self) -> None:
+        """No console error, and no address outside the service."""
+        assert self.errors == []
+        inside = (self.base, self.base.replace("http", "ws"), "blob:", "data:")
+        assert [address for address in self.addresses if not address.startswith(inside)] == []
+
+
+def visit(browser: Browser, base: str, size: str = "1366x768") -> Visit:
+    width, height = SIZES[size]
+    context = browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    return Visit(context.new_page(), base)
+
+
+def keep_screenshots(page: Page, folder: Path, name: str) -> None:
+    """At both sizes; the page stays as it was."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for size, (width, height) in SIZES.items():
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(700)
+        page.screenshot(path=folder / f"{name}-{size}.png")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} is too wide at {size}"
+    page.set_viewport_size({"width": SIZES["1366x768"][0], "height": SIZES["1366x768"][1]})
+
+
+def axe_script() -> str | None:
+    """axe-core as a PyPI package carries it; None where that is not installed."""
+    found = importlib.util.find_spec("axe_playwright_python")
+    if found is None or not found.submodule_search_locations:
+        return None
+    return (Path(found.submodule_search_locations[0]) / "axe.min.js").read_text(encoding="utf-8")
+
+
+def violations(page: Page, script: str) -> list[str]:
+    """Serious and critical findings of axe-core, with where they are."""
+    page.evaluate(script)
+    found = page.evaluate("axe.run(document, { resultTypes: ['violations'] }).then(r => r.violations)")
+    return [
+        f"{v['id']} ({v['impact']}): {v['help']}: " + "; ".join(node["html"][:160] for node in v["nodes"][:4])
+        for v in found
+        if v["impact"] in SEVERE
+    ]

@@ -1,0 +1,151 @@
+"""deploy/setup.sh and what it stands on: the download of uv, the quick way out, the list of allowed skips."""
+
+import functools
+import hashlib
+import importlib.util
+import io
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PROGRAM = b"#!/bin/sh\necho uv 9.9.9\n"
+
+
+@pytest.fixture
+def fetch_uv() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("fetch_uv", ROOT / "deploy" / "fetch_uv.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A package index on this machine with one wheel; relative links, as mirrors have them."""
+    wheel = io.BytesIO()
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("uv-1.0.data/scripts/uvx", b"another program")
+        archive.writestr("uv-1.0.data/scripts/uv", PROGRAM)
+    site = tmp_path / "site"
+    (site / "simple" / "uv").mkdir(parents=True)
+    (site / "files").mkdir()
+    (site / "files" / "uv-1.0-x.whl").write_bytes(wheel.getvalue())
+    page = '<a href="../../files/uv-0.9-x.whl">old</a><a href="../../files/uv-1.0-x.whl#sha256=whatever">new</a>'
+    (site / "simple" / "uv" / "index.html").write_text(page)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(site)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setenv("UV_DEFAULT_INDEX", f"http://127.0.0.1:{server.server_port}/simple")
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    yield site
+    server.shutdown()
+    server.server_close()
+
+
+def pin(fetch_uv: ModuleType, monkeypatch: pytest.MonkeyPatch, filename: str, digest: str) -> None:
+    monkeypatch.setattr(fetch_uv, "WHEELS", {fetch_uv.platform.machine(): (filename, digest)})
+
+
+def test_uv_comes_from_the_index_and_runs(
+    fetch_uv: ModuleType, index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    digest = hashlib.sha256((index / "files" / "uv-1.0-x.whl").read_bytes()).hexdigest()
+    pin(fetch_uv, monkeypatch, "uv-1.0-x.whl", digest)
+    fetch_uv.main(tmp_path / "cache")
+    said = subprocess.run([tmp_path / "cache" / "uv"], capture_output=True, text=True, check=True)
+    assert said.stdout == "uv 9.9.9\n"
+    assert [path.name for path in (tmp_path / "cache").iterdir()] == ["uv"]
+
+
+@pytest.mark.parametrize(
+    ("filename", "words"), [("uv-1.0-x.whl", "not the file that was pinned"), ("uv-2.0-x.whl", "lists no uv-2.0")]
+)
+def test_a_changed_or_missing_wheel_is_refused(
+    fetch_uv: ModuleType, index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filename: str, words: str
+) -> None:
+    pin(fetch_uv, monkeypatch, filename, "0" * 64)
+    with pytest.raises(SystemExit, match=words):
+        fetch_uv.main(tmp_path / "cache")
+    assert not (tmp_path / "cache").exists()
+
+
+def test_no_network_is_said(fetch_uv: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UV_DEFAULT_INDEX", "http://127.0.0.1:9/simple")
+    with pytest.raises(SystemExit, match="Is there a network"):
+        fetch_uv.main(tmp_path)
+
+
+def setup(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = ["bash", "deploy/setup.sh", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_setup_is_quick_and_silent_where_nothing_is_to_do(tmp_path: Path) -> None:
+    for name in ("uv.lock", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
+    shutil.copytree(ROOT / "deploy", tmp_path / "deploy", ignore=shutil.ignore_patterns("firmware"))
+    (tmp_path / ".venv" / "bin").mkdir(parents=True)
+    (tmp_path / ".venv" / "bin" / "python").symlink_to(sys.executable)
+    stamp = 'echo "$(cat uv.lock pyproject.toml deploy/setup.sh | sha256sum) $PWD" > .venv/.ready'
+    subprocess.run(["bash", "-c", stamp], cwd=tmp_path, check=True)
+    begun = time.perf_counter()
+    outcome = setup(tmp_path)
+    assert time.perf_counter() - begun < 1.0
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (0, "", "")
+
+
+def test_setup_refuses_an_unknown_option() -> None:
+    outcome = setup(ROOT, "--everything")
+    assert outcome.returncode == 1
+    assert "--everything" in outcome.stderr
+
+
+SKIPPING = """
+import pytest
+
+def test_runs():
+    pass
+
+def test_wants_a_device():
+    pytest.skip("no device")
+"""
+
+
+@pytest.mark.parametrize(
+    ("ci", "allowed", "status"),
+    [
+        ("", "", 0),
+        ("true", "", 1),
+        ("true", "*::test_wants_*  a device of the operator's", 0),
+        ("true", "*::test_runs x", 1),
+    ],
+)
+def test_a_skip_that_no_list_names_fails_in_ci(tmp_path: Path, ci: str, allowed: str, status: int) -> None:
+    shutil.copy(ROOT / "tests" / "conftest.py", tmp_path)
+    (tmp_path / "allowed_skips.txt").write_text(f"# a comment\n{allowed}\n")
+    (tmp_path / "test_it.py").write_text(SKIPPING)
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = gl: needs an EGL context\n")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path)]
+    environment = os.environ | {"CI": ci, "PYTHONPATH": str(ROOT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    outcome = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert outcome.returncode == status, outcome.stdout
+    assert ("no device" in outcome.stdout) == (status == 1)
