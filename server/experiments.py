@@ -84,7 +84,7 @@ def _facekit(shared: Path) -> HeadModel:
     """ICT-FaceKit: the user's own import, or the compact copy in the shared folder."""
     if (models_folder() / "ict-facekit.npz").is_file():
         return load_model(model_path("ict-facekit"))
-    source = shared / "ict-facekit"
+    source = shared / "ict-facekit" / "ict_facekit_light.npz"
     if not source.exists():
         raise InputError("ict-facekit", ["is not at hand: run `eigenhead model fetch ict-facekit`, or name --shared"])
     return assemble(import_model(source), "imported")
