@@ -1,9 +1,9 @@
 """How far the contour solver is from the physical limit: RMSE over the Cramer-Rao bound, and interval coverage.
 
-Gaussian noise is added to the signed distance of the true sub-pixel outline (binary masks are no regular problem): a
-random field of standard deviation sigma whose correlation along any line has the integral l. Bare heads, exact cameras,
-pose and scale unknown. The bound is ``e^2 = tr(B I^-1 B^T) / V`` over the face's vertices, with I the Fisher
-information of the rim at the truth plus the prior.
+Gaussian noise of standard deviation sigma moves the true sub-pixel outline along its normals (binary masks are no
+regular problem); its correlation along the outline has the integral l. Bare heads, exact cameras, pose and scale
+unknown. The bound is ``e^2 = tr(B I^-1 B^T) / V`` over the face's vertices, with I the Fisher information of the rim at
+the truth plus the prior.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_errors, random_subjects
@@ -36,6 +38,8 @@ from rig.render.renderer import Renderer
 from rig.studio.layout import default_layout
 
 NOISES_PX, CORRELATION_PX = (0.3, 1.0), 2.0
+BAND_PX = 12.0  # the noise reaches this far: no rim sample is farther off at the end
+STEP_PX = 0.25  # of the noise along the contour
 UNROBUST_PX = 1e3  # a robust scale so wide that the bound knows of no outliers
 
 
@@ -127,40 +131,51 @@ def rms_deviation_mm(model: HeadModel, fit: Fit) -> float:
 
 
 def with_noise(silhouette: Silhouette, sigma: float, correlation: float, rng: np.random.Generator) -> Silhouette:
-    """The silhouette with a random field added to its signed distance."""
-    distance = (silhouette.distance + noise_field(silhouette.distance.shape, sigma, correlation, rng)).astype(
-        np.float32
-    )
+    """The silhouette with its contour moved along its normals by a random process of the arc length.
+
+    Near the contour every pixel takes the displacement of its nearest contour point, so that the signed distance keeps
+    its slope across the contour, as the distance to any contour does; a random field over the image would not.
+    """
+    points, arc = contour_points(silhouette.distance)
+    band = np.abs(silhouette.distance) < BAND_PX
+    rows, columns = np.nonzero(band)
+    _, nearest = cKDTree(points).query(np.stack([columns, rows], axis=1))
+    displacement = contour_process(arc, sigma, correlation, rng)
+    distance = silhouette.distance.copy()
+    distance[band] += displacement[nearest]
     return Silhouette(distance < 0, distance)
 
 
-def noise_field(
-    shape: tuple[int, ...], sigma: float, correlation: float, rng: np.random.Generator
-) -> Float32[np.ndarray, "h w"]:
-    """White noise smoothed by a Gaussian of width a has the correlation exp(-x^2 / 4 a^2), whose integral is l for
-    a = l / (2 sqrt(pi)). Reading it between pixels smooths it once more; the variance there and l are set right."""
-    # Bilinear reading is a triangle of variance 1/6 px^2 about each axis in the mean over all places.
-    width = float(np.sqrt(max((correlation / (2.0 * np.sqrt(np.pi))) ** 2 - 1.0 / 12.0, 0.04)))
-    field = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), width)
-    x, y = rng.uniform(1, shape[1] - 2, 20_000), rng.uniform(1, shape[0] - 2, 20_000)
-    read = cv2.remap(field, x.astype(np.float32)[None], y.astype(np.float32)[None], cv2.INTER_LINEAR)
-    return field * (sigma / float(read.std()))
+def contour_points(distance: Float32[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+    """Points (x, y) on the zero contour, STEP_PX or less apart, and the arc length (px) at each; a gap of 1,000 px
+    between pieces makes their noise independent."""
+    slopes = np.stack(np.gradient(distance)[::-1], axis=-1)
+    pieces, _ = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    points, arcs, end = [], [], 0.0
+    for piece in pieces:
+        pixels = np.concatenate([piece[:, 0], piece[:1, 0]])
+        x, y = pixels.T
+        feet = pixels - distance[y, x, None] * slopes[y, x]  # from the pixel's centre to the contour
+        length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(feet, axis=0), axis=1))]
+        fine = np.linspace(0.0, length[-1], int(length[-1] / STEP_PX) + 2)
+        points.append(np.stack([np.interp(fine, length, feet[:, axis]) for axis in (0, 1)], axis=1))
+        arcs.append(end + fine)
+        end += length[-1] + 1000.0
+    return np.concatenate(points), np.concatenate(arcs)
 
 
-def line_correlation_px(field: Float[np.ndarray, "h w"]) -> float:
-    """Integral of the correlation along lines, read between pixels: what ``noise_field`` promises."""
-    height, width = field.shape
-    t = np.arange(0, min(height, width) - 4, 0.25)
-    lines = []
-    for k in range(200):
-        angle = np.pi * k / 200
-        x, y = width / 2 + (t - t.mean()) * np.cos(angle), height / 2 + (t - t.mean()) * np.sin(angle)
-        lines.append(
-            cv2.remap(
-                field.astype(np.float32), x.astype(np.float32)[None], y.astype(np.float32)[None], cv2.INTER_LINEAR
-            )[0]
-        )
-    values = np.array(lines)
-    lags = np.arange(1, 60)
-    variance = (values**2).mean()
-    return float(0.25 * (1.0 + 2.0 * sum((values[:, lag:] * values[:, :-lag]).mean() / variance for lag in lags)))
+def contour_process(
+    arc: Float[np.ndarray, " n"], sigma: float, correlation: float, rng: np.random.Generator
+) -> Float[np.ndarray, " n"]:
+    """Gaussian process at the arc lengths: read between pixels it has the standard deviation sigma and the correlation
+    exp(-x^2 / 4 a^2), whose integral is ``correlation`` for a = l / (2 sqrt(pi)).
+
+    Reading bilinearly is one more filter, a triangle of variance 1/6 px^2, so that the process itself is that much
+    narrower and stronger.
+    """
+    read = correlation / (2.0 * np.sqrt(np.pi))
+    width = np.sqrt(max(read**2 - 1.0 / 6.0, 0.04))
+    smooth = gaussian_filter1d(rng.standard_normal(int(arc[-1] / STEP_PX) + 2), width / STEP_PX, mode="wrap")
+    response = gaussian_filter1d(np.eye(1, 201, 100)[0], width / STEP_PX)
+    smooth *= sigma * np.sqrt(read / width) / np.sqrt((response**2).sum())
+    return np.interp(arc, STEP_PX * np.arange(len(smooth)), smooth)
