@@ -61,17 +61,24 @@ class ServiceSettings(BaseSettings):
     make_room: bool = Field(
         default=False, description="drop the oldest finished results when the disk falls below free_bytes"
     )
+    cache_bytes: int = Field(default=4 << 30, ge=0, description="the most that silhouettes and thumbnails take up")
     sweep_s: float = Field(default=60.0, gt=0)
 
     log_json: bool = Field(default=False, description="log lines as JSON")
 
     @property
     def url(self) -> str:
-        """The database's URL in SQLAlchemy's form."""
+        """The database's URL in SQLAlchemy's form. PostgreSQL is told to end a session that idles inside a transaction:
+        a worker that vanished there would keep its row locks, and nobody could take over its job."""
         if self.database_url is None:
             return f"sqlite:///{self.data.resolve() / 'eigenhead.sqlite'}"
         scheme, _, rest = self.database_url.partition("://")
-        return f"postgresql+psycopg://{rest}" if scheme in ("postgres", "postgresql") else self.database_url
+        if scheme not in ("postgres", "postgresql"):
+            return self.database_url
+        if "options=" not in rest:
+            rest += "&" if "?" in rest else "?"
+            rest += f"options=-c%20idle_in_transaction_session_timeout%3D{round(self.silent_s * 1000)}"
+        return f"postgresql+psycopg://{rest}"
 
     def environment(self) -> dict[str, str]:
         """The variables with which another process reads the same settings."""

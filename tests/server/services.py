@@ -84,13 +84,17 @@ class RunningService:
 
 @contextmanager
 def running_service(data: Path, *, worker: bool = True, **settings: str) -> Iterator[RunningService]:
-    """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given."""
+    """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given. A test that fails shows
+    the end of the log."""
     chosen = {"work": "tests.server.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1"} | settings
     environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
     service = RunningService(data, environment, free_port(), worker)
     service.start()
     try:
         yield service
+    except BaseException:
+        sys.stdout.write(f"{service.log}:\n{service.log.read_text()[-4000:]}")
+        raise
     finally:
         service.stop()
 
