@@ -1,11 +1,12 @@
 """A real browser for the operator's pages, and what every page must hold to in it."""
 
-import importlib.util
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -79,27 +80,27 @@ def visit(browser: Browser, base: str, size: str = "1366x768") -> Visit:
 
 
 def keep_screenshots(page: Page, folder: Path, name: str) -> None:
-    """At both sizes; the page stays as it was."""
+    """At both sizes, each of which must fit and hold to WCAG as far as axe-core tells; the page stays as it was."""
     folder.mkdir(parents=True, exist_ok=True)
     for size, (width, height) in SIZES.items():
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_timeout(700)
         page.screenshot(path=folder / f"{name}-{size}.png")
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} is too wide at {size}"
+        found = violations(page)
+        assert not found, f"{name} at {size}: {found}"
     page.set_viewport_size({"width": SIZES["1366x768"][0], "height": SIZES["1366x768"][1]})
 
 
-def axe_script() -> str | None:
-    """axe-core as a PyPI package carries it; None where that is not installed."""
-    found = importlib.util.find_spec("axe_playwright_python")
-    if found is None or not found.submodule_search_locations:
-        return None
-    return (Path(found.submodule_search_locations[0]) / "axe.min.js").read_text(encoding="utf-8")
+@cache
+def _axe_script() -> str:
+    """axe-core (MPL-2.0), as the PyPI package axe-playwright-python carries it."""
+    return (resources.files("axe_playwright_python") / "axe.min.js").read_text(encoding="utf-8")
 
 
-def violations(page: Page, script: str) -> list[str]:
+def violations(page: Page) -> list[str]:
     """Serious and critical findings of axe-core, with where they are."""
-    page.evaluate(script)
+    page.evaluate(_axe_script())
     found = page.evaluate("axe.run(document, { resultTypes: ['violations'] }).then(r => r.violations)")
     return [
         f"{v['id']} ({v['impact']}): {v['help']}: " + "; ".join(node["html"][:160] for node in v["nodes"][:4])

@@ -15,8 +15,8 @@ from playwright.sync_api import Browser, Page, expect
 
 from rig.archive import pack_folder
 from rig.mesh_files import read_mesh
-from tests.end_to_end.browser import axe_script, chromium, keep_screenshots, violations, visit
-from tests.server.services import RunningService, running_service, small_capture
+from tests.end_to_end.browser import chromium, keep_screenshots, violations, visit
+from tests.server.services import ROOT, RunningService, running_service, small_capture
 from tests.shared_data import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -32,8 +32,9 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Path(os.environ.get("EIGENHEAD_SCREENSHOTS") or tmp_path_factory.mktemp("screenshots"))
+def screenshots() -> Path:
+    """``make test-slow`` and CI keep them in out/screenshots."""
+    return Path(os.environ.get("EIGENHEAD_SCREENSHOTS") or ROOT / "out/screenshots")
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +105,7 @@ def test_the_whole_way(browser: Browser, studio: RunningService, screenshots: Pa
     rig.go("/")
     rate = live_rate(rig.page)
     running = httpx.get(studio.url + "/v1/jobs").json()["jobs"][0]["state"]
-    print_figure("live_rate_hz", rate, job=running)
+    keep_figure(screenshots, "live_rate_hz", rate, job=running)
     rig.check_clean()
     rig.page.context.close()
 
@@ -231,27 +232,22 @@ def newest_report(studio: RunningService) -> dict:
     return httpx.get(f"{studio.url}/v1/jobs/{job}/result/report.json").json()
 
 
-def print_figure(name: str, value: float, **more: object) -> None:
-    """Kept beside the screenshots, for whoever quotes it."""
-    folder = os.environ.get("EIGENHEAD_SCREENSHOTS")
-    if folder:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        (Path(folder) / f"{name}.json").write_text(json.dumps({name: value} | more))
+def keep_figure(folder: Path, name: str, value: float, **more: object) -> None:
+    """Beside the screenshots, for whoever quotes it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps({name: value} | more))
 
 
 def test_no_page_has_a_serious_violation_and_each_says_what_to_do(
     browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
 ) -> None:
-    script = axe_script()
-    if script is None:
-        pytest.skip("axe-core is not installed (PyPI: axe-playwright-python)")
     found = []
     v = visit(browser, service.url)
     for state in ("empty", "filled"):
         for path in PATHS:
             page = v.go(path)
             page.wait_for_timeout(1500)
-            found += [f"{state} {path}: {violation}" for violation in violations(page, script)]
+            found += [f"{state} {path}: {violation}" for violation in violations(page)]
             if state == "empty":
                 keep_screenshots(page, screenshots, f"empty{path.replace('/', '-').rstrip('-')}")
         if state == "empty":
@@ -305,7 +301,9 @@ def test_quick_keys_do_not_overtake_each_other(browser: Browser, service: Runnin
     v.check_clean()
 
 
-def test_the_first_page_is_usable_within_two_seconds(browser: Browser, service: RunningService) -> None:
+def test_the_first_page_is_usable_within_two_seconds(
+    browser: Browser, service: RunningService, screenshots: Path
+) -> None:
     """CPU of a loaded machine aside: the best of three fresh browsers."""
     took = []
     for _ in range(3):
@@ -315,7 +313,7 @@ def test_the_first_page_is_usable_within_two_seconds(browser: Browser, service: 
         expect(v.page.locator("article.tile")).to_have_count(11)
         took.append(time.monotonic() - began)
         v.page.context.close()
-    print_figure("first_page_s", min(took))
+    keep_figure(screenshots, "first_page_s", min(took))
     assert min(took) < 2.0
 
 
