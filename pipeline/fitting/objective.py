@@ -9,15 +9,19 @@ the head grows a neck; hair outside the skull pays the skull for growing. So pix
 the aligned head nearest to them belongs to the face region (ear to ear, forehead to chin), and weight zero elsewhere.
 The division is made once per level from the head that the level starts with: within a level the cost is a fixed
 function of the coefficients, eq. (5) with some weights zero. ``speaking="all"`` is the paper's cost to the letter.
+
+The cut through the neck being mute, it is closed with a lid, so that back faces need not be drawn: of 19 ms an
+evaluation that saves 5. The lid adds a thousandth of the area where the cut is not flat, all of it at the cut.
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from types import TracebackType
 from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.silhouette import Silhouette, boundary_weights, signed_distance
@@ -44,16 +48,23 @@ class SilhouetteObjective:
         scale: float,
         start: Float[np.ndarray, " m"],
         speaking: Literal["face", "all"] = "face",
+        weighted: bool = True,
     ) -> None:
-        """``level`` of the model, ``scale`` of the images (0.5: half the width); ``start`` fixes what may speak."""
+        """``level`` of the model, ``scale`` of the images (0.5: half the width); ``start`` fixes what may speak.
+
+        ``weighted``: eq. (5); otherwise eq. (4), where every pixel that may speak counts alike.
+        """
         self._turn = world_from_head.scale * world_from_head.rotation
         mean = model.levels[level].operator @ model.mean
         self._mean_world = world_from_head.apply(mean.astype(np.float64))
         self._basis = model.basis(level, len(start)).reshape(len(start), -1)
-        self._drawn = renderer.silhouette_set(rig, model.levels[level].faces, scale)
+        faces, region = model.levels[level].faces, model.levels[level].face_region
+        self._drawn = renderer.silhouette_set(rig, lidded(faces, region) if speaking == "face" else faces, scale)
         scaled = self._drawn.rig
         masks = {camera.name: mask_at_scale(silhouettes[camera.name].distance, scale) for camera in rig}
-        weights = {name: boundary_weights(mask) for name, mask in masks.items()}
+        weights = {
+            name: boundary_weights(mask) if weighted else np.ones_like(mask, np.float32) for name, mask in masks.items()
+        }
         if speaking == "face":
             outlines = self._drawn.masks(self.vertices_world(start))
             region = model.levels["full"].face_region
@@ -79,6 +90,26 @@ class SilhouetteObjective:
         """T(H(alpha)): the level's vertices in the world, mm."""
         moved = (np.asarray(coefficients, np.float32) @ self._basis).reshape(-1, 3)
         return self._mean_world + moved @ self._turn.T
+
+
+def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
+    """The triangles with a fan over every hole, so that each edge has its counterpart; the same triangles where a hole
+    reaches the face region, whose outline may speak, or two holes meet."""
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
+    edges = {(a, b) for a, b in directed}
+    rim = [(a, b) for a, b in edges if (b, a) not in edges]
+    after = {b: a for a, b in rim}  # around a hole, against its edges
+    if len(after) < len(rim) or face_region[list(after)].any():
+        return faces
+    lids = []
+    while after:
+        first, at = after.popitem()
+        ring = [first]
+        while at != first:
+            ring.append(at)
+            at = after.pop(at)
+        lids += [(first, b, c) for b, c in pairwise(ring[1:])]
+    return np.concatenate([faces, np.array(lids, faces.dtype).reshape(-1, 3)])
 
 
 def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.ndarray, "_ _"]:

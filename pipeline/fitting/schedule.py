@@ -7,6 +7,7 @@ levels begin with p_i = p_0 + mu_i e_i, mu_i = 3 sigma_i (three standard deviati
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -45,18 +46,22 @@ def fit_simplex(
     *,
     renderer: Renderer,
     report: Callable[[str, float], None],
+    hierarchy: tuple[HierarchyLevel, ...] = HIERARCHY,
+    speaking: Literal["face", "all"] = "face",
+    weighted: bool = True,
 ) -> Fit:
     """Coefficients that minimise eq. (2) from the mean head. ``report("fit", fraction)`` may raise Cancelled.
 
+    ``speaking`` and ``weighted`` are the objective's: which pixels count, and whether by eq. (5) or eq. (4).
     ``rig`` and ``silhouettes`` may differ: cameras without a silhouette stay out.
     """
     rig = rig.subset(name for name in silhouettes if silhouettes[name].quality.usable)
     coefficients = np.zeros(min(settings.modes, len(model.modes)))
     evaluations, reasons = 0, []
-    for number, level in enumerate(HIERARCHY):
+    for number, level in enumerate(hierarchy):
 
         def watch(count: int, cost: float, number: int = number) -> None:
-            report("fit", (number + min(count / LIMIT, 1.0)) / len(HIERARCHY))
+            report("fit", (number + min(count / LIMIT, 1.0)) / len(hierarchy))
 
         with SilhouetteObjective(
             model,
@@ -67,6 +72,8 @@ def fit_simplex(
             level=level.mesh,
             scale=level.image_scale,
             start=coefficients,
+            speaking=speaking,
+            weighted=weighted,
         ) as objective:
             solution = minimise(
                 objective, coefficients, np.full(len(coefficients), MU), tolerance=TOLERANCE, limit=LIMIT, watch=watch

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.fitting.objective import SilhouetteObjective, face_pixels, mask_at_scale
+from pipeline.fitting.objective import SilhouetteObjective, face_pixels, lidded, mask_at_scale
 from pipeline.fitting.schedule import HIERARCHY, LIMIT, fit_simplex
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import (
@@ -19,6 +19,7 @@ from rig.errors import Cancelled
 from rig.geometry import Similarity, rotation_from_vector
 from rig.layout import Rig
 from rig.render.renderer import Renderer
+from rig.render.silhouettes import is_closed
 from tests.benchmarks.simplex_halves import bench_rig, face_error
 from tests.oracles import camera_depth
 
@@ -59,6 +60,35 @@ def test_it_is_eq_5_of_numpy_and_an_independent_rasteriser(model: HeadModel, rig
     # A pixel whose centre lies on an edge (1 in 10^4) may go either way: of 1,500 contour pixels, a few of cost 1.
     assert cost == pytest.approx(expected, abs=3.0)
     assert cost > 100.0
+
+
+def test_a_lid_over_the_neck_changes_no_pixel_that_may_speak(model: HeadModel, rig: Rig, renderer: Renderer) -> None:
+    """The same cost as from every triangle of the open mesh, by an independent rasteriser; abs=3: see above."""
+    rng = np.random.default_rng(2)
+    seen, z = views(model, rig, renderer, rng.standard_normal(10)), 0.5 * rng.standard_normal(10)
+    with SilhouetteObjective(
+        model, POSE, seen, rig, renderer=renderer, level="p99", scale=0.25, start=np.zeros(10)
+    ) as objective:
+        cost = objective(z)
+    level, expected = model.levels["p99"], 0.0
+    start, vertices = (POSE.apply(model.vertices(c, "p99")) for c in (np.zeros(10), z))
+    for camera in rig.scaled(0.25):
+        observed = mask_at_scale(seen[camera.name].distance, 0.25)
+        open_start, drawn = (np.isfinite(camera_depth(camera, v, level.faces)) for v in (start, vertices))
+        named = camera.project(POSE.apply(model.vertices(np.zeros(10))))
+        speaks = face_pixels(open_start, named, model.levels["full"].face_region)
+        expected += boundary_weighted_xor(observed, drawn, boundary_weights(observed) * speaks)
+    assert cost == pytest.approx(expected, abs=3.0)
+    assert cost > 50.0
+
+
+def test_a_lid_closes_holes_outside_the_face_alone(model: HeadModel) -> None:
+    level = model.levels["p99"]
+    shut = lidded(level.faces, level.face_region)
+    assert is_closed(shut)
+    assert not is_closed(level.faces)
+    np.testing.assert_array_equal(shut[: len(level.faces)], level.faces)
+    assert lidded(level.faces, np.ones(level.count, bool)) is level.faces
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.25])
