@@ -18,9 +18,9 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BufferedIOBase
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import IO
 
 from rig.errors import InputError
 
@@ -51,7 +51,7 @@ class _Member:
     name: str
     size: int
     kind: str  # "file", "folder", or what is wrong with it
-    open: Callable[[], IO[bytes]] | None = None
+    open: Callable[[], BufferedIOBase] | None = None
 
 
 def is_archive(path: Path) -> bool:
@@ -162,7 +162,7 @@ def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
     if faults:
         raise InputError("archive", _first(faults))
     return [
-        _Member(info.orig_filename, info.file_size, _zip_kind(info), lambda info=info: archive.open(info))
+        _Member(info.orig_filename, info.file_size, _zip_kind(info), lambda info=info: _buffered(archive.open(info)))
         for info in infos
     ]
 
@@ -188,11 +188,11 @@ def _tar_members(archive: tarfile.TarFile) -> Iterator[_Member]:
             kind = "file"
         else:
             kind = "is a sparse file" if info.issparse() else "is a device or pipe"
-        yield _Member(info.name, info.size, kind, lambda info=info: _present(archive.extractfile(info)))
+        yield _Member(info.name, info.size, kind, lambda info=info: _buffered(archive.extractfile(info)))
 
 
-def _present(stream: IO[bytes] | None) -> IO[bytes]:
-    assert stream is not None  # only regular files are opened
+def _buffered(stream: object) -> BufferedIOBase:
+    assert isinstance(stream, BufferedIOBase)  # only regular files are opened
     return stream
 
 

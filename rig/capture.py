@@ -24,7 +24,7 @@ from PIL import Image, UnidentifiedImageError
 from rig.errors import InputError
 from rig.files import write_atomically
 from rig.layout import Rig, write_rig
-from rig.layout_files import find_rig_file, read_rig_file
+from rig.layout_files import find_rig_file, read_rig_file, rig_file_parts
 
 FEATURES_FORMAT = "eigenhead-features/1"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
@@ -64,7 +64,7 @@ def read_capture(folder: Path) -> tuple[Capture, Rig]:
     if faults:
         raise InputError("capture", faults)
     digests = dict(capture.digests)
-    for path in _rig_parts(rig_file):
+    for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
     return Capture(capture.images, capture.backgrounds, capture.masks, capture.features, ordered), rig
@@ -250,11 +250,6 @@ def _listed(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-
-
-def _rig_parts(rig_file: Path) -> list[Path]:
-    """A COLMAP model is a folder of files; the other formats are one file."""
-    return sorted(p for p in rig_file.iterdir() if p.is_file()) if rig_file.is_dir() else [rig_file]
 
 
 def _pixel(value: Any) -> np.ndarray | None:

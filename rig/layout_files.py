@@ -70,6 +70,11 @@ def read_rig_file(path: Path) -> Rig:
     raise InputError(path.name, ["is no rig file: wanted cameras.json, COLMAP's cameras.txt or .bin, or a .toml"])
 
 
+def rig_file_parts(path: Path) -> tuple[Path, ...]:
+    """The files from which ``read_rig_file`` reads ``path``: of a COLMAP model two, of the other formats one."""
+    return (path, path.with_stem("images")) if path.suffix in (".bin", ".txt") else (path,)
+
+
 def read_colmap(folder: Path, suffix: str = ".bin") -> Rig:
     """The rig in a COLMAP model: every image is a camera of this project, named after the image file."""
     files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
