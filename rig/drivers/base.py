@@ -6,7 +6,7 @@ stamps must not lose. ``grab_frame`` is both. A driver belongs to one thread at 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -34,6 +34,7 @@ class Frame:
     sequence: int
 
 
+@runtime_checkable
 class Driver(Protocol):
     """One camera. Everything but ``close`` may raise DriverError; ``close`` never does and may be called twice."""
 

@@ -4,6 +4,8 @@ Azimuth is counted from the front towards the subject's left, elevation upwards.
 the head, y up, z towards the front camera.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rig.camera import Camera, Distortion, Intrinsics
@@ -46,8 +48,8 @@ def arrangement(name: str) -> Rig:
     return rig_from_directions(ARRANGEMENTS_DEG[name])
 
 
-def rig_from_directions(directions_deg: tuple[tuple[float, float], ...], seed: int = LENS_SEED) -> Rig:
-    """Cameras at (azimuth, elevation), each with a lens and a mounting a little of its own."""
+def rig_from_directions(directions_deg: Sequence[tuple[int | float, int | float]], seed: int = LENS_SEED) -> Rig:
+    """Cameras at (azimuth, elevation) in degrees, each with a lens and a mounting a little of its own."""
     rng = np.random.default_rng(seed)
     return Rig(tuple(_camera(f"cam{i:02}", *direction, rng) for i, direction in enumerate(directions_deg)))
 
