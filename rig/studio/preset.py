@@ -25,6 +25,8 @@ class Preset:
     pose_spread_deg: float = 5.0  # how the subject holds its head, standard deviation an axis
     pose_spread_mm: float = 8.0
     feature_noise_px: float = 1.5  # of clicked feature points, standard deviation an axis
+    rolling_ms: float = 0.0  # from the first row's readout to the last's; 0: all rows at once (global shutter)
+    sway_mm_s: float = 20.0  # how fast the subject moves meanwhile, in a direction of its own each time
     samples: int = 4  # coverage samples a pixel
 
 

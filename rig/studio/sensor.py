@@ -41,6 +41,16 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
     return light * fall_off[:, :, None] * np.array(sensor.gains, np.float32)
 
 
+def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
+    """What a rolling shutter makes of a subject that moves by ``shift_px`` from the first row's readout to the last's:
+    each row shows it where it was then, the middle row where it is."""
+    height, width = subject.shape[:2]
+    across, down = shift_px / (height - 1)
+    source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(subject, source, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
 def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     """One picture of the light on the sensor, with fresh noise."""
     if sensor.noise > 0:

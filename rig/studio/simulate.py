@@ -23,7 +23,7 @@ from rig.render.renderer import Renderer
 from rig.studio.backdrop import backdrop, chair
 from rig.studio.faults import Fault
 from rig.studio.preset import Preset
-from rig.studio.sensor import Sensor, drift, expose, focus
+from rig.studio.sensor import Sensor, drift, expose, focus, rolled
 from rig.studio.subject import Look, Subject, dress, random_look, random_pose
 
 CAMOUFLAGE = (0.13, 0.10, 0.08)  # linear RGB, a dark brown that hair, shirt and backdrop may share
@@ -116,6 +116,8 @@ def build_scene(
     dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng)
     true_rig = Rig(tuple(_knocked(camera, faults, set_rng) for camera in rig))
     light = renderer.photograph(true_rig, (*dressed.worn, dressed.head), dressed.gallery, samples=preset.samples)
+    if preset.rolling_ms > 0:
+        light = _rolling(true_rig, light, pose.translation, preset, rng.spawn(1)[0])
     head = dressed.head
     colours = np.rint(255 * srgb_from_linear(renderer.vertex_radiance(head, dressed.gallery))).astype(np.uint8)
     with renderer.silhouette_set(true_rig, head.faces) as silhouettes:
@@ -208,6 +210,21 @@ def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) 
             turn = rotation_from_vector(np.radians(fault.strength) * axis / np.linalg.norm(axis))
             camera = replace(camera, camera_from_world=RigidTransform(turn, np.zeros(3)) @ camera.camera_from_world)
     return camera
+
+
+def _rolling(
+    rig: Rig,
+    light: Mapping[str, Float[np.ndarray, "h w 4"]],
+    at_world: Float[np.ndarray, " 3"],
+    preset: Preset,
+    rng: np.random.Generator,
+) -> dict[str, Float[np.ndarray, "h w 4"]]:
+    """The subject sways while the rows are read, and each camera sees that from its own side. The truth is its place
+    at the middle row. Motion across the image is that of the head's origin; nearer parts move by a tenth more."""
+    direction = rng.standard_normal(3)
+    sway_mm = direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
+    shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
+    return {name: rolled(light[name], shift_px) for name, shift_px in shifts.items()}
 
 
 def _views(
