@@ -3,13 +3,14 @@
 Each function is one command: it opens a session, works, and closes it. Nothing is printed here.
 """
 
+import itertools
 import json
 import math
 import os
 import shutil
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from rig.session import MakeDriver, RigSession
 from rig.shot import Fault, Shot, ShotFailed
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
+HIDDEN_BY_BOARD = ("view", "swapped", "moved", "plates", "overexposed")  # what is judged by the background, or is paper
 COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "sync", "last seen", "remark")
 
 
@@ -68,17 +70,27 @@ def preview(config: RigConfig, out: Path, make_driver: MakeDriver = driver_for) 
     return shot.faults
 
 
-def capture(config: RigConfig, out: Path, make_driver: MakeDriver = driver_for) -> Shot:
-    """`eigenhead rig capture`: one shot into the capture folder ``out``.
+def capture(
+    config: RigConfig,
+    out: Path,
+    make_driver: MakeDriver = driver_for,
+    *,
+    report: Callable[[str, float], None] = lambda stage, fraction: None,
+) -> Shot:
+    """`eigenhead rig capture`: one shot into the capture folder ``out``; ``report`` hears of "warm up", "shot", "done".
 
     Raises ShotFailed, and writes nothing, where the shot is no complete capture; NoCalibration; InputError where
     ``out`` is there already. Warnings are in the shot that is returned, and in shot.json of the folder.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(str(out), ["is there already; name a folder that is not"])
+    report("warm up", 0.0)
     with RigSession(config, make_driver) as session:
         session.warm_up()
-        return capture_with(session, out)
+        report("shot", 0.5)
+        shot = capture_with(session, out)
+        report("done", 1.0)
+    return shot
 
 
 def capture_with(session: RigSession, out: Path) -> Shot:
@@ -90,6 +102,32 @@ def capture_with(session: RigSession, out: Path) -> Shot:
         raise ShotFailed(shot.faults)
     write_shot(out, shot, session.plates, session.rig)
     return shot
+
+
+def board_shots(
+    config: RigConfig, out: Path, count: int, make_driver: MakeDriver = driver_for, *, pause_s: float = 4.0
+) -> Iterator[tuple[str, tuple[str, ...], tuple[Fault, ...]]]:
+    """`eigenhead rig board`: shots of a calibration board into ``out/<camera>/<shot>.png``, for `eigenhead calibrate`.
+
+    Needs no calibration and no clean plates. Yields, for each shot, its name, the cameras whose pictures were written,
+    and the faults, without those of views that the board itself hides; waits ``pause_s`` before each, for the board to
+    be moved. Names go on after those that are there. Raises ShotFailed where no camera delivers.
+    """
+    taken = {path.stem for path in out.glob("*/*.png")}
+    names = (name for name in map("shot{:03}".format, itertools.count()) if name not in taken)
+    with RigSession(config, make_driver) as session:
+        session.warm_up()
+        for name in itertools.islice(names, count):
+            time.sleep(pause_s)
+            shot = session.shoot()
+            faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
+            spoilt = {fault.camera for fault in faults if fault.is_error}
+            good = () if None in spoilt else tuple(camera for camera in shot.images if camera not in spoilt)
+            if not good:
+                raise ShotFailed(faults)
+            for camera in good:
+                write_image(out / camera / f"{name}.png", shot.images[camera])
+            yield name, good, faults
 
 
 def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:

@@ -104,6 +104,12 @@ class SyncCertificate:
         skews = [camera.skew_s for camera in self.cameras if camera.skew_s is not None]
         return max(skews) - min(skews) if len(skews) > 1 else None
 
+    def lines(self) -> list[str]:
+        """One a camera, for people."""
+        width = max(len(line.camera) for line in self.cameras)
+        skews = {line.camera: "" if line.skew_s is None else f"  {line.skew_s * 1000:+.1f} ms" for line in self.cameras}
+        return [f"{line.camera:<{width}}  {line.status}{skews[line.camera]}" for line in self.cameras]
+
     def document(self) -> dict[str, Any]:
         """For JSON; times in milliseconds."""
         return {

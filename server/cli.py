@@ -103,31 +103,69 @@ def reconstruct(
     _answer(written, json_out, [f"{out / 'head.ply'}"])
 
 
-@app.command(epilog="Example: eigenhead simulate shots/anna --seed 7 --fault bumped:cam03=0.5")
+@app.command(
+    epilog="Example: eigenhead simulate shots/anna --seed 7 --fault bumped:cam03=0.5   "
+    "eigenhead simulate studio --serve --port 8700"
+)
 def simulate(
-    out: Annotated[Path, typer.Argument(help="The capture folder to write; the truth goes to OUT.truth.")],
+    out: Annotated[
+        Path | None,
+        typer.Argument(help="The capture folder to write (--serve: the rig's); the truth goes to OUT.truth."),
+    ] = None,
     subject: Annotated[str, typer.Option(help="random, mean, or a mesh file (head frame, mm).")] = "random",
     seed: Annotated[int, typer.Option(help="Of subject, looks, pose and noise.", min=0)] = 0,
     noise: Annotated[float | None, typer.Option(help="Sensor noise, share of full scale.", min=0, max=1)] = None,
     light_drift: Annotated[float | None, typer.Option(help="From plate to shot, share.", min=0, max=1)] = None,
     defocus: Annotated[float | None, typer.Option(help="Blur, pixels.", min=0)] = None,
+    rolling_ms: Annotated[float | None, typer.Option(help="Readout of a rolling shutter.", min=0, max=200)] = None,
     hair: Annotated[bool, typer.Option(help="Give the subject hair.")] = True,
     fault: Annotated[list[str] | None, typer.Option(help="KIND[:CAMERA][=AMOUNT]; may be repeated.")] = None,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
+    fps: Annotated[float, typer.Option(help="--serve: of the live views.", min=0.5, max=30)] = 4.0,
     json_out: Json = False,
 ) -> None:
-    """Take a capture with the simulated studio, and write the truth beside it."""
+    """Take a capture with the simulated studio, and write the truth beside it; or serve the studio as real devices.
+
+    --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
+    given) with which the rig commands and the service work as with a real rig."""
     from dataclasses import replace
 
     from rig.render.renderer import Renderer
     from rig.studio.preset import PRESET
     from server.shoot import simulate_folder
 
-    chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus}
+    chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
     preset = replace(PRESET, hair=hair and PRESET.hair, **{k: v for k, v in chosen.items() if v is not None})
+    if serve:
+        _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
+                      faults=fault or [])  # fmt: skip
+        return
+    if out is None:
+        raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
     with _progress() as report, Renderer.create() as renderer:
         report("simulate", 0.0)
         truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer)
     _answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
+    """Serves until Ctrl-C, which is how it ends well."""
+    from contextlib import ExitStack, suppress
+
+    from server.studio import OpenStudio, serve_studio
+
+    with ExitStack() as bar, suppress(KeyboardInterrupt):
+        report = bar.enter_context(_progress())
+
+        def ready(studio: OpenStudio) -> None:
+            bar.close()
+            _answer(studio.document(), json_out, studio.lines())
+            sys.stdout.flush()
+
+        serve_studio(folder, ready=ready, report=report, **options)
 
 
 @app.command(epilog="Example: eigenhead demo --out out/demo")
@@ -254,18 +292,57 @@ def rig_preview(
     _answer({"sheet": str(out), "faults": faults}, json_out, [str(out), *faults])
 
 
-@rig_app.command("capture", epilog="Example: eigenhead rig capture shots/anna --rig rig.toml")
+@rig_app.command("capture", epilog="Example: eigenhead rig capture --rig rig.toml --out shots/anna")
 def rig_capture(
-    out: Annotated[Path, typer.Argument(help="The capture folder to write.")],
+    out: Annotated[Path | None, typer.Argument(help="The capture folder to write.", show_default=False)] = None,
+    out_option: Annotated[
+        Path | None, typer.Option("--out", help="The same; without either captures/<date>-<time>, UTC.")
+    ] = None,
     rig: RigFile = Path("rig.toml"),
     json_out: Json = False,
 ) -> None:
     """Take one synchronised shot into a capture folder."""
+    from datetime import UTC, datetime
+    from time import monotonic
+
     from rig.config import read_rig_config
     from rig.operate import capture
 
-    shot = capture(read_rig_config(rig), out)
-    _answer({"capture": str(out)} | shot.document(), json_out, [str(out), *map(str, shot.faults)])
+    if out is not None and out_option is not None:
+        raise typer.BadParameter("the capture folder is named twice", param_hint="--out")
+    folder = out or out_option or Path("captures") / datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+    at: dict[str, float] = {}
+    with _progress() as progress:
+
+        def report(stage: str, fraction: float) -> None:
+            at[stage] = monotonic()
+            progress(stage, fraction)
+
+        shot = capture(read_rig_config(rig), folder, report=report)
+    seconds = {"warm_up": round(at["shot"] - at["warm up"], 3), "capture": round(at["done"] - at["shot"], 3)}
+    told = f"{len(shot.images)} pictures in {seconds['capture']:.2f} s, after {seconds['warm_up']:.2f} s of warm-up"
+    document = {"capture": str(folder), "seconds": seconds} | shot.document()
+    _answer(document, json_out, [str(folder), told, *shot.certificate.lines(), *map(str, shot.faults)])
+
+
+@rig_app.command("board", epilog="Example: eigenhead rig board --rig rig.toml --shots 25 --out board-shots")
+def rig_board(
+    out: Annotated[Path, typer.Option(help="The folder that `eigenhead calibrate` reads.", file_okay=False)],
+    rig: RigFile = Path("rig.toml"),
+    shots: Annotated[int, typer.Option(help="How many.", min=1)] = 25,
+    pause_s: Annotated[float, typer.Option(help="Before each, to move the board and hold it still.", min=0)] = 4.0,
+    json_out: Json = False,
+) -> None:
+    """Take shots of the calibration board with every camera."""
+    from rig.config import read_rig_config
+    from rig.operate import board_shots
+
+    document = []
+    for name, cameras, faults in board_shots(read_rig_config(rig), out, shots, pause_s=pause_s):
+        told = [str(fault) for fault in faults]
+        print(f"{name}  {len(cameras)} pictures  {'; '.join(told)}".rstrip(), file=sys.stderr)
+        document.append({"shot": name, "cameras": list(cameras), "faults": told})
+    _answer({"images": str(out), "shots": document}, json_out, [f"{out}  {len(document)} shots"])
 
 
 @rig_app.command("plates", epilog="Example: eigenhead rig plates --rig rig.toml")

@@ -39,9 +39,14 @@ class Fault:
 
 def fault_from_text(text: str) -> Fault:
     """``kind[:camera][=amount]``, as the command line takes it: ``exposure=0.2``, ``dark:cam03``. Raises InputError."""
+    return Fault(*fault_parts(text))
+
+
+def fault_parts(text: str) -> tuple[str, str | None, float | None]:
+    """Kind, camera and amount of ``kind[:camera][=amount]``. Raises InputError."""
     head, _, amount = text.partition("=")
     kind, _, camera = head.partition(":")
     try:
-        return Fault(kind, camera or None, float(amount) if amount else None)
+        return kind, camera or None, float(amount) if amount else None
     except ValueError as error:
         raise InputError("fault", [f"{text!r}: {amount!r} is no number; wanted kind[:camera][=amount]"]) from error

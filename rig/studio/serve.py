@@ -21,6 +21,7 @@ from jaxtyping import UInt8
 from rig.errors import InputError
 from rig.files import write_atomically
 from rig.layout import write_rig
+from rig.studio.faults import fault_parts
 from rig.studio.simulate import Scene
 from rig.studio.sources import ImageSource, SceneImages
 from rig.studio.streams import Film, StreamServer
@@ -28,6 +29,7 @@ from rig.studio.trigger_box import LIGHTS, BoxLogic, Release, SimulatedTriggerBo
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 
+STUDIO = "simulated studio"  # the name in rig.toml
 KINDS = {
     "dropped": "the next triggered frame of the camera gets lost",
     "late-trigger": "the output of the camera (no camera: every output) rises late (amount: seconds)",
@@ -62,6 +64,14 @@ class DeviceFault:
     def strength(self) -> float:
         """The amount, or the kind's usual one."""
         return self.amount if self.amount is not None else DEFAULT_AMOUNT.get(self.kind, 0.0)
+
+
+def device_fault_from_text(text: str) -> DeviceFault:
+    """``kind[:camera][=amount]``. Raises InputError; ``StudioDevices.inject`` judges whether a studio can do it."""
+    kind, camera, amount = fault_parts(text)
+    if kind not in KINDS:
+        raise InputError("fault", [f"{kind!r} is none of {', '.join(KINDS)}"])
+    return DeviceFault(kind, camera, amount)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +172,7 @@ class StudioDevices:
         """rig.toml of this studio; its path."""
         text = [
             'format = "eigenhead-rig/1"',
-            'name = "simulated studio"',
+            f"name = {json.dumps(STUDIO)}",
             *([] if self._calibration is None else [f"calibration = {json.dumps(self._calibration)}"]),
             f"\n[trigger]\nport = {json.dumps(str(self.port_link))}",
             "\n[lights]\noutputs = [0, 1]\nsettle_s = 0.3",

@@ -76,9 +76,14 @@ class StreamServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def address(self) -> str:
+        """Where everything is served."""
+        return f"http://{self._host}:{self.port}"
+
     def url(self, name: str) -> str:
         """Address of a camera's stream."""
-        return f"http://{self._host}:{self.port}/{name}.mjpeg"
+        return f"{self.address}/{name}.mjpeg"
 
     def close(self) -> None:
         """Ends every connection, the port and the thread. Safe to call twice."""

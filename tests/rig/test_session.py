@@ -16,7 +16,7 @@ from rig.drivers.base import Frame
 from rig.errors import InputError
 from rig.geometry import RigidTransform
 from rig.layout import Rig, write_rig
-from rig.operate import COLUMNS, NoCalibration, capture, check, preview, take_plates
+from rig.operate import COLUMNS, NoCalibration, board_shots, capture, check, preview, take_plates
 from rig.plates import read_plates, write_plates
 from rig.session import RigSession
 from rig.shot import FAULTS, WARNINGS, ShotFailed, Timing, certify
@@ -245,3 +245,26 @@ def test_a_camera_that_runs_freely_or_was_recorded_is_not_the_triggers_fault() -
 
 def test_every_warning_is_a_fault_that_is_explained() -> None:
     assert set(FAULTS) > WARNINGS
+
+
+def test_board_shots_need_neither_calibration_nor_plates(
+    studio: StudioDevices, config: RigConfig, tmp_path: Path
+) -> None:
+    bare = dataclasses.replace(config, calibration=None, plates=str(tmp_path / "none"))
+    studio.inject(DeviceFault("hung", "cam02"))
+    quick = dataclasses.replace(bare, shot=dataclasses.replace(bare.shot, timeout_s=0.5))
+    taken = list(board_shots(quick, tmp_path / "board", 1, pause_s=0.0))
+    studio.clear()
+    taken += list(board_shots(bare, tmp_path / "board", 1, pause_s=0.0))
+    assert [(name, cameras) for name, cameras, _ in taken] == [("shot000", THREE[:2]), ("shot001", THREE)]
+    assert [[(f.code, f.camera) for f in faults] for _, _, faults in taken] == [[("missing", "cam02")], []]
+    found = sorted(path.relative_to(tmp_path / "board").as_posix() for path in (tmp_path / "board").rglob("*.png"))
+    assert found == ["cam00/shot000.png", "cam00/shot001.png", "cam01/shot000.png", "cam01/shot001.png",
+                     "cam02/shot001.png"]  # fmt: skip
+
+
+def test_board_shots_stop_where_nothing_fires(studio: StudioDevices, config: RigConfig, tmp_path: Path) -> None:
+    studio.inject(DeviceFault("unplugged"))
+    with pytest.raises(ShotFailed, match="trigger"):
+        list(board_shots(config, tmp_path / "board", 3, pause_s=0.0))
+    assert not (tmp_path / "board").exists()

@@ -1,0 +1,76 @@
+"""Real cameras behind the HTTP interface: a service with a rig.toml, and eleven streams and a box that it opens."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from rig.config import read_rig_config
+from rig.layout import write_rig
+from rig.operate import take_plates
+from rig.studio.serve import DeviceFault, StudioDevices
+from tests.rig.test_session import flat_rig
+from tests.rig.textured_studio import NAMES, FlatStudio
+from tests.server.services import running_service
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
+
+
+@pytest.fixture
+def studio(tmp_path: Path) -> Iterator[StudioDevices]:
+    folder = tmp_path / "studio"
+    write_rig(flat_rig(NAMES), folder / "cameras.json")
+    with StudioDevices(folder, NAMES, FlatStudio(False), FlatStudio(True), calibration="cameras.json") as devices:
+        take_plates(read_rig_config(folder / "rig.toml"))
+        devices.seat(True)
+        yield devices
+
+
+def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_path: Path) -> None:
+    rig_file = str(studio.folder / "rig.toml")
+    with (
+        running_service(tmp_path / "data", worker=False, rig=rig_file) as service,
+        httpx.Client(base_url=service.url, timeout=60) as client,
+    ):
+        state = client.get("/v1/rig").json()
+        assert (state["kind"], state["calibration"], len(state["cameras"])) == ("real", "own", 11)
+        made = client.post("/v1/captures", json={"label": "first", "expression": "neutral"})
+        assert made.status_code == 201, made.text
+        capture = made.json()
+        assert [camera["name"] for camera in capture["cameras"]] == list(NAMES)
+        sync = capture["shot"]["sync"]["cameras"]
+        assert all(sync[name]["status"] == "in sync" and sync[name]["skew_ms"] is not None for name in NAMES)
+        assert [found["id"] for found in client.get("/v1/captures").json()["captures"]] == [capture["id"]]
+        image = client.get(f"/v1/captures/{capture['id']}/images/cam05").content
+        assert _decoded(image).shape == (240, 320, 3)
+        state = client.get("/v1/rig").json()
+        assert state["ready"]
+        assert {camera["state"] for camera in state["cameras"]} == {"open"}
+        assert _decoded(client.get("/v1/rig/cameras/cam03/preview.jpg").content).shape == (240, 320, 3)
+
+        studio.inject(DeviceFault("hung", "cam02"))
+        failed = client.post("/v1/captures", json={})
+        assert failed.status_code == 503
+        assert any(error.startswith("cam02: missing") for error in failed.json()["errors"])
+        studio.clear()
+        studio.inject(DeviceFault("unplugged"))
+        failed = client.post("/v1/captures", json={})
+        assert failed.status_code == 503
+        assert any("trigger" in error for error in failed.json()["errors"])
+        studio.clear()
+        studio.seat(False)
+        plates = client.post("/v1/rig/background").json()
+        assert (plates["cameras"], plates["plates"]) == (list(NAMES), 5)
+        studio.seat(True)
+        assert client.post("/v1/captures", json={}).status_code == 201
+        assert client.post("/v1/captures", json={"seed": 1}).status_code == 422
+        assert len(client.get("/v1/captures").json()["captures"]) == 2
+
+
+def _decoded(data: bytes) -> np.ndarray:
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture
