@@ -55,20 +55,25 @@ class Similarity:
         return self.scale * (points @ self.rotation.T) + self.translation
 
 
-def cross_matrix(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+def cross_matrix(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
     """``[v]x``, so that ``cross_matrix(v) @ w == cross(v, w)``."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix = np.zeros((*vector.shape[:-1], 3, 3))
+    x, y, z = np.moveaxis(vector, -1, 0)
+    matrix[..., 0, 1], matrix[..., 0, 2] = -z, y
+    matrix[..., 1, 0], matrix[..., 1, 2] = z, -x
+    matrix[..., 2, 0], matrix[..., 2, 1] = -y, x
+    return matrix
 
 
-def rotation_from_vector(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+def rotation_from_vector(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
     """Rodrigues' formula: rotation by ``|vector|`` radians about ``vector``."""
-    angle = float(np.linalg.norm(vector))
+    angle = np.sqrt((vector * vector).sum(axis=-1))[..., None, None]
     skew = cross_matrix(vector)
     # Below 1e-4 rad the series keeps full precision where sin(a)/a and (1-cos a)/a^2 lose digits.
-    first = np.sin(angle) / angle if angle > 1e-4 else 1.0 - angle**2 / 6.0
-    second = (1.0 - np.cos(angle)) / angle**2 if angle > 1e-4 else 0.5 - angle**2 / 24.0
-    return np.eye(3) + first * skew + second * skew @ skew
+    safe = np.maximum(angle, 1e-4)
+    first = np.where(angle > 1e-4, np.sin(safe) / safe, 1.0 - angle**2 / 6.0)
+    second = np.where(angle > 1e-4, (1.0 - np.cos(safe)) / safe**2, 0.5 - angle**2 / 24.0)
+    return np.eye(3) + first * skew + second * (skew @ skew)
 
 
 def vector_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:

@@ -17,6 +17,7 @@ sticks out. It shrinks step by step, which carries the fit over clutter from a s
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -27,12 +28,12 @@ from numba import njit, prange
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
-from pipeline.fitting.rim import Rim, Topology, Views, find_rim, make_topology, pack_views
+from pipeline.fitting.rim import Rim, Topology, Views, find_rim, make_topology, pack_views, project_with_slopes
 from pipeline.fitting.surface import SurfaceObservations, surface_cost, surface_equations
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import Silhouette
 from rig.camera import Camera
-from rig.geometry import RigidTransform, Similarity, rotation_from_vector
+from rig.geometry import Similarity, rotation_from_vector
 from rig.layout import Rig
 
 FIRST_NOISE_PX, FIRST_CORRELATION_PX = 1.0, 6.0  # before the residuals have been seen: a model that does not quite fit
@@ -73,11 +74,12 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Feature points, packed: landmark vertex (row of the full level), view, pixel."""
+    """Feature points, packed: view, pixel, and what the model says of their landmarks (head frame, mm)."""
 
-    vertex: np.ndarray
-    view: np.ndarray
+    view: Int[np.ndarray, " n"]
     pixel: Float[np.ndarray, "n 2"]
+    mean: Float[np.ndarray, "n 3"]
+    basis: Float32[np.ndarray, "m n 3"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -351,8 +353,10 @@ def pack_features(
     ]
     if not found:
         return None
-    vertex, view, pixel = zip(*found, strict=True)
-    return Observed(np.array(vertex), np.array(view), np.array(pixel, float))
+    vertex, view, pixel = (np.array(column) for column in zip(*found, strict=True))
+    mean = model.levels["full"].operator[vertex] @ model.mean
+    basis = model.basis("full", len(model.modes), vertex)
+    return Observed(view, pixel.astype(float), mean.astype(float), basis)
 
 
 def start_state(problem: Problem, world_from_head: Similarity) -> State:
@@ -409,11 +413,9 @@ def moved_views(problem: Problem, state: State) -> Views:
     """The views with the cameras where the state has them."""
     if not state.camera_shift.any():
         return problem.views
-    moved = [
-        RigidTransform(rotation_from_vector(shift[:3]), shift[3:]) @ camera.camera_from_world
-        for shift, camera in zip(state.camera_shift, problem.rig, strict=True)
-    ]
-    rotation, translation = np.stack([m.rotation for m in moved]), np.stack([m.translation for m in moved])
+    turn = rotation_from_vector(state.camera_shift[:, :3])
+    rotation = turn @ problem.views.rotation
+    translation = (turn @ problem.views.translation[:, :, None])[:, :, 0] + state.camera_shift[:, 3:]
     return replace(problem.views, rotation=rotation, translation=translation)
 
 
@@ -449,10 +451,24 @@ def normal_equations(
 ) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
     """J^T W J and J^T W r over (coefficients, pose, cameras), priors included."""
     rim = speaking(rim)
-    jacobian = rim_jacobian(problem, state, rim, stage)
+    rows = rim_rows(problem, state, rim, stage)
     weight = rim.length / problem.unit * _forgiveness(rim.residual, scale_px) ** 2
-    weighted = jacobian * weight[:, None]
-    matrix, gradient = weighted.T @ jacobian, weighted.T @ rim.residual
+    shared, m = stage.modes + POSE, stage.modes
+    size = shared + (PER_CAMERA * len(problem.views.names) if stage.cameras else 0)
+    matrix, gradient = np.zeros((size, size)), np.zeros(size)
+    ends = np.searchsorted(rim.view, np.arange(len(problem.views.names) + 1))
+    for k, (first, last) in enumerate(pairwise(ends)):
+        part = rows[first:last]
+        weighted = part * weight[first:last, None]
+        square, slope = weighted.T @ part, weighted.T @ rim.residual[first:last]
+        matrix[:shared, :shared] += square[:shared, :shared]
+        gradient[:shared] += slope[:shared]
+        if stage.cameras:
+            own = slice(shared + PER_CAMERA * k, shared + PER_CAMERA * (k + 1))
+            matrix[:shared, own] = square[:shared, shared:]
+            matrix[own, :shared] = square[shared:, :shared]
+            matrix[own, own] = square[shared:, shared:]
+            gradient[own] = slope[shared:]
     if problem.features is not None:
         rows, miss, weight = feature_rows(problem, state, stage, scale_px)
         matrix += (rows * weight[:, None]).T @ rows
@@ -463,7 +479,6 @@ def normal_equations(
         )
         matrix += more
         gradient += slope
-    m = stage.modes
     matrix[np.arange(m), np.arange(m)] += 1.0
     gradient[:m] += state.coefficients
     spread = problem.settings.scale_spread
@@ -483,51 +498,65 @@ def speaking(rim: Rim) -> Rim:
     return rim if kept.all() else Rim(*(getattr(rim, field)[kept] for field in Rim.__dataclass_fields__))
 
 
-def rim_jacobian(problem: Problem, state: State, rim: Rim, stage: Stage) -> Float[np.ndarray, "s p"]:
-    """d(residual) / d(coefficients, pose, cameras)."""
-    cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
-    jacobian = np.zeros((len(rim.view), stage.modes + POSE + cameras))
-    pose = state.world_from_head
-    head_gradient = pose.scale * (rim.gradient @ pose.rotation)
+def rim_rows(problem: Problem, state: State, rim: Rim, stage: Stage) -> Float[np.ndarray, "s q"]:
+    """d(residual) / d(coefficients, pose, the correction of the sample's own camera)."""
+    pose, views = state.world_from_head, moved_views(problem, state)
     operator, modes = problem.bases[stage.level]
-    _mode_rows(
-        operator.indptr, operator.indices, operator.data, rim.corner, rim.blend, head_gradient, modes, stage.modes,
-        jacobian,
+    rows = np.empty((len(rim.view), stage.modes + POSE + PER_CAMERA))
+    _fill_rows(
+        operator.indptr, operator.indices, operator.data, modes, stage.modes, pose.scale * pose.rotation,
+        pose.translation, views.rotation, views.translation, rim.view, rim.corner, rim.blend, rim.point, rim.gradient,
+        rows,
     )  # fmt: skip
-    jacobian[:, stage.modes : stage.modes + POSE] = _pose_rows(rim.point - pose.translation, rim.gradient)
-    if stage.cameras:
-        views = moved_views(problem, state)
-        for k in range(len(views.names)):
-            here = rim.view == k
-            gradient = rim.gradient[here] @ views.rotation[k].T
-            point = rim.point[here] @ views.rotation[k].T + views.translation[k]
-            first = stage.modes + POSE + PER_CAMERA * k
-            jacobian[here, first : first + 6] = np.concatenate([np.cross(point, gradient), gradient], axis=1)
-    return jacobian
-
-
-def _pose_rows(arm: Float[np.ndarray, "s 3"], gradient: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 7"]:
-    turn = np.cross(arm, gradient)  # g . (w x arm) = w . (arm x g)
-    return np.concatenate([turn, gradient, (arm * gradient).sum(axis=1, keepdims=True)], axis=1)
+    return rows
 
 
 @njit(cache=True, parallel=True, fastmath=True)
-def _mode_rows(indptr, indices, data, corner, blend, gradient, modes, count, out):
-    """out[s, :count] = sum over the cage of (gradient . mode), through the level's operator and the edge's blend."""
-    for s in prange(len(corner)):
+def _fill_rows(indptr, indices, data, modes, count, turn, place, rotation, translation, view, corner, blend, point,
+               gradient, out):  # fmt: skip
+    """Modes: the sum over the cage of (gradient . mode), through the level's operator and the edge's blend."""
+    for s in prange(len(view)):
+        gx, gy, gz = gradient[s]
+        hx = gx * turn[0, 0] + gy * turn[1, 0] + gz * turn[2, 0]
+        hy = gx * turn[0, 1] + gy * turn[1, 1] + gz * turn[2, 1]
+        hz = gx * turn[0, 2] + gy * turn[1, 2] + gz * turn[2, 2]
         row = np.zeros(count, np.float32)
         for end in range(2):
             share = blend[s] if end else 1.0 - blend[s]
             v = corner[s, end]
             for j in range(indptr[v], indptr[v + 1]):
                 i, w = indices[j], share * data[j]
-                gx = np.float32(w * gradient[s, 0])
-                gy = np.float32(w * gradient[s, 1])
-                gz = np.float32(w * gradient[s, 2])
+                wx, wy, wz = np.float32(w * hx), np.float32(w * hy), np.float32(w * hz)
                 for m in range(count):
-                    row[m] += gx * modes[i, 0, m] + gy * modes[i, 1, m] + gz * modes[i, 2, m]
+                    row[m] += wx * modes[i, 0, m] + wy * modes[i, 1, m] + wz * modes[i, 2, m]
         for m in range(count):
             out[s, m] = row[m]
+        _fill_rigid(point[s, 0] - place[0], point[s, 1] - place[1], point[s, 2] - place[2], gx, gy, gz, out[s], count)
+        out[s, count + 6] = (
+            gx * (point[s, 0] - place[0]) + gy * (point[s, 1] - place[1]) + gz * (point[s, 2] - place[2])
+        )
+        r, t = rotation[view[s]], translation[view[s]]
+        _fill_rigid(
+            r[0, 0] * point[s, 0] + r[0, 1] * point[s, 1] + r[0, 2] * point[s, 2] + t[0],
+            r[1, 0] * point[s, 0] + r[1, 1] * point[s, 1] + r[1, 2] * point[s, 2] + t[1],
+            r[2, 0] * point[s, 0] + r[2, 1] * point[s, 1] + r[2, 2] * point[s, 2] + t[2],
+            r[0, 0] * gx + r[0, 1] * gy + r[0, 2] * gz,
+            r[1, 0] * gx + r[1, 1] * gy + r[1, 2] * gz,
+            r[2, 0] * gx + r[2, 1] * gy + r[2, 2] * gz,
+            out[s], count + POSE,
+        )  # fmt: skip
+
+
+@njit(cache=True, fastmath=True)
+def _fill_rigid(x, y, z, gx, gy, gz, out, first):
+    """Rotation and translation: g . (w x arm) = w . (arm x g), and g."""
+    out[first], out[first + 1], out[first + 2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+    out[first + 3], out[first + 4], out[first + 5] = gx, gy, gz
+
+
+def _pose_rows(arm: Float[np.ndarray, "s 3"], gradient: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 7"]:
+    turn = np.cross(arm, gradient)  # g . (w x arm) = w . (arm x g)
+    return np.concatenate([turn, gradient, (arm * gradient).sum(axis=1, keepdims=True)], axis=1)
 
 
 def feature_rows(
@@ -537,9 +566,8 @@ def feature_rows(
     observed = problem.features
     assert observed is not None
     points, misses, slopes = _project_features(problem, state)
-    basis = problem.model.basis("full", stage.modes, observed.vertex)  # m n 3
     pose = state.world_from_head
-    along = pose.scale * np.einsum("nac,cd,mnd->nam", slopes, pose.rotation, basis)
+    along = np.einsum("nad,mnd->nam", pose.scale * slopes @ pose.rotation, observed.basis[: stage.modes], optimize=True)
     arm = points - pose.translation
     cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
     rows = np.zeros((len(misses), 2, stage.modes + POSE + cameras))
@@ -547,11 +575,11 @@ def feature_rows(
     views = moved_views(problem, state)
     for axis in range(2):
         rows[:, axis, stage.modes : stage.modes + POSE] = _pose_rows(arm, slopes[:, axis])
-        for n, k in enumerate(observed.view if stage.cameras else ()):
-            gradient = views.rotation[k] @ slopes[n, axis]
-            point = views.rotation[k] @ points[n] + views.translation[k]
-            first = stage.modes + POSE + PER_CAMERA * k
-            rows[n, axis, first : first + 6] = np.concatenate([np.cross(point, gradient), gradient])
+        if stage.cameras:
+            gradient = np.einsum("nij,nj->ni", views.rotation[observed.view], slopes[:, axis])
+            point = np.einsum("nij,nj->ni", views.rotation[observed.view], points) + views.translation[observed.view]
+            own = stage.modes + POSE + PER_CAMERA * observed.view[:, None] + np.arange(PER_CAMERA)
+            rows[np.arange(len(points))[:, None], axis, own] = _pose_rows(point, gradient)[:, :PER_CAMERA]
     deviation = _feature_deviation(problem, slopes)
     forgiving = 1.0 / (1.0 + (misses**2).sum(axis=1) / (FEATURE_SCALE * deviation) ** 2) ** 2
     weight = np.repeat(forgiving / deviation**2, 2)
@@ -579,18 +607,11 @@ def _project_features(problem: Problem, state: State) -> tuple[np.ndarray, np.nd
     """World points, pixel misses, and d(pixel)/d(world point) of the observed landmarks."""
     observed = problem.features
     assert observed is not None
-    basis = problem.model.basis("full", len(state.coefficients), observed.vertex)
-    mean = problem.model.levels["full"].operator[observed.vertex] @ problem.model.mean
-    points = state.world_from_head.apply(mean + np.einsum("m,mnc->nc", state.coefficients, basis))
-    misses, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
+    moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
+    points = state.world_from_head.apply(observed.mean + moved)
     views = moved_views(problem, state)
-    for k, camera in enumerate(problem.rig):
-        here = observed.view == k
-        if here.any():
-            moved = replace(camera, camera_from_world=RigidTransform(views.rotation[k], views.translation[k]))
-            pixels, slopes[here] = moved.project_with_jacobian(points[here])
-            misses[here] = pixels - observed.pixel[here]
-    return points, misses, slopes
+    pixels, slopes = project_with_slopes(points, observed.view, views)
+    return points, pixels - observed.pixel, slopes
 
 
 def apply_step(state: State, step: Float[np.ndarray, " p"], stage: Stage) -> State:

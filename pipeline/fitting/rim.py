@@ -132,6 +132,23 @@ def find_rim(
     )  # fmt: skip
 
 
+def project_with_slopes(
+    points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+    """Pixel of every point in the view named beside it, and d(pixel) / d(point)."""
+    return _project_with_slopes(points_world, view, views.rotation, views.translation, views.lens)
+
+
+@njit(cache=True, fastmath=True)
+def _project_with_slopes(points, view, rotation, translation, lens):
+    pixels, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
+    for n in range(len(points)):
+        k = view[n]
+        pixels[n] = _project(points[n], rotation[k], translation[k], lens[k])
+        slopes[n] = _projection_jacobian(points[n], rotation[k], translation[k], lens[k])
+    return pixels, slopes
+
+
 @njit(cache=True, fastmath=True)
 def _normals_and_planes(vertices, faces):
     """Unit vertex normals; and by face its normal n and n . a: a centre C is in front of it where n . C > n . a."""

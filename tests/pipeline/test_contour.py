@@ -15,7 +15,7 @@ from pipeline.fitting.contour import (
     evaluate,
     fit_contour,
     make_problem,
-    rim_jacobian,
+    rim_rows,
     schedule,
 )
 from pipeline.fitting.posterior import vertex_deviation_mm
@@ -80,7 +80,12 @@ def test_derivatives_predict_the_rim(model, planted):
     problem = make_problem(model, pose, silhouettes, rig, SETTINGS, {})
     state = State(coefficients, pose, np.zeros((len(rig), PER_CAMERA)))
     rim = evaluate(problem, state, stage, 3.0, None).rim
-    jacobian = rim_jacobian(problem, state, rim, stage)
+    rows = rim_rows(problem, state, rim, stage)
+    jacobian = np.zeros((len(rows), 60 + POSE + PER_CAMERA * len(rig)))
+    jacobian[:, : 60 + POSE] = rows[:, : 60 + POSE]
+    for k in range(len(rig)):
+        first = 60 + POSE + PER_CAMERA * k
+        jacobian[rim.view == k, first : first + PER_CAMERA] = rows[rim.view == k, 60 + POSE :]
     for parameter in (0, 1, 7, 60, 61, 62, 63, 64, 65, 66, 60 + POSE, 60 + POSE + 3, 60 + POSE + 5):
         here = np.ones(len(rim.view), bool) if parameter < 60 + POSE else rim.view == 0
         step = np.zeros(jacobian.shape[1])
