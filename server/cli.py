@@ -187,6 +187,10 @@ def demo(
             f"head           {done['ply']}",
             f"contact sheet  {done['contact_sheet']}",
             f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
+            *(
+                f"  {name:<12} {of['error_mm']['mean']:.2f} mm mean, {of['seconds']:.1f} s, {of['evaluations']} steps"
+                for name, of in done["methods"].items()
+            ),
             f"time           {done['seconds']:.1f} s",
         ],
     )

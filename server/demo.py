@@ -1,5 +1,6 @@
-"""``eigenhead demo``: the main job through the real service, from the trigger to the head."""
+"""``eigenhead demo``: the main job through the real service, from the trigger to the head, by both solvers."""
 
+import json
 import os
 import subprocess
 import sys
@@ -10,6 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
+from pipeline.overlays import PANEL
 from rig.errors import EigenheadError
 from server.client import Client, Unreachable
 from server.serve import listen
@@ -17,6 +22,7 @@ from server.settings import ServiceSettings
 from server.truth import error_mm
 
 START_S = 60.0
+STRIP = 60  # height of the headings, pixels
 
 Report = Callable[[str, float], None]
 
@@ -27,8 +33,9 @@ class ServiceDied(EigenheadError):
 
 
 def run_demo(out: Path, *, seed: int, report: Report) -> dict[str, Any]:
-    """Starts a service in a temporary data folder, triggers its simulated rig, submits the job, follows it, and fetches
-    the result into ``out``. Returns what ``demo --json`` prints."""
+    """Starts a service in a temporary data folder, triggers its simulated rig, submits a job for each solver, follows
+    them, and fetches the default's result into ``out``, the paper's simplex's into ``out/simplex``. Returns what
+    ``demo --json`` prints."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="eigenhead-demo-") as scratch:
         data = Path(scratch) / "data"
@@ -36,24 +43,59 @@ def run_demo(out: Path, *, seed: int, report: Report) -> dict[str, Any]:
         with _service(data) as url, Client(url) as client:
             report("capture", 0.05)
             capture = client.post("/v1/captures", {"seed": seed, "label": "demo"})
-            job = client.submit(capture["id"])
-            job = client.wait(job["id"], report=lambda stage, fraction: report(stage, 0.2 + 0.75 * fraction))
-            report("fetch", 0.95)
-            client.download(job["id"], out)
-        error = error_mm(data / "captures" / capture["id"] / "truth", out / "head.ply")
+            folders = {"contour": out, "simplex": out / "simplex"}
+            for method, start, share in (("contour", 0.15, 0.25), ("simplex", 0.4, 0.55)):  # one at a time: both draw
+                job = client.submit(capture["id"], settings={"method": method})
+                client.wait(job["id"], report=_part(report, f"{method}: ", start, share))
+                client.download(job["id"], folders[method])
+        truth = data / "captures" / capture["id"] / "truth"
+        found = {method: _described(folders[method], truth) for method in folders}
+    side_by_side(found, out / "contact_sheet.png")
     return {
-        "ply": str(out / "head.ply"),
+        "ply": found["contour"]["ply"],
         "contact_sheet": str(out / "contact_sheet.png"),
         "seconds": round(time.monotonic() - began, 3),
-        "error_mm": {name: round(value, 4) for name, value in error.items()},
-        "warnings": client_warnings(out / "report.json"),
+        "error_mm": found["contour"]["error_mm"],
+        "warnings": found["contour"]["warnings"],
+        "methods": found,
     }
 
 
-def client_warnings(report: Path) -> list[str]:
-    import json
+def _part(report: Report, name: str, start: float, share: float) -> Report:
+    return lambda stage, fraction: report(name + stage, start + share * fraction)
 
-    return [warning["message"] for warning in json.loads(report.read_text())["warnings"]]
+
+def _described(folder: Path, truth: Path) -> dict[str, Any]:
+    document = json.loads((folder / "report.json").read_text())
+    return {
+        "ply": str(folder / "head.ply"),
+        "error_mm": {name: round(value, 4) for name, value in error_mm(truth, folder / "head.ply").items()},
+        "seconds": round(document["seconds"]["total"], 3),
+        "evaluations": document["evaluations"],
+        "stopped_because": document["stopped_because"],
+        "warnings": [warning["message"] for warning in document["warnings"]],
+    }
+
+
+def side_by_side(found: dict[str, dict[str, Any]], target: Path) -> None:
+    """The contact sheets of both results as one: input and start, then each solver's silhouettes and head."""
+    columns = []
+    for method, described in found.items():
+        sheet = cv2.imread(str(Path(described["ply"]).with_name("contact_sheet.png")))
+        assert sheet is not None  # the job wrote it
+        both = [sheet[:, : 2 * PANEL[0]]] if not columns else []  # input, before the fit: the same for every solver
+        told = (
+            f"{method}: {described['error_mm']['median']:.2f} mm median error, {described['evaluations']} evaluations"
+        )
+        headings = ["input, and before the fit"] * len(both) + [told]
+        for part, heading in zip([*both, sheet[:, 2 * PANEL[0] :]], headings, strict=True):
+            columns.append(np.vstack([_strip(part.shape[1], heading), part.astype(np.uint8)]))
+    cv2.imwrite(str(target), np.hstack(columns))
+
+
+def _strip(width: int, text: str) -> np.ndarray:
+    strip = np.full((STRIP, width, 3), 40, np.uint8)
+    return cv2.putText(strip, text, (12, 40), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (255, 255, 255), 1, cv2.LINE_AA)
 
 
 @contextmanager

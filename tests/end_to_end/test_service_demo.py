@@ -32,6 +32,10 @@ def test_the_demo_ends_with_a_head_near_the_truth(tmp_path: Path) -> None:
     assert {"head.glb", "report.json", "overlays", "contact_sheet.png"} <= names
     assert answer["error_mm"]["median"] < HULL_MEDIAN_MM
     assert answer["error_mm"]["median"] <= answer["error_mm"]["mean"] <= answer["error_mm"]["max"]
+    simplex = answer["methods"]["simplex"]
+    assert Path(simplex["ply"]).is_file()
+    assert simplex["evaluations"] > 1000
+    assert answer["error_mm"]["mean"] < simplex["error_mm"]["mean"], "the default is there because it is closer"
 
 
 @pytest.mark.slow
