@@ -30,6 +30,7 @@ from rig.render.renderer import Renderer
 
 VIEWS_LEAST = 3
 Report = Callable[[str, float], None]
+Segment = Callable[..., dict[str, Silhouette]]
 
 
 class TooFewViews(EigenheadError):
@@ -63,9 +64,17 @@ class Clock:
 
 
 def reconstruct(
-    capture: Capture, rig: Rig, model: HeadModel, settings: Settings, *, renderer: Renderer, report: Report
+    capture: Capture,
+    rig: Rig,
+    model: HeadModel,
+    settings: Settings,
+    *,
+    renderer: Renderer,
+    report: Report,
+    segment: Segment = segment,
 ) -> Reconstruction:
-    """Capture to textured head (section 4). Reads and writes no files.
+    """Capture to textured head (section 4). Reads and writes no files. A caller that keeps silhouettes gives a
+    ``segment`` of its own.
 
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing), and
     Cancelled when ``report`` does.

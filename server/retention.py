@@ -5,13 +5,16 @@ import asyncio
 import time
 from contextlib import suppress
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import structlog
 
 from rig.errors import EigenheadError
 from server.jobs import DELIVERY, FINISHED
+from server.problems import Problem
 from server.service import Service
+from server.store import folder_bytes, newest
 
 LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
 DAY_S = 86400.0
@@ -34,6 +37,7 @@ def sweep(service: Service) -> dict[str, int]:
     gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
+    gone["caches"] = _caches(service)
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
     if any(gone.values()):
@@ -68,8 +72,31 @@ def _captures(service: Service) -> int:
         return 0
     for record in list(service.store.captures()):
         if _age_s(record["created"]) > days * DAY_S and not service.jobs.active(capture=record["id"]):
-            service.store.remove(service.store.folder("captures", record["id"]))
+            service.store.remove_capture(record["id"])
             removed += 1
+    return removed
+
+
+def _caches(service: Service) -> int:
+    """Caches without a capture, and those used longest ago where all together are too large or the disk is full."""
+    store, s = service.store, service.settings
+    known, removed = set(store.ids("captures")), 0
+    kept: list[tuple[float, int, Path]] = []
+    for identity in store.ids("cache/captures"):
+        folder = store.cache_of(identity)
+        if identity not in known:
+            store.remove(folder)
+            removed += 1
+            continue
+        with suppress(FileNotFoundError):  # it is being erased
+            kept.append((newest(folder), folder_bytes(folder), folder))
+    total = sum(size for _, size, _ in kept)
+    for _, size, folder in sorted(kept):
+        if total <= s.cache_bytes and store.free_bytes() >= s.free_bytes:
+            break
+        store.remove(folder)
+        total -= size
+        removed += 1
     return removed
 
 
@@ -81,12 +108,20 @@ def _orphans(service: Service) -> int:
         attempts = list(folder.glob("attempt-*"))
         if not attempts or time.time() - max(path.stat().st_mtime for path in attempts) < LEFTOVER_S:
             continue
-        with suppress(EigenheadError):
-            if service.jobs.state(job_id) in FINISHED:
-                for path in attempts:
-                    service.store.remove(path)
-                    removed += 1
+        if _ended(service, job_id):
+            for path in attempts:
+                service.store.remove(path)
+                removed += 1
+            with suppress(OSError):  # it has a result
+                folder.rmdir()
     return removed
+
+
+def _ended(service: Service, job_id: str) -> bool:
+    try:
+        return service.jobs.state(job_id) in FINISHED
+    except Problem as problem:  # erased while its worker still wrote
+        return problem.status == 404
 
 
 def _deliveries(service: Service) -> int:

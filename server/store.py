@@ -3,7 +3,8 @@
     <data>/captures/<id>/record.json  files/...          one folder a capture, as the contract lays it out
     <data>/sessions/<id>.json
     <data>/jobs/<id>/result/...                          and attempt-*/ while a worker writes
-    <data>/calibrations/<id>/...  rig/...  cache/...      see server.calibrations, server.rigs
+    <data>/cache/captures/<id>/...                       what is worth keeping of a capture, and can be made anew
+    <data>/calibrations/<id>/...  rig/...                 see server.calibrations, server.rigs
     <data>/incoming/<id>/                                what is being received; swept after a crash
     <data>/trash/                                        what is being deleted
     <data>/set-aside/                                    damaged records, moved here and reported
@@ -108,6 +109,15 @@ class Store:
     def update_capture(self, record: dict[str, Any]) -> None:
         write_atomically(self.folder("captures", record["id"]) / "record.json", _encoded(record))
 
+    def remove_capture(self, identity: str) -> None:
+        """Removes a capture with what was kept of it: that shows a face too."""
+        self.remove(self.folder("captures", identity))
+        self.remove(self.cache_of(identity))
+
+    def cache_of(self, identity: str) -> Path:
+        """Where silhouettes, thumbnails and the like of a capture are kept."""
+        return self.folder("cache/captures", identity)
+
     def save_session(self, record: dict[str, Any]) -> None:
         path = self.folder("sessions", record["id"]).with_suffix(".json")
         write_atomically(path, _encoded({"format": SESSION_FORMAT, **record}))
@@ -144,7 +154,7 @@ class Store:
             for identity in self.ids(kind):
                 folder = self.data / kind / identity
                 with suppress(FileNotFoundError):
-                    if time.time() - _newest(folder) > older_s:
+                    if time.time() - newest(folder) > older_s:
                         shutil.rmtree(folder, ignore_errors=True) if folder.is_dir() else folder.unlink()
                         removed += 1
         return removed
@@ -182,7 +192,7 @@ def folder_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _newest(path: Path) -> float:
+def newest(path: Path) -> float:
     times = [path.stat().st_mtime]
     if path.is_dir():
         times += [entry.stat().st_mtime for entry in path.rglob("*")]

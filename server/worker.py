@@ -163,6 +163,7 @@ class Worker:
         arguments = {
             "capture": str(self.store.folder("captures", request["capture_id"]) / "files"),
             "result": str(folder),
+            "cache": str(self.store.cache_of(request["capture_id"])),
             "model": request.get("model"),
             "settings": request.get("settings") or {},
         }

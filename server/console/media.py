@@ -66,7 +66,7 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     """A small JPEG of an image; a capture never changes."""
     service = who[0]
     name = _image_name(service.store.capture(capture_id), camera)
-    path = _cache(service, capture_id) / "small" / f"{Path(name).stem}.jpg"
+    path = service.store.cache_of(capture_id) / "small" / f"{Path(name).stem}.jpg"
     if not path.is_file():
         make_thumbnail(service.store.folder("captures", capture_id) / "files" / name, path)
     return FileResponse(path, headers=FOREVER)
@@ -82,12 +82,13 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
     """The outline of the subject, drawn for all cameras at the first look."""
     service = who[0]
     name = Path(_image_name(service.store.capture(capture_id), camera)).stem
-    folder = _cache(service, capture_id) / "outlines"
+    folder = service.store.cache_of(capture_id) / "outlines"
     with _drawing:
         if not (folder / f"{name}.png").is_file():
             files = service.store.folder("captures", capture_id) / "files"
             with service.children.one() as child:
-                child.run("server.console.silhouettes:draw", {"capture": str(files), "target": str(folder)})
+                arguments = {"capture": str(files), "cache": str(folder.parent), "target": str(folder)}
+                child.run("server.console.silhouettes:draw", arguments)
     return FileResponse(folder / f"{name}.png", headers=FOREVER)
 
 
@@ -162,15 +163,6 @@ def make_thumbnail(source: Path, target: Path) -> None:
         picture.thumbnail((THUMBNAIL_WIDTH, THUMBNAIL_WIDTH * 2), reducing_gap=2.0)
         picture.save(unfinished, "JPEG", quality=THUMBNAIL_QUALITY)
     unfinished.rename(target)
-
-
-def drop_cache(service: Service, capture_id: str) -> None:
-    """What was drawn of a capture goes with it: it shows a face."""
-    service.store.remove(_cache(service, capture_id))
-
-
-def _cache(service: Service, capture_id: str) -> Path:
-    return service.store.data / "cache" / "console" / capture_id
 
 
 def _image_name(record: dict[str, Any], camera: str) -> str:

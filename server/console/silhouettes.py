@@ -6,21 +6,21 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipeline.segmentation import segment
 from pipeline.settings import SegmentationSettings
 from rig.capture import read_capture
 from rig.files import write_atomically
 from server.child import Bench, Report
+from server.silhouette_cache import segment_once
 
 WIDTH = 640
 COLOUR = (108, 178, 255)  # the accent of the pages
 LINE_PX = 3
 
 
-def draw(bench: Bench, report: Report, *, capture: str, target: str) -> None:
+def draw(bench: Bench, report: Report, *, capture: str, cache: str, target: str) -> None:
     """Writes ``target``/<camera>.png, the outline with a tint of the subject on nothing. Raises InputError."""
     shot, rig = read_capture(Path(capture))
-    found = segment(shot, rig, SegmentationSettings(), report=report)
+    found = segment_once(Path(cache), shot, rig, SegmentationSettings(), report=report)
     for name, silhouette in found.items():
         done, data = cv2.imencode(".png", outline(silhouette.mask)[:, :, [2, 1, 0, 3]])
         assert done

@@ -157,13 +157,12 @@ def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeat
 @router.delete("/captures/{capture_id}", status_code=204, responses=documented(404, 409))
 def delete_capture(service: ServiceOf, caller: Taker, capture_id: str) -> None:
     """Removes a capture with its images; its jobs and their results stay. 409 while a job needs it."""
-    folder = service.store.folder("captures", capture_id)
     service.store.capture(capture_id)
     active = service.jobs.active(capture=capture_id)
     if active:
         detail = "Jobs that are queued or running need this capture; cancel them first."
         raise Problem(409, "capture-in-use", detail, [f"job {job}" for job in active])
-    service.store.remove(folder)
+    service.store.remove_capture(capture_id)
 
 
 @router.post(
@@ -206,10 +205,10 @@ async def reconstruct_upload(
             submit, service, caller, record, wanted, request.headers.get("idempotency-key")
         )
     except BaseException:
-        service.store.remove(service.store.folder("captures", record["id"]))
+        service.store.remove_capture(record["id"])
         raise
     if job["capture_id"] != record["id"]:  # the key's first call made the job; this upload is not needed
-        service.store.remove(service.store.folder("captures", record["id"]))
+        service.store.remove_capture(record["id"])
     response.headers["Location"] = f"/v1/jobs/{job['id']}"
     return JobOut.model_validate(job)
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Response
 
 from server.access import Caller, require
+from server.jobs import FINISHED
 from server.problems import Problem, documented
 from server.schemas import NewSession, SessionList, SessionOut
 from server.service import Service, ServiceOf
@@ -58,24 +59,29 @@ def erase(service: Service, session_id: str) -> None:
     jobs = {job["id"] for job in service.jobs.find(session=session_id, limit=100_000)}
     for capture in captures:
         jobs |= {job["id"] for job in service.jobs.find(capture=capture["id"], limit=100_000)}
+    active = [job for job in jobs if service.jobs.state(job) not in FINISHED]
     for job in jobs:
         service.jobs.cancel(job)
+    _await_workers(service, active)
     for job in jobs:
         _delete_job(service, job)
     for capture in captures:
-        service.store.remove(service.store.folder("captures", capture["id"]))
+        service.store.remove_capture(capture["id"])
     service.store.remove(service.store.folder("sessions", session_id).with_suffix(".json"))
 
 
-def _delete_job(service: Service, job_id: str) -> None:
-    """A worker may still write for a moment after the cancellation."""
-    service.jobs.delete(job_id)
-    folder = service.store.folder("jobs", job_id)
+def _await_workers(service: Service, jobs: list[str]) -> None:
+    """Until no worker writes to the jobs any more, each of which then lacks its attempt's folder: it would put back
+    what is erased here. One that was killed will not write either, but leaves its folder."""
     deadline = time.monotonic() + CANCEL_S
-    while folder.exists() and time.monotonic() < deadline:
-        service.store.remove(folder)
-        time.sleep(0.1)
-    if folder.exists():
+    folders = [service.store.folder("jobs", job) for job in jobs]
+    while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:
+        time.sleep(0.05)
+
+
+def _delete_job(service: Service, job_id: str) -> None:
+    service.jobs.delete(job_id)
+    if service.store.folder("jobs", job_id).exists():
         raise Problem(503, "still-writing", "A worker still writes; ask for the erasure again.")
 
 

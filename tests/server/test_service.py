@@ -260,6 +260,9 @@ def test_erasing_a_session_leaves_nothing_of_it(service: RunningService, http: h
     assert len(jobs) == 2
     await_state(http, jobs[0], ("running", "succeeded"))
     assert http.get(f"/v1/sessions/{session}").json()["captures"] == sorted(captures, reverse=True)
+    for capture in captures:
+        (service.data / "cache/captures" / capture / "small").mkdir(parents=True)
+        (service.data / "cache/captures" / capture / "small/cam00.jpg").write_bytes(b"a face")
     assert http.delete(f"/v1/sessions/{session}").status_code == 204
     gone = [session, *captures, *jobs]
     assert not [path for path in stored(service) if any(identity in path for identity in gone)]

@@ -13,7 +13,7 @@ from server.child import Bench, Report
 
 
 def work(
-    bench: Bench, report: Report, *, capture: str, result: str, model: str | None, settings: dict[str, Any]
+    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
 ) -> dict[str, Any]:
     """Takes ``EIGENHEAD_TINY_S`` seconds and writes files that follow from the capture alone."""
     shot, _ = read_capture(Path(capture))
@@ -40,7 +40,7 @@ def work(
 
 
 def busy(
-    bench: Bench, report: Report, *, capture: str, result: str, model: str | None, settings: dict[str, Any]
+    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
 ) -> dict[str, Any]:
     """About a second of one core, by count and not by clock, so that a busy core takes longer."""
     digest = b""

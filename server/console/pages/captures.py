@@ -6,7 +6,6 @@ from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from server.console.media import drop_cache
 from server.console.page import Action, Page, shared, signed_in
 from server.console.removal import Removals
 from server.console.theme import page_frame
@@ -57,7 +56,6 @@ def remove(page: Page, event: dict[str, Any]) -> None:
 
     def delete() -> None:
         delete_capture(service, caller, identity)
-        drop_cache(service, identity)
 
     removals.add(identity, delete)
     shared.forget("captures")
