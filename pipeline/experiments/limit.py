@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_errors, random_subjects
@@ -139,7 +139,7 @@ def with_noise(silhouette: Silhouette, sigma: float, correlation: float, rng: np
     points, arc = contour_points(silhouette.distance)
     band = np.abs(silhouette.distance) < BAND_PX
     rows, columns = np.nonzero(band)
-    _, nearest = cKDTree(points).query(np.stack([columns, rows], axis=1))
+    _, nearest = KDTree(points).query(np.stack([columns, rows], axis=1))
     displacement = contour_process(arc, sigma, correlation, rng)
     distance = silhouette.distance.copy()
     distance[band] += displacement[nearest]
@@ -149,7 +149,7 @@ def with_noise(silhouette: Silhouette, sigma: float, correlation: float, rng: np
 def contour_points(distance: Float32[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Points (x, y) on the zero contour, STEP_PX or less apart, and the arc length (px) at each; a gap of 1,000 px
     between pieces makes their noise independent."""
-    slopes = np.stack(np.gradient(distance)[::-1], axis=-1)
+    slopes = np.stack([np.gradient(distance, axis=1), np.gradient(distance, axis=0)], axis=-1)
     pieces, _ = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     points, arcs, end = [], [], 0.0
     for piece in pieces:

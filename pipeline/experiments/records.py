@@ -1,8 +1,11 @@
 """Rows of long experiments, kept as they come, so that a run that was stopped goes on where it was."""
 
+import hashlib
+import inspect
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from rig.files import write_atomically
@@ -27,5 +30,13 @@ class Records:
         if name not in self._rows:
             self._rows[name] = compute()
             if self._path is not None:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(self._path, json.dumps({"key": self._key, "rows": self._rows}).encode())
         return self._rows[name]
+
+
+def key_of(*parts: object) -> str:
+    """A key for ``Records``: modules count by their source, so that rows of an older solver are computed anew, and
+    everything else by its text."""
+    texts = [inspect.getsource(part) if isinstance(part, ModuleType) else str(part) for part in parts]
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]

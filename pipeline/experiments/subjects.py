@@ -11,11 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.contour import camera_information
 from pipeline.fitting.fit import Fit
 from pipeline.silhouette import Silhouette, silhouette_from_mask
-from rig.geometry import Similarity, rotation_from_vector
+from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.layout import Rig
+from rig.mesh import Mesh
 from rig.render.renderer import Renderer
+from rig.studio.anatomy import anatomy
+from rig.studio.clothes import shirt
+from rig.studio.hair import HairStyle, grow
 
 SPREAD = 0.8  # section 5.2: Gaussian within +-0.8 standard deviations
 TURN, SHIFT_MM = 0.06, 8.0  # a seated subject: standard deviation of its pose
@@ -45,16 +50,17 @@ def subjects_of_section_5_2(model: HeadModel, count: int = 100, seed: int = 52) 
     return found
 
 
-def random_subjects(count: int, seed: int, modes: int = 60) -> list[Planted]:
-    """Random heads of the model's span."""
+def random_subjects(count: int, seed: int, modes: int = 60, most: float | None = SPREAD) -> list[Planted]:
+    """Random heads of the model's span, each coefficient within ``most`` standard deviations if not None."""
     rng = np.random.default_rng(seed)
-    return [_planted(f"random-{i:03}", _within(rng, modes), rng) for i in range(count)]
+    bound = np.inf if most is None else most
+    return [_planted(f"random-{i:03}", _within(rng, modes, bound), rng) for i in range(count)]
 
 
-def _within(rng: np.random.Generator, modes: int) -> Float[np.ndarray, " m"]:
+def _within(rng: np.random.Generator, modes: int, most: float = SPREAD) -> Float[np.ndarray, " m"]:
     """Gaussian coefficients, drawn again where they leave +-0.8 standard deviations, as section 5.2 says."""
     drawn = rng.standard_normal(modes)
-    while (outside := np.abs(drawn) > SPREAD).any():
+    while (outside := np.abs(drawn) > most).any():
         drawn[outside] = rng.standard_normal(int(outside.sum()))
     return drawn
 
@@ -82,11 +88,11 @@ def binary_silhouettes(
 
 
 def exact_silhouettes(
-    model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, finer: int = 4
+    model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, finer: int = 4, level: str = "full"
 ) -> dict[str, Silhouette]:
     """Signed distances of the true outline, to 0.03 px or so, from masks drawn ``finer`` times as large."""
-    with renderer.silhouette_set(rig, model.levels["full"].faces, float(finer)) as drawn:
-        masks = drawn.masks(subject.vertices(model))
+    with renderer.silhouette_set(rig, model.levels[level].faces, float(finer)) as drawn:
+        masks = drawn.masks(subject.vertices(model, level))
     found = {}
     for name, mask in masks.items():
         fine = silhouette_from_mask(mask).distance / finer
@@ -101,3 +107,62 @@ def face_errors(model: HeadModel, fit: Fit, subject: Planted) -> Float[np.ndarra
     region = model.levels["full"].face_region
     found = fit.world_from_head.apply(model.vertices(fit.coefficients))
     return found[region] - subject.vertices(model)[region]
+
+
+def mean_error_mm(model: HeadModel, fit: Fit, subject: Planted) -> float:
+    """Mean distance (mm) of the face region's vertices from where they truly are."""
+    return float(np.linalg.norm(face_errors(model, fit, subject), axis=1).mean())
+
+
+def worn_silhouettes(
+    model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, style: HairStyle, rng: np.random.Generator
+) -> dict[str, Silhouette]:
+    """Masks of the head with hair, strands and all, and a shirt, as the studio dresses a subject."""
+    head, full = model.vertices(subject.coefficients), model.levels["full"]
+    body = anatomy(head, {name: head[row] for name, row in model.landmarks.items()})
+    hair, worn = grow(head, body, style, rng), shirt(Mesh(head, full.faces), body, rng)
+    pieces = [(head, full.faces), (hair.shell, hair.shell_faces), (hair.strands, hair.strand_faces)]
+    pieces += [worn] if worn is not None else []
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in pieces])
+    faces = np.concatenate([faces + start for (_, faces), start in zip(pieces, starts[:-1], strict=True)])
+    with renderer.silhouette_set(rig, faces) as drawn:
+        masks = drawn.masks(subject.world_from_head.apply(np.concatenate([vertices for vertices, _ in pieces])))
+    return {name: silhouette_from_mask(mask) for name, mask in masks.items()}
+
+
+def off_by(rig: Rig, error_px: float, rng: np.random.Generator) -> Rig:
+    """The rig with every camera's pose off: a head in the middle moves by ``error_px`` RMS in each image."""
+    moved = []
+    for camera in rig:
+        depth = float(camera.camera_from_world.apply(rig.centre_world())[2])
+        spread = 1.0 / np.sqrt(np.diag(camera_information(replace(camera, covariance=None), depth, error_px)))
+        shift = spread * rng.standard_normal(6)
+        motion = RigidTransform(rotation_from_vector(shift[:3]), shift[3:])
+        moved.append(replace(camera, camera_from_world=motion @ camera.camera_from_world))
+    return Rig(tuple(moved))
+
+
+def stated(rig: Rig, error_px: float) -> Rig:
+    """The rig with calibration errors of that size stated as each camera's covariance."""
+    cameras = []
+    for camera in rig:
+        depth = float(camera.camera_from_world.apply(rig.centre_world())[2])
+        information = camera_information(replace(camera, covariance=None), depth, error_px)
+        cameras.append(replace(camera, covariance=np.linalg.inv(information)))
+    return Rig(tuple(cameras))
+
+
+def face_rows(
+    model: HeadModel, coefficients: Float[np.ndarray, " m"], pose: Similarity, every: int
+) -> Float[np.ndarray, "n p"]:
+    """d(position along a world axis) / d(coefficients, rotation, translation, log scale): three rows for every
+    ``every``-th vertex of the face region, all x first."""
+    region = np.flatnonzero(model.levels["full"].face_region)[::every]
+    basis = model.basis("full", len(coefficients), region).astype(float)
+    arms = pose.apply(model.vertices(coefficients)[region]) - pose.translation
+    rows = []
+    for axis in range(3):
+        unit = np.broadcast_to(np.eye(3)[axis], arms.shape)
+        shape = pose.scale * np.einsum("c,mvc->vm", pose.rotation[axis], basis)
+        rows.append(np.concatenate([shape, np.cross(arms, unit), unit, arms[:, [axis]]], axis=1))
+    return np.concatenate(rows)
