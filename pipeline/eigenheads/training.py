@@ -34,7 +34,7 @@ class Training:
 
 
 def train(training: Training, *, report: Report | None = None) -> ModelParts:
-    """Rigid Procrustes (no scale), PCA, levels and the leave-one-out figure. Raises NotAManifold."""
+    """Rigid Procrustes (no scale), PCA, levels, generalisation and specificity. Raises NotAManifold."""
     say = report or (lambda stage, fraction: None)
     check_manifold(training.faces)
     say("aligning", 0.0)
@@ -47,6 +47,7 @@ def train(training: Training, *, report: Report | None = None) -> ModelParts:
     used = min(USED_MODES, len(components.modes))
     figures = {
         "generalisation_mm": worth.generalisation(components, region, [used], report=report)[used],
+        "specificity_mm": worth.specificity(components.mean, components.modes[:used], heads, region),
         "modes_used": used,
     }
     return finish(training, components, region, figures, report=report)

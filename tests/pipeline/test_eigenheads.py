@@ -18,7 +18,7 @@ from pipeline.eigenheads.model import (
     save_model,
     with_modes,
 )
-from pipeline.eigenheads.surface import check_manifold
+from pipeline.eigenheads.surface import boundary_loops, check_manifold
 from rig.mesh import face_normals, vertex_normals
 
 
@@ -65,6 +65,19 @@ def test_every_level_is_one_outward_surface_open_only_at_the_neck(model: HeadMod
         assert area.min() > 0, name
 
 
+def test_the_neck_is_cut_clean(model: HeadModel) -> None:
+    """The border of the mean is plane and convex: its turns add up to one, where a saw's would add up to several."""
+    for name, level in model.levels.items():
+        (loop,) = boundary_loops(level.faces)
+        border = model.vertices(np.zeros(0), name)[loop]
+        centred = border - border.mean(0)
+        assert np.abs(centred @ np.linalg.svd(centred)[2][2]).max() < 0.5, name
+        along = np.roll(border, -1, 0) - border
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        turns = np.degrees(np.arccos(np.clip((along * np.roll(along, 1, 0)).sum(1), -1, 1)))
+        assert turns.sum() == pytest.approx(360, abs=2), name
+
+
 def test_levels_are_rows_of_the_full_one(model: HeadModel) -> None:
     rng = np.random.default_rng(1)
     z = rng.standard_normal(60)
@@ -105,7 +118,7 @@ def test_coefficients_are_standard_deviations(model: HeadModel) -> None:
     flat = model.modes.reshape(len(model.modes), -1).astype(float)
     np.testing.assert_allclose(np.linalg.norm(flat, axis=1), model.sigma, rtol=1e-3)
     gram = flat @ flat.T / np.outer(model.sigma, model.sigma)
-    assert np.abs(gram - np.eye(len(gram))).max() < 2e-3  # rounding to 2^-10 mm on modes of a few mm in all
+    assert np.abs(gram - np.eye(len(gram))).max() < 2e-3  # rounding to 2^-12 mm on modes of a few mm in all
     np.testing.assert_allclose(model.scores.std(0, ddof=1), 1, rtol=1e-4)
     assert (np.diff(model.sigma) <= 0).all()
 
