@@ -92,11 +92,15 @@ def _write_pictures(folder: Path, result: Reconstruction, capture: Capture, head
         drawn = overlay(capture.images[name], silhouette.distance, result.fitted_masks[name], name)
         write_image(folder / "overlays" / f"{name}.png", drawn)
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # cv2 and NumPy release the interpreter lock
+    def draw_head() -> None:
+        panels = turntable(head, result.colours)
+        write_image(folder / "turntable.png", np.hstack(panels))
+        write_image(folder / "contact_sheet.png", _sheet(result, capture, shown, panels))
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # cv2, NumPy and the rasteriser release the interpreter lock
+        last = pool.submit(draw_head)
         list(pool.map(draw, shown))
-    panels = turntable(head, result.colours)
-    write_image(folder / "turntable.png", np.hstack(panels))
-    write_image(folder / "contact_sheet.png", _sheet(result, capture, shown, panels))
+        last.result()
 
 
 def _sheet(result: Reconstruction, capture: Capture, shown: list[str], panels: list[np.ndarray]) -> np.ndarray:

@@ -23,6 +23,7 @@ FITTED_COLOUR = (255, 110, 20)  # vermilion, a little lighter
 AZIMUTHS_DEG = (-80, -60, -40, -20, 0, 20, 40, 60, 80)
 PANEL = (480, 360)  # width and height of one panel of the contact sheet
 PAPER = (245, 245, 245)
+MARGIN_PX = 16  # around a fitted mask: wider than any line that is painted
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 
@@ -32,25 +33,25 @@ def overlay(
 ) -> ImageRgb:
     """The image with the input contour (sky blue) and the fitted head's contour (vermilion)."""
     line = max(1.0, 1.5 * image.shape[1] / 1024)
-    canvas = image.astype(np.float32)
+    painted = image.copy()
     contours = ((input_distance, INPUT_COLOUR), (_smooth_distance(fitted_mask), FITTED_COLOUR))
     for distance, _ in contours:
-        _paint(canvas, distance, (0, 0, 0), line + 1.0, 0.45)
+        _paint(painted, distance, (0, 0, 0), line + 1.0, 0.45)
     for distance, colour in contours:
-        _paint(canvas, distance, colour, line, 1.0)
-    painted = np.clip(np.round(canvas), 0, 255).astype(np.uint8)
+        _paint(painted, distance, colour, line, 1.0)
     entries = [(label, (255, 255, 255))] if label else []
     return legend(painted, [*entries, ("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)])
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> ImageRgb:
     """Eq. (4) as a picture: sky blue where only the input is, vermilion where only the model is, over a pale image."""
-    grey = image.mean(axis=2, dtype=np.float32, keepdims=True) * 0.35 + 150.0
-    canvas = np.repeat(grey, 3, axis=2)
-    canvas[observed & model] -= 60.0
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+    shade = np.round(0.35 * np.arange(256) + 150.0)
+    pale, dark = shade.astype(np.uint8), (shade - 60.0).astype(np.uint8)
+    canvas = cv2.cvtColor(np.where(observed & model, dark[grey], pale[grey]), cv2.COLOR_GRAY2RGB)
     for where, colour in ((observed & ~model, INPUT_COLOUR), (model & ~observed, FITTED_COLOUR)):
-        canvas[where] = 0.25 * canvas[where] + 0.75 * np.array(colour, np.float32)
-    return np.clip(np.round(canvas), 0, 255).astype(np.uint8)
+        canvas[where] = (0.25 * canvas[where] + 0.75 * np.array(colour, np.float32)).astype(np.uint8)
+    return canvas
 
 
 def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
@@ -107,20 +108,26 @@ def _panel(image: ImageRgb) -> ImageRgb:
 
 
 def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The distance to a binary mask's contour without its stairs, which would make a thin line look broken."""
-    if not mask.any():
-        return np.full(mask.shape, np.inf, np.float32)
-    return cv2.GaussianBlur(signed_distance(mask), (0, 0), 1.0)
+    """The distance to a binary mask's contour without its stairs, which would make a thin line look broken; taken in
+    the mask's own frame and a margin, infinite outside."""
+    distance = np.full(mask.shape, np.inf, np.float32)
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    if width:
+        own = (
+            slice(max(top - MARGIN_PX, 0), top + height + MARGIN_PX),
+            slice(max(left - MARGIN_PX, 0), left + width + MARGIN_PX),
+        )
+        distance[own] = cv2.GaussianBlur(signed_distance(mask[own]), (0, 0), 1.0)
+    return distance
 
 
 def _paint(
-    canvas: Float32[np.ndarray, "h w 3"],
+    canvas: ImageRgb,
     distance: Float[np.ndarray, "h w"],
     colour: tuple[int, int, int],
     width: float,
     strength: float,
 ) -> None:
-    alpha = strength * np.clip(width / 2 + 0.5 - np.abs(distance), 0.0, 1.0)
-    where = alpha > 0
-    share = alpha[where][:, None]
-    canvas[where] += share * (np.array(colour, np.float32) - canvas[where])
+    where = np.abs(distance) < width / 2 + 0.5
+    alpha = strength * np.clip(width / 2 + 0.5 - np.abs(distance[where]), 0.0, 1.0)
+    canvas[where] = np.round(canvas[where] + alpha[:, None] * (np.array(colour, np.float32) - canvas[where]))

@@ -9,7 +9,7 @@ from pipeline.alignment_search import search_alignment
 from pipeline.drift import find_drift
 from pipeline.eigenheads.kernel import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_modes
-from pipeline.evidence import camera_figures, start_vertices
+from pipeline.evidence import camera_figures, start_masks
 from pipeline.fitting.contour import finish, solve_contour
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo import refine_with_photographs
@@ -98,10 +98,10 @@ def reconstruct(
     normals = mesh.normals()
     coloured = texture(mesh, normals, capture, silhouettes, rig, settings.texture, renderer=renderer)
     clock("evidence")
+    before = start_masks(model, start, rig, renderer)
     with renderer.silhouette_set(rig, full.faces) as drawn:
-        start_masks = drawn.masks(start_vertices(model, start))
         fitted_masks = drawn.masks(mesh.vertices)
-    figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, start_masks)
+    figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, before)
     quality = vertex_deviation_mm(model, fit)
     clock("")
     report("done", 1.0)
@@ -115,7 +115,7 @@ def reconstruct(
         views=coloured.views,
         quality_mm=quality,
         silhouettes=silhouettes,
-        start_masks=start_masks,
+        start_masks=before,
         fitted_masks=fitted_masks,
         cameras=figures,
         landmarks=landmarks(model, fit),
@@ -187,7 +187,10 @@ def fit_head(
     """Section 4.4 by the solver that the settings name: the fit, the model with the modes that it has, and how deep it
     went."""
     if settings.method == "simplex":
-        fit = fit_simplex(model, start, silhouettes, rig, settings.fitting, renderer=renderer, report=report)
+        # The simplex never moves the pose, and what seven points leave (3 degrees, 5 mm) would all become shape.
+        posed = solve_contour(model, start, silhouettes, rig, settings.fitting, features=capture.features)
+        place = posed.state.world_from_head
+        fit = fit_simplex(model, place, silhouettes, rig, settings.fitting, renderer=renderer, report=report)
         return fit, model, Detail("span", "the simplex searches the eigenheads alone")
     solved = solve_contour(model, start, silhouettes, rig, settings.fitting, features=capture.features, report=report)
     detail = Detail("span" if settings.detail == "span" else "kernel", "the settings ask for it")
