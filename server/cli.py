@@ -454,18 +454,31 @@ def model_show(
 
 @app.command(epilog="Example: eigenhead experiments limit --subjects 3 --json")
 def experiments(
-    name: Annotated[str, typer.Argument(help="table1, table2, table3, limit, span or detail.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, posterior, "
+            "views, span or detail."
+        ),
+    ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
     subjects: Annotated[int | None, typer.Option(help="How many, instead of the experiment's own.", min=1)] = None,
+    simplex: Annotated[
+        int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
+    ] = None,
     shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
-    folder: Annotated[Path | None, typer.Option(help="Keeps rows, so that a stopped run goes on.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Keeps rows there, so that a stopped run goes on; and the table and pictures.")
+    ] = None,
     json_out: Json = False,
 ) -> None:
     """Repeat the paper's experiments, and ours."""
     from server.experiments import run_experiment
 
     with _progress() as report:
-        found = run_experiment(name, model=model, subjects=subjects, shared=shared, folder=folder, report=report)
+        found = run_experiment(
+            name, model=model, subjects=subjects, simplex=simplex, shared=shared, folder=out, report=report
+        )
     _answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
 
 
