@@ -46,7 +46,7 @@ def report_page(calibration: Calibration) -> str:
         f"<style>{STYLE}</style><h1>Camera calibration</h1><p>{summary}</p>",
         "<h2>Checks</h2>",
         _checks(calibration),
-        _listed("Warnings", calibration.warnings),
+        listed("Warnings", calibration.warnings),
         "<h2>Cameras</h2>",
         _camera_table(calibration),
         _offsets(calibration),
@@ -71,7 +71,8 @@ def _checks(calibration: Calibration) -> str:
     return f"<table class='wide'>{''.join(rows)}</table>"
 
 
-def _listed(title: str, lines: Iterable[str]) -> str:
+def listed(title: str, lines: Iterable[str]) -> str:
+    """A headed list, or nothing."""
     items = "".join(f"<li>{escape(line)}</li>" for line in lines)
     return f"<h2>{title}</h2><ul>{items}</ul>" if items else ""
 
@@ -90,7 +91,7 @@ def _camera_table(calibration: Calibration) -> str:
         )
         for name, row in calibration.figures()["cameras"].items()
     ]
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def _offsets(calibration: Calibration) -> str:
@@ -103,7 +104,7 @@ def _offsets(calibration: Calibration) -> str:
         for name, value, sigma in zip(calibration.rig.names, offsets.offsets, offsets.sigma, strict=True)
     ]
     text = f"RMS {offsets.rms_without_px:.3f} px without, {offsets.rms_with_px:.3f} px with them ({said})."
-    return f"<h3>Time offsets, in shots</h3><p>{text}</p>" + _table(("camera", "offset", "+-"), rows)
+    return f"<h3>Time offsets, in shots</h3><p>{text}</p>" + table(("camera", "offset", "+-"), rows)
 
 
 def _parameter_table(calibration: Calibration) -> str:
@@ -123,10 +124,11 @@ def _parameter_table(calibration: Calibration) -> str:
         turn = ", ".join(f"&plusmn; {1000 * value:.2g}" for value in spread[:3])
         shift = ", ".join(f"&plusmn; {value:.2g}" for value in spread[3:])
         rows.append((camera.name, *lens, turn, shift))
-    return _table(head, rows)
+    return table(head, rows)
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Rows of cells that are markup already."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{top}</tr>{body}</table>"

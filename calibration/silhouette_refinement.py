@@ -13,10 +13,11 @@ pixels stay where they are as a camera moves: with x' = R(w) x + v in camera 1's
     d delta ~ w . (R1 (d2 x b)) x R1 d1 + v . R1 (d1 x d2)         and likewise, signs swapped, for camera 2.
 
 The first step uses the outer tangents of ``pipeline.drift``, which cannot be confused, the others all frontier points;
-each finds them anew. The calibration's covariance is the prior; the gauge is that of
-``calibration.gauge``. Silhouettes do not see a rig's scale, so that stays the board's.
+each finds them anew. With a head model, the rims of the fitted heads join in at the end (``calibration.rims``). The
+calibration's covariance is the prior; the gauge is that of ``calibration.gauge``. Silhouettes do not see a rig's scale,
+so that stays the board's.
 
-Enters: silhouettes of several captures, and the rig. Leaves: the rig, refined if the captures held out agree.
+Enters: silhouettes of several captures, and the rig. Leaves: the rig, refined if captures held out agree.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,10 +25,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from calibration.frontier import find_frontier
 from calibration.gauge import align_world, gauge_projection, image_distance, moved
+from calibration.rims import Heads, rim_equations
 from pipeline.drift import Tangency, find_tangencies
 from pipeline.fitting.contour import camera_information
 from pipeline.silhouette import Silhouette
@@ -40,30 +42,48 @@ FOCAL_SPREAD = 1e-3  # of the logarithm: what a board leaves open
 NOISE_LEAST_PX = 0.07  # a contour of a binary mask is not better
 OUTER_STEPS = 1  # with outer tangents alone, which cannot be confused
 ROBUST_SIGMAS = 3.0
-STEPS = 6
+STEPS, RIM_STEPS = 6, 2
 SETTLED_PX = 1e-2
+FOLDS = 5
 GAIN_SIGMAS = 2.0  # by how many of its standard deviations the held-out residuals must shrink
 
 
 class TooFewCaptures(EigenheadError):
     """Nothing would be left to refine from."""
 
-    def __init__(self, captures: int, held_out: int) -> None:
+    def __init__(self, captures: int) -> None:
         super().__init__(
-            f"silhouette refinement got {captures} captures, of which {held_out} are held out as a check: "
-            f"take at least {held_out + 1}, better 5, of different subjects or head poses"
+            f"silhouette refinement got {captures} captures, of which some are held out as a check: "
+            "take at least 2, better 5, of different subjects or head poses"
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Tangency residuals (px), each with the two cameras that it is of."""
+
+    cameras: tuple[tuple[str, str], ...]
+    px: Float[np.ndarray, " n"]
+
+    def of(self, camera: str) -> Float[np.ndarray, " k"]:
+        """Those that a camera takes part in."""
+        return self.px[[camera in pair for pair in self.cameras]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """What came of it. ``before_px`` and ``after_px``: robust RMS of the tangency residuals (px) of the captures held
-    out. ``change_px``: RMS motion (2D) per camera of the subject's region, worlds aligned, of the proposed change,
-    which ``rig`` contains only where ``kept``."""
+    """What came of it. ``before``: residuals of all captures at the start; ``after``: of each capture where the others
+    alone put the cameras; ``before_px`` and ``after_px`` their robust RMS with the noise ``noise_px``. ``change_px``:
+    RMS motion (2D) per camera of the subject's region, worlds aligned, from the start to ``proposed``, the rig that all
+    captures agree on and that ``rig`` is only where ``kept``."""
 
     rig: Rig
+    proposed: Rig
+    before: Residuals
+    after: Residuals
     before_px: float
     after_px: float
+    noise_px: float
     kept: bool
     reason: str
     change_px: Mapping[str, float]
@@ -73,38 +93,65 @@ def refine(
     captures: Sequence[Mapping[str, Silhouette]],
     rig: Rig,
     *,
-    held_out: int = 1,
     focal: bool = False,
     prior_px: float = PRIOR_PX,
+    heads: Heads | None = None,
     report: Callable[[str, float], None] = lambda stage, fraction: None,
 ) -> Refinement:
-    """Refines extrinsics, and with ``focal`` focal lengths, on all but the last ``held_out`` captures.
+    """Refines extrinsics, and with ``focal`` focal lengths, from all captures; kept if they agree when each is held out
+    in its turn (several at a time where there are more than ``FOLDS``).
 
-    ``prior_px``: standard deviation in the image of a camera without a covariance. Raises TooFewCaptures.
+    ``prior_px``: standard deviation in the image of a camera without a covariance. ``heads``: a model whose rims speak
+    as well, once the tangencies have settled. Raises TooFewCaptures.
     """
-    if held_out < 1 or len(captures) <= held_out:
-        raise TooFewCaptures(len(captures), held_out)
-    used, checks = captures[:-held_out], captures[-held_out:]
-    proposed = _minimise(used, rig, focal=focal, prior_px=prior_px, report=report)
-    before, after = residuals(checks, rig), residuals(checks, proposed)
-    noise = _noise(after)
-    gain, deviation = _gain(before, after, noise)
-    before_px, after_px = robust_rms(before, noise), robust_rms(after, noise)
+    if len(captures) < 2:
+        raise TooFewCaptures(len(captures))
+    folds = min(FOLDS, len(captures))
+    proposed = _minimise(captures, rig, focal=focal, prior_px=prior_px, heads=heads)
+    report("refine", 1 / (folds + 1))
+    parts = []
+    for fold in range(folds):
+        others = [i for i in range(len(captures)) if i % folds != fold]
+        their = None if heads is None else heads.subset(others)
+        without = _minimise([captures[i] for i in others], rig, focal=focal, prior_px=prior_px, heads=their)
+        held_out = captures[fold::folds]
+        parts.append((residuals(held_out, rig), residuals(held_out, without)))
+        report("refine", (fold + 2) / (folds + 1))
+    before, after = (_joined(side) for side in zip(*parts, strict=True))
+    noise = _noise(after.px)
+    gain, deviation = _gain(before.px, after.px, noise)
+    before_px, after_px = robust_rms(before.px, noise), robust_rms(after.px, noise)
     kept = gain > GAIN_SIGMAS * deviation
     words = "shrink" if kept else "do not shrink"
     reason = (
-        f"tangency residuals of {held_out} captures held out {words}: {before_px:.2f} to {after_px:.2f} px "
-        f"over {len(after)} equations, {gain / max(deviation, 1e-9):.1f} standard deviations"
+        f"tangency residuals of the {len(captures)} captures, each held out in its turn, {words}: "
+        f"{before_px:.2f} to {after_px:.2f} px over {len(after.px)} equations, "
+        f"{gain / max(deviation, 1e-9):.1f} standard deviations"
     )
-    change = dict(zip(rig.names, image_distance(proposed, rig).tolist(), strict=True))
-    report("refine", 1.0)
-    return Refinement(proposed if kept else rig, before_px, after_px, kept, reason, change)
+    return Refinement(
+        rig=proposed if kept else rig,
+        proposed=proposed,
+        before=before,
+        after=after,
+        before_px=before_px,
+        after_px=after_px,
+        noise_px=noise,
+        kept=kept,
+        reason=reason,
+        change_px=dict(zip(rig.names, image_distance(proposed, rig).tolist(), strict=True)),
+    )
 
 
-def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig) -> Float[np.ndarray, " n"]:
-    """Residuals (px) of all captures' outer tangencies: the same ones whatever the rig, so that two rigs compare."""
-    found = [_equations(_tangencies(capture, rig, outer=True), rig, focal=False)[1] for capture in captures]
-    return np.concatenate(found)
+def _joined(parts: Sequence[Residuals]) -> Residuals:
+    cameras = tuple(pair for part in parts for pair in part.cameras)
+    return Residuals(cameras, np.concatenate([part.px for part in parts]))
+
+
+def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig) -> Residuals:
+    """Residuals of all captures' outer tangencies: the same ones whatever the rig, so that two rigs compare."""
+    found = [_tangencies(capture, rig, outer=True) for capture in captures]
+    misses = [_equations(tangencies, rig, focal=False)[1] for tangencies in found]
+    return Residuals(tuple(t.cameras for tangencies in found for t in tangencies), np.concatenate(misses))
 
 
 def robust_rms(misses: Float[np.ndarray, " n"], noise_px: float) -> float:
@@ -136,28 +183,53 @@ def _minimise(
     *,
     focal: bool,
     prior_px: float,
-    report: Callable[[str, float], None],
+    heads: Heads | None,
 ) -> Rig:
-    """Gauss-Newton on the tangencies of all captures, found anew at each step, with the start as prior."""
+    """Gauss-Newton on the tangencies of all captures, found anew at each step, with the start as prior; then on these
+    and the rims of the heads. The result's covariances are those of the last step, in the subject's gauge."""
     prior = _prior(start, focal=focal, prior_px=prior_px)
     projection = _projection(start, focal=focal)
-    total, rig = np.zeros(len(prior)), start
+    total, rig, matrix = np.zeros(len(prior)), start, prior
     for k in range(STEPS):
         outer = k < OUTER_STEPS
-        systems = [_equations(_tangencies(capture, rig, outer=outer), rig, focal=focal) for capture in captures]
-        rows, misses = np.concatenate([s[0] for s in systems]), np.concatenate([s[1] for s in systems])
-        noise = _noise(misses)
-        weight = 1.0 / (1.0 + (misses / (ROBUST_SIGMAS * noise)) ** 2) ** 2 / noise**2
-        matrix = (rows * weight[:, None]).T @ rows + prior
-        gradient = (rows * weight[:, None]).T @ misses + prior @ total
-        step = projection @ -scipy.linalg.solve(matrix, gradient, assume_a="pos")
+        matrix, gradient, rows = _tangency_system(captures, rig, outer=outer, focal=focal)
+        matrix += prior
+        step = projection @ -scipy.linalg.solve(matrix, gradient + prior @ total, assume_a="pos")
         total = total + step
         rig = _apply(start, total, focal=focal)
-        report("refine", (k + 1) / (STEPS + 2))
-        size = np.sqrt(np.mean((rows @ step) ** 2))
-        if not outer and size < SETTLED_PX:
+        if not outer and np.sqrt(np.mean((rows @ step) ** 2)) < SETTLED_PX:
             break
-    return align_world(rig, start)
+    for _ in range(RIM_STEPS if heads is not None else 0):
+        assert heads is not None
+        matrix, gradient, _ = _tangency_system(captures, rig, outer=False, focal=focal)
+        matrix += prior
+        poses = _pose_places(rig, focal=focal)
+        for capture, place in zip(captures, heads.starts, strict=True):
+            more, slope = rim_equations(capture, rig, heads, place)
+            matrix[np.ix_(poses, poses)] += more
+            gradient[poses] += slope
+        total = total + projection @ -scipy.linalg.solve(matrix, gradient + prior @ total, assume_a="pos")
+        rig = _apply(start, total, focal=focal)
+    covariance = projection @ np.linalg.inv(matrix) @ projection.T
+    return _with_covariances(align_world(rig, start), covariance, focal=focal)
+
+
+def _tangency_system(
+    captures: Sequence[Mapping[str, Silhouette]], rig: Rig, *, outer: bool, focal: bool
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"], Float[np.ndarray, "n p"]]:
+    """Normal matrix and gradient of the robust cost of all captures' tangencies, and the Jacobian."""
+    systems = [_equations(_tangencies(capture, rig, outer=outer), rig, focal=focal) for capture in captures]
+    rows, misses = np.concatenate([s[0] for s in systems]), np.concatenate([s[1] for s in systems])
+    noise = _noise(misses)
+    weight = 1.0 / (1.0 + (misses / (ROBUST_SIGMAS * noise)) ** 2) ** 2 / noise**2
+    weighted = (rows * weight[:, None]).T
+    return weighted @ rows, weighted @ misses, rows
+
+
+def _with_covariances(rig: Rig, covariance: Float[np.ndarray, "p p"], *, focal: bool) -> Rig:
+    size = _per_camera(focal=focal)
+    blocks = [covariance[size * k : size * k + 6, size * k : size * k + 6] for k in range(len(rig))]
+    return Rig(tuple(replace(c, covariance=0.5 * (b + b.T)) for c, b in zip(rig, blocks, strict=True)))
 
 
 def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, *, outer: bool) -> list[Tangency]:
@@ -167,6 +239,11 @@ def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, *, outer: bool) -> 
 
 def _per_camera(*, focal: bool) -> int:
     return 7 if focal else 6
+
+
+def _pose_places(rig: Rig, *, focal: bool) -> Int[np.ndarray, " q"]:
+    """Where the six pose parameters of every camera stand among all parameters."""
+    return np.concatenate([_per_camera(focal=focal) * k + np.arange(6) for k in range(len(rig))])
 
 
 def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"]:
@@ -184,9 +261,8 @@ def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"
 
 def _projection(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
     """Takes the world's own motion out of a step."""
-    size = _per_camera(focal=focal)
-    poses = np.concatenate([size * k + np.arange(6) for k in range(len(rig))])
-    matrix = np.eye(size * len(rig))
+    poses = _pose_places(rig, focal=focal)
+    matrix = np.eye(_per_camera(focal=focal) * len(rig))
     matrix[np.ix_(poses, poses)] = gauge_projection(rig)
     return matrix
 

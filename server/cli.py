@@ -265,6 +265,35 @@ def calibrate(
     _answer(found.document(), json_out, [str(out), str(page), *cameras, total, *found.warnings])
 
 
+@app.command(epilog="Example: eigenhead refine shots/anna shots/ben shots/cleo shots/dora --out cameras.json")
+def refine(
+    captures: Annotated[list[Path], typer.Argument(help="Capture folders or archives, better 5 or more.", exists=True)],
+    out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Start from this cameras.json, not from the captures' own.", exists=True)
+    ] = None,
+    focal: Annotated[bool, typer.Option(help="Refine focal lengths too.")] = False,
+    model: Annotated[str | None, typer.Option(help="A head model whose rims speak as well: a name or file.")] = None,
+    json_out: Json = False,
+) -> None:
+    """Refine a calibration by the silhouettes of several captures; kept only if each agrees with the others."""
+    from calibration.refinement_report import refinement_page
+    from rig.files import write_atomically
+    from rig.layout import write_rig
+    from server.refine import refine_locally
+
+    page = out.with_suffix(".html")
+    with _progress() as report:
+        run = refine_locally(captures, calibration=calibration, focal=focal, model=model, report=report)
+    write_rig(run.refinement.rig, out)
+    write_atomically(page, refinement_page(run).encode())
+    verdict = "refined" if run.refinement.kept else "not changed"
+    cameras = [f"{name}  {px:.2f} px at the subject" for name, px in run.refinement.change_px.items()]
+    _answer(
+        run.document(), json_out, [f"{out}  {verdict}: {run.refinement.reason}", str(page), *cameras, *run.warnings]
+    )
+
+
 @rig_app.command("check", epilog="Example: eigenhead rig check --rig rig.toml")
 def rig_check(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
     """Open every camera, take a test shot, and print what to act on."""

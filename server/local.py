@@ -49,7 +49,7 @@ def reconstruct_locally(
 
     tell("read", 0.0)
     head_model = load_model(model or "default")
-    with _folder_of(capture) as folder, Renderer.create() as renderer:
+    with folder_of(capture) as folder, Renderer.create() as renderer:
         shot, rig = read_capture(folder)
         done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell)
         tell("write", 0.0)
@@ -58,7 +58,8 @@ def reconstruct_locally(
 
 
 @contextmanager
-def _folder_of(capture: Path) -> Iterator[Path]:
+def folder_of(capture: Path) -> Iterator[Path]:
+    """A capture folder, or what is in an archive of one for as long as it is needed. Raises InputError."""
     if capture.is_dir():
         yield capture
         return

@@ -34,10 +34,12 @@ def captures_of(
 
 
 def dressed_head(
-    model: HeadModel, rig: Rig, rng: np.random.Generator, modes: int
+    model: HeadModel, rig: Rig, rng: np.random.Generator, modes: int, *, bare: bool = False
 ) -> tuple[np.ndarray, Int[np.ndarray, "f 3"], Similarity]:
-    """Vertices (head frame) and faces of a head with hair and shirt, and its pose."""
+    """Vertices (head frame; the head's own first) and faces of a head with hair and shirt, or bare, and its pose."""
     vertices, faces = model.vertices(0.8 * rng.standard_normal(modes)), model.levels["full"].faces
+    if bare:
+        return vertices, faces, random_pose(rig.centre_world(), SPREAD_DEG, SPREAD_MM, rng)
     body = anatomy(vertices, {name: vertices[i] for name, i in model.landmarks.items()})
     pieces = [(vertices, faces)]
     style = random_look(rng).hair
