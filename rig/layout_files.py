@@ -23,7 +23,7 @@ from rig.camera import Camera
 from rig.errors import InputError
 from rig.files import write_atomically
 from rig.geometry import rotation_from_vector, vector_from_rotation
-from rig.layout import CAMERAS_MOST, FORMAT, Rig, read_rig, rig_from_document
+from rig.layout import CAMERAS_MOST, FORMAT, Rig, read_rig, rig_from_document, write_rig
 
 BYTES_MOST = 1 << 29  # a sparse model of a rig is a few megabytes; its 2D points may be many
 METRES_MOST = 30.0  # the widest head rig, in metres; in millimetres it would fit in a hand
@@ -38,6 +38,7 @@ COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
     "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 }
 COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
+FORMATS = ("eigenhead", "colmap", "colmap-text", "caliscope", "aniposelib")
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
 
 
@@ -112,6 +113,21 @@ def read_toml(path: Path) -> Rig:
         if not (isinstance(table, dict) and table.get("ignore") is True)
     ]
     return _judge(entries, path.name, faults)
+
+
+def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
+    """Writes a rig in a format of ``FORMATS``; COLMAP's are folders. Raises InputError for another format."""
+    writers: dict[str, Callable[[Rig, Path], None]] = {
+        "eigenhead": write_rig,
+        "colmap": lambda rig, folder: write_colmap(rig, folder, binary=True),
+        "colmap-text": write_colmap,
+        "caliscope": write_caliscope,
+        "aniposelib": write_aniposelib,
+    }
+    assert tuple(writers) == FORMATS
+    if kind not in writers:
+        raise InputError("format", [f"{kind!r} is none of {', '.join(FORMATS)}"])
+    writers[kind](rig, path)
 
 
 def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = ".png") -> None:

@@ -294,6 +294,25 @@ def refine(
     )
 
 
+@app.command(epilog="Example: eigenhead convert cameras.json --to colmap --out sparse/0")
+def convert(
+    source: Annotated[Path, typer.Argument(help="A rig's file, or a folder that holds one.", exists=True)],
+    out: Annotated[Path, typer.Option(help="The file to write; for COLMAP the folder.")],
+    to: Annotated[str, typer.Option(help="eigenhead, colmap, colmap-text, caliscope or aniposelib.")] = "eigenhead",
+    json_out: Json = False,
+) -> None:
+    """Turn a calibration into another program's format, or another program's into ours."""
+    from rig.errors import InputError
+    from rig.layout_files import find_rig_file, read_rig_file, write_rig_file
+
+    file = find_rig_file(source) if source.is_dir() else source
+    if file is None:
+        raise InputError(str(source), ["holds no cameras.json, COLMAP model, camera_array.toml or aniposelib file"])
+    rig = read_rig_file(file)
+    write_rig_file(rig, out, to)
+    _answer({"out": str(out), "cameras": list(rig.names)}, json_out, [f"{out}  {len(rig)} cameras"])
+
+
 @rig_app.command("check", epilog="Example: eigenhead rig check --rig rig.toml")
 def rig_check(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
     """Open every camera, take a test shot, and print what to act on."""

@@ -15,11 +15,13 @@ from rig.errors import InputError
 from rig.geometry import look_at
 from rig.layout import Rig, write_rig
 from rig.layout_files import (
+    FORMATS,
     find_rig_file,
     read_rig_file,
     write_aniposelib,
     write_caliscope,
     write_colmap,
+    write_rig_file,
 )
 from tests.shared_data import shared
 
@@ -66,6 +68,17 @@ def test_what_is_written_is_read_back(kind: str, tmp_path: Path) -> None:
     for ours, theirs in zip(rig, back, strict=True):
         assert theirs.intrinsics.width == ours.intrinsics.width
         np.testing.assert_allclose(theirs.project(POINTS), ours.project(POINTS), atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_format_is_written_and_found_again(kind: str, tmp_path: Path) -> None:
+    names = {"eigenhead": "cameras.json", "caliscope": "camera_array.toml", "aniposelib": "calibration.toml"}
+    write_rig_file(fan(), tmp_path / names.get(kind, "sparse/0"), kind)
+    file = find_rig_file(tmp_path)
+    assert file is not None
+    assert read_rig_file(file).names == fan().names
+    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
+        write_rig_file(fan(), tmp_path / "x", "ply")
 
 
 @pytest.mark.parametrize("binary", [False, True])
