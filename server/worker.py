@@ -11,6 +11,7 @@ worker, so that two that try do no harm.
 """
 
 import hashlib
+import json
 import os
 import platform
 import secrets
@@ -221,9 +222,13 @@ class Worker:
         return files
 
     def settle(self, job_id: str, state: str) -> None:
-        """Tells the world how the job ended: the last event of its stream, and the webhooks."""
+        """Tells the world how the job ended: the last event of its stream, with what the operator must see to, and the
+        webhooks."""
+        moved = moved_cameras(self.store.folder("jobs", job_id) / "result" / "report.json")
+        if moved:
+            log.warning("camera moved", details=moved)
         with suppress(SQLAlchemyError):
-            self.events.append(job_id, {"state": state})
+            self.events.append(job_id, {"state": state} | ({"camera_moved": moved} if moved else {}))
         self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options)
 
     def _failure(self, error: BaseException) -> BaseException:
@@ -285,6 +290,15 @@ class Worker:
     def _running(self) -> list[Any]:
         names = [WORKFLOW, DELIVERY, calibrations.WORKFLOW]
         return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
+
+
+def moved_cameras(report: Path) -> list[str]:
+    """What a result's report.json says of cameras that have moved since their calibration."""
+    try:
+        warnings = json.loads(report.read_bytes())["warnings"]
+    except (OSError, ValueError, KeyError):  # no result, or another kind of work
+        return []
+    return [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
 
 
 class _StateWatch:

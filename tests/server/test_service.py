@@ -172,6 +172,13 @@ def test_an_idempotency_key_makes_one_job(http: httpx.Client, archive: bytes) ->
     assert other.status_code == 409
 
 
+def test_the_events_of_a_job_name_a_camera_that_has_moved(http: httpx.Client, client: Client, archive: bytes) -> None:
+    capture = upload(http, archive).json()["id"]
+    for front, told in (("moved", [["cam02 has moved by 5.0 px"]]), ("cam00", [])):
+        job = client.submit(capture, settings={"front": front})["id"]
+        assert [document["camera_moved"] for _, document in client.events(job) if "camera_moved" in document] == told
+
+
 def test_events_tell_progress_and_resume(http: httpx.Client, client: Client, archive: bytes) -> None:
     capture = upload(http, archive).json()["id"]
     job = client.submit(capture)["id"]

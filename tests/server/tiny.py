@@ -1,6 +1,7 @@
 """Work that stands for a reconstruction where the engine around it is tested: real files, real time, no head."""
 
 import hashlib
+import json
 import os
 import time
 from pathlib import Path
@@ -32,6 +33,10 @@ def work(
         if mode != "deaf":
             report("fit", share)
         time.sleep(0.01)
+    if mode == "moved":
+        warning = {"code": "camera-moved", "message": "cam02 has moved by 5.0 px"}
+        report_json = json.dumps({"warnings": [{"code": "other", "message": "?"}, warning]})
+        write_atomically(Path(result) / "report.json", report_json.encode())
     for name in ("head.ply", "head.glb", "overlays/cam00.png"):
         digest = hashlib.sha256(f"{name}{sorted(shot.digests.items())}".encode()).digest()
         repeats = int(os.environ.get("EIGENHEAD_TINY_BYTES", "64000")) // len(digest)
