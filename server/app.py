@@ -13,7 +13,6 @@ from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server import problems
-from server.console.mount import mount_console
 from server.health import check_egl
 from server.metrics import Metrics
 from server.retention import sweep_forever
@@ -57,7 +56,10 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     for router in routers:
         app.include_router(router)
     problems.install(app, [route for router in routers for route in router.routes if isinstance(route, APIRoute)])
-    mount_console(app, settings)
+    if settings.console:
+        from server.console.mount import mount_console  # NiceGUI takes longer to import than all the rest
+
+        mount_console(app, settings)
     app.add_middleware(Watch, metrics=metrics)
     _name_problem(app)
     return app

@@ -57,12 +57,13 @@ def serve(
     port: Annotated[int | None, typer.Option(help="0 takes a free one.")] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.toml of real cameras; without it the simulated studio.")] = None,
     worker: Annotated[bool, typer.Option(help="Run a worker beside the service.")] = True,
+    console: Annotated[bool | None, typer.Option(help="Serve the operator's pages.")] = None,
 ) -> None:
     """Run the service, and a worker beside it."""
     from server.log import set_up
     from server.serve import run_service
 
-    settings = _settings(data=data, host=host, port=port, rig=rig)
+    settings = _settings(data=data, host=host, port=port, rig=rig, console=console)
     set_up(settings.log_json)
     run_service(settings, worker=worker, ready=lambda url: print(f"eigenhead listens on {url}", file=sys.stderr))
 

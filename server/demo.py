@@ -103,7 +103,7 @@ def _service(data: Path) -> Iterator[str]:
     """A service process on a free port, which ends with the block."""
     with listen("127.0.0.1", 0) as sock:
         port = sock.getsockname()[1]
-    settings = ServiceSettings(data=data, port=port, host="127.0.0.1", free_bytes=0)
+    settings = ServiceSettings(data=data, port=port, host="127.0.0.1", free_bytes=0, console=False)
     log = data.parent / "service.log"
     command = [sys.executable, "-m", "server.cli", "serve"]
     with log.open("wb") as stream:

@@ -161,12 +161,16 @@ class Jobs:
             self.events.append(job_id, {"state": self.state(job_id)})
         return self.get(job_id)
 
-    def restart(self, job_id: str, settings: dict[str, Any] | None, *, key: str = "local") -> dict[str, Any]:
-        """A new job for the same capture, which names the old one."""
+    def restart(
+        self, job_id: str, settings: dict[str, Any] | None, *, model: str | None = None, key: str = "local"
+    ) -> dict[str, Any]:
+        """A new job for the same capture, which names the old one. What is None is as in that."""
         row = self._known(job_id)
         request = _request(row) | {"restart_of": job_id}
         if settings is not None:
             request["settings"] = settings
+        if model is not None:
+            request["model"] = model
         self._store.capture(request["capture_id"])
         attributes = row.attributes or {}
         return self.submit(

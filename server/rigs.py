@@ -5,12 +5,14 @@ then the rig's own one does (the studio's layout, or what rig.toml names).
 """
 
 import threading
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from rig.capture import Capture, write_capture
 from rig.config import RigConfig, read_rig_config
@@ -23,6 +25,7 @@ from server.child import Child, WorkFailed
 from server.problems import Problem
 from server.settings import ServiceSettings
 
+ImageRgb = UInt8[np.ndarray, "h w 3"]
 PREVIEW_WIDTH = 640
 PREVIEW_QUALITY = 80
 SHOT_BYTES = 64 << 20
@@ -37,6 +40,10 @@ class RigBackend(Protocol):
 
     def capture(self, folder: Path, *, seed: int | None) -> dict[str, Any]:
         """Takes a shot into ``folder/files``; returns its certificate. Raises a 503 problem naming what is missing."""
+        ...
+
+    def look(self) -> Mapping[str, ImageRgb]:
+        """What all cameras see now; one that shows nothing is absent. Raises a 503 problem."""
         ...
 
     def preview(self, camera: str) -> bytes:
@@ -78,11 +85,15 @@ class SimulatedRig:
             write_rig(read_rig(self._calibration), folder / "files" / "cameras.json")
         return shot
 
+    def look(self) -> Mapping[str, ImageRgb]:
+        with self._one_at_a_time:
+            return self._child.run("server.shoot:look", {"cameras": list(self._rig().names)})
+
     def preview(self, camera: str) -> bytes:
         if camera not in self._rig():
             raise Problem(404, "not-found", f"The rig has no camera {camera!r:.80}.")
         with self._one_at_a_time:
-            return self._child.run("server.shoot:preview", {"camera": camera})
+            return jpeg(self._child.run("server.shoot:look", {"cameras": [camera]})[camera])
 
     def take_background(self) -> dict[str, Any]:
         """The studio takes clean plates with every shot; there is nothing to keep."""
@@ -149,11 +160,14 @@ class RealRig:
             link_plates(session.plates, folder / "files" / "background")
         return shot.document()
 
+    def look(self) -> Mapping[str, ImageRgb]:
+        with self._lock:
+            return self._opened().look()
+
     def preview(self, camera: str) -> bytes:
         if camera not in self._config.names:
             raise Problem(404, "not-found", f"The rig has no camera {camera!r:.80}.")
-        with self._lock:
-            image = self._opened().look().get(camera)
+        image = self.look().get(camera)
         if image is None:
             raise Problem(503, "camera-missing", f"{camera} delivers no picture; GET /v1/rig says why.", [camera])
         return jpeg(image)
@@ -211,13 +225,20 @@ def open_rig(settings: ServiceSettings) -> RigBackend:
     return SimulatedRig(calibration) if settings.rig is None else RealRig(settings.rig, calibration)
 
 
-def jpeg(image: np.ndarray) -> bytes:
-    """RGB pixels as a JPEG of at most ``PREVIEW_WIDTH``."""
-    factor = min(1.0, PREVIEW_WIDTH / image.shape[1])
-    small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
+    """RGB pixels as a JPEG of at most ``width``."""
+    small = reduced(image, width)
     done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
     assert done
     return data.tobytes()
+
+
+def reduced(image: ImageRgb, width: int) -> ImageRgb:
+    """The image, made smaller where it is wider than ``width``."""
+    if image.shape[1] <= width:
+        return image
+    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 
 def _check_names(rig: Rig, names: tuple[str, ...]) -> None:

@@ -27,6 +27,21 @@ class NewCapture(Received):
     seed: int | None = Field(None, ge=0, lt=2**31, description="subject and noise of the simulated studio")
 
 
+class SessionEdit(Received):
+    """What is not given stays as it is."""
+
+    label: Text | None = None
+    consent: Text | None = None
+
+
+class CaptureEdit(Received):
+    """What is not given stays as it is; ``"session": null`` takes the capture out of its session."""
+
+    session: Id | None = None
+    label: Text | None = None
+    expression: Text | None = None
+
+
 class NewFeatures(Received):
     format: Literal["eigenhead-features/1"] = "eigenhead-features/1"
     points: dict[str, dict[str, list[float]]]
@@ -47,6 +62,9 @@ class NewSessionJobs(Received):
 
 
 class Restart(Received):
+    """What is not given is as in the old job."""
+
+    model: str | None = Field(None, max_length=200)
     settings: dict[str, Any] | None = None
 
 

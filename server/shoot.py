@@ -73,11 +73,10 @@ def simulate_folder(
     return simulate_to_folder(out, taken, seed=seed)
 
 
-def preview(bench: Bench, report: Report, *, camera: str) -> bytes:
-    """What a camera of the studio shows: a subject that sits there, drawn once and kept."""
+def look(bench: Bench, report: Report, *, cameras: list[str]) -> dict[str, np.ndarray]:
+    """What cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
     from rig.studio.sensor import expose
     from rig.studio.simulate import build_scene, view_light
-    from server.rigs import jpeg
 
     def scene() -> Any:
         rng = np.random.default_rng(1)
@@ -85,5 +84,5 @@ def preview(bench: Bench, report: Report, *, camera: str) -> bytes:
         renderer = bench.keep("renderer", Renderer.create)
         return build_scene(drawn_subject(model, rng), default_layout(), PRESET, rng, renderer=renderer)
 
-    view = bench.keep("scene", scene).views[camera]
-    return jpeg(expose(view_light(view), view.sensor, np.random.default_rng()))
+    views, noise = bench.keep("scene", scene).views, np.random.default_rng()
+    return {name: expose(view_light(views[name]), views[name].sensor, noise) for name in cameras}

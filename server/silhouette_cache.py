@@ -79,7 +79,8 @@ def _encoded(silhouettes: dict[str, Silhouette]) -> bytes:
         arrays[f"mask{number}"] = _bytes(zlib.compress(np.packbits(silhouette.mask).tobytes(), QUICK))
         arrays[f"distance{number}"] = _bytes(zlib.compress(_steps(silhouette.distance), QUICK))
     stream = io.BytesIO()
-    np.savez(stream, views=_bytes(json.dumps(documents).encode()), **arrays)  # a zip file: it tells damage by its CRC
+    # A zip file, which tells damage by its CRC.
+    np.savez(stream, allow_pickle=False, views=_bytes(json.dumps(documents).encode()), **arrays)
     return stream.getvalue()
 
 
@@ -97,8 +98,9 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
 
 
 def _quality(document: dict[str, Any]) -> ViewQuality:
-    lists = {name: tuple(document[name]) for name in ("cut_off", "warnings")}
-    return ViewQuality(**(document | lists))
+    for name in ("cut_off", "warnings"):
+        document[name] = tuple(document[name])
+    return ViewQuality(**document)
 
 
 def _steps(values: Float32[np.ndarray, "h w"]) -> bytes:

@@ -18,8 +18,9 @@ import os
 import re
 import secrets
 import shutil
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,7 @@ class Store:
 
     def __init__(self, data: Path) -> None:
         self.data = data
+        self._changing = threading.Lock()  # two changes of one record must not lose one of them
         for name in FOLDERS:
             (data / name).mkdir(parents=True, exist_ok=True)
         data.chmod(0o700)  # faces are biometric data
@@ -106,8 +108,13 @@ class Store:
             if record is not None:
                 yield record
 
-    def update_capture(self, record: dict[str, Any]) -> None:
-        write_atomically(self.folder("captures", record["id"]) / "record.json", _encoded(record))
+    def change_capture(self, identity: str, change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+        """Applies ``change`` to the record of a capture and returns it. Raises a 404 problem."""
+        with self._changing:
+            record = self.capture(identity)
+            change(record)
+            write_atomically(self.folder("captures", identity) / "record.json", _encoded(record))
+        return record
 
     def remove_capture(self, identity: str) -> None:
         """Removes a capture with what was kept of it: that shows a face too."""

@@ -8,20 +8,19 @@ import time
 from collections.abc import AsyncIterator
 from typing import Any, Protocol
 
-import cv2
-import numpy as np
 import structlog
 
 from rig.checks import blur_px, exposure
-from rig.errors import EigenheadError
 from server.child import Child
 from server.problems import problem_from
+from server.rigs import ImageRgb, RigBackend, jpeg, reduced
 from server.service import Service
 
 EVERY_S = 0.25  # four looks a second at most
 IDLE_S = 3.0  # without anybody who watches: then nobody looks at the cameras either
 KEEP_S = 300.0  # and so long the studio stays drawn, for the next who comes
 LOOK_S = 0.05
+WIDTH = 640  # of a picture on the wire: a tile is 320 points wide, twice as many pixels on a dense screen
 
 log = structlog.get_logger()
 
@@ -48,31 +47,32 @@ class StudioSource:
         self._child.close()
 
 
-class PreviewSource:
-    """Real cameras, through the rig's previews; one camera a look is judged for sharpness."""
+class RigSource:
+    """Real cameras, all in one look; one of them a look is judged for sharpness, which takes its full size."""
 
-    def __init__(self, service: Service) -> None:
-        self._rig, self._looks = service.rig, 0
+    def __init__(self, rig: RigBackend) -> None:
+        self._rig, self._looks = rig, 0
 
     def frames(self) -> list[dict[str, Any]]:
+        pictures = self._rig.look()
         names = [camera["name"] for camera in self._rig.describe()["cameras"]]
         self._looks += 1
-        return [self._frame(name, self._looks % len(names) == i) for i, name in enumerate(names)]
-
-    def _frame(self, name: str, sharp: bool) -> dict[str, Any]:
-        try:
-            data = self._rig.preview(name)
-        except EigenheadError as error:
-            return {"name": name, "jpeg": None, "fault": str(error)}
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
-        assert picture is not None  # the rig encoded it
-        picture = picture.astype(np.uint8, copy=False)
-        level = exposure(picture)
-        found = {"name": name, "jpeg": data, "mean": round(level.mean, 1), "clipped": round(level.clipped_share, 4)}
-        return found | ({"blur_px": blur_px(picture)} if sharp else {})
+        return [_frame(name, pictures.get(name), self._looks % len(names) == i) for i, name in enumerate(names)]
 
     def close(self) -> None:
         pass
+
+
+def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> dict[str, Any]:
+    if picture is None:
+        return {"name": name, "jpeg": None, "fault": "The camera shows nothing. Check its cable and power."}
+    small = reduced(picture, WIDTH)
+    level = exposure(small)
+    found: dict[str, Any] = {"name": name, "mean": round(level.mean, 1), "clipped": round(level.clipped_share, 4)}
+    if sharp:
+        blur = blur_px(picture)
+        found["blur_px"] = None if blur is None else round(blur, 2)
+    return found | {"jpeg": jpeg(small)}
 
 
 class LiveView:
@@ -106,7 +106,7 @@ class LiveView:
 
     def _look_around(self) -> None:
         simulated = self._service.rig.describe()["kind"] == "simulated"
-        source: Source = StudioSource() if simulated else PreviewSource(self._service)
+        source: Source = StudioSource() if simulated else RigSource(self._service.rig)
         blur: dict[str, float | None] = {}
         try:
             while True:

@@ -23,6 +23,7 @@ from server.service import Service
 
 REFRESH_S = 0.5
 STATUS_S = 2.0
+KEEP_S = 3600.0  # of a value that is shared by all pages
 MAKE = Callable[[], Any]
 
 _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a capture holds one for seconds
@@ -56,10 +57,24 @@ class Cache:
             if time.monotonic() - made > age_s or key not in self._values:
                 value = make()
                 self._values[key] = (time.monotonic(), value)
+                self._drop_old()
             return value
 
     def forget(self, key: Any) -> None:
         self._values.pop(key, None)
+
+    def _drop_old(self) -> None:
+        """What no page has asked for anew: reports of jobs, mostly."""
+        with self._lock:
+            before = time.monotonic() - KEEP_S
+            for key in [key for key, (made, _) in self._values.items() if made < before]:
+                self._values.pop(key, None)
+                self._locks.pop(key, None)
+
+    def clear(self) -> None:
+        with self._lock:
+            self._values.clear()
+            self._locks.clear()
 
 
 shared = Cache()

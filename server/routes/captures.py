@@ -12,7 +12,7 @@ from server.access import Caller, require
 from server.files import send_file
 from server.problems import Problem, documented
 from server.rigs import SHOT_BYTES
-from server.schemas import CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures
+from server.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures
 from server.service import Service, ServiceOf
 from server.uploads import check_length, receive_multipart
 
@@ -107,6 +107,16 @@ def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureO
     return CaptureOut.model_validate(service.store.capture(capture_id))
 
 
+@router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))
+def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: CaptureEdit) -> CaptureOut:
+    """Another label, expression or session."""
+    given = wanted.model_dump(exclude_unset=True)
+    if given.get("session") is not None:
+        service.store.session(given["session"])
+    given |= {name: given[name] or "" for name in ("label", "expression") if name in given}
+    return CaptureOut.model_validate(service.store.change_capture(capture_id, lambda record: record.update(given)))
+
+
 IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"content": {f"image/{kind}": {} for kind in ("png", "jpeg", "tiff", "webp")}},
     206: {
@@ -132,17 +142,19 @@ def get_background(service: ServiceOf, caller: Reader, request: Request, capture
 @router.put("/captures/{capture_id}/features", responses=documented(400, 404, 413, 415, 507))
 def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: NewFeatures) -> CaptureOut:
     """Stores feature points; 422 names every point that the capture cannot have. Jobs made from now on use them."""
-    record = service.store.capture(capture_id)
+    service.store.capture(capture_id)
     arguments = {
         "folder": str(service.store.folder("captures", capture_id) / "files"),
         "document": features.model_dump(),
     }
     with service.children.one() as child:
         digest = child.run("server.ingest:check_features", arguments)
-    record["inputs"] = dict(sorted({**record["inputs"], "features.json": digest}.items()))
-    record["features"] = True
-    service.store.update_capture(record)
-    return CaptureOut.model_validate(record)
+
+    def change(record: dict[str, Any]) -> None:
+        record["inputs"] = dict(sorted({**record["inputs"], "features.json": digest}.items()))
+        record["features"] = True
+
+    return CaptureOut.model_validate(service.store.change_capture(capture_id, change))
 
 
 @router.get("/captures/{capture_id}/features", responses=documented(404))

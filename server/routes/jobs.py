@@ -23,14 +23,19 @@ Idempotency = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1
 
 
 def checked_request(capture_id: str, model: str | None, settings: dict[str, Any] | None) -> dict[str, Any]:
-    """What a job stores. Raises InputError for an unknown model or setting, so that a job does not fail hours later."""
+    """What a job stores. Raises InputError."""
+    checked_work(model, settings)
+    return {"capture_id": capture_id, "model": model, "settings": settings or {}}
+
+
+def checked_work(model: str | None, settings: dict[str, Any] | None) -> None:
+    """Raises InputError for an unknown model or setting, so that a job does not fail hours later."""
     from pipeline.eigenheads.model import list_models
 
     if model is not None and model != "default" and model not in list_models():
         known = ", ".join(["default", *list_models()])
         raise InputError("model", [f"{model!r:.80} is not at hand; there are: {known}"])
     settings_from_document(settings or {})
-    return {"capture_id": capture_id, "model": model, "settings": settings or {}}
 
 
 def submit(
@@ -142,10 +147,11 @@ def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
 def restart_job(
     service: ServiceOf, caller: Submitter, job_id: str, response: Response, wanted: Restart | None = None
 ) -> JobOut:
-    """A new job for the same capture, perhaps with other settings; ``restart_of`` names the old one."""
+    """A new job for the same capture, perhaps with another model or settings; ``restart_of`` names the old one."""
     settings = wanted.settings if wanted else None
-    settings_from_document(settings or {})
-    return _accepted(service.jobs.restart(job_id, settings, key=caller.key), response)
+    model = wanted.model if wanted else None
+    checked_work(model, settings)
+    return _accepted(service.jobs.restart(job_id, settings, model=model, key=caller.key), response)
 
 
 @router.delete("/jobs/{job_id}", status_code=204, responses=documented(404, 409))

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Response
 from server.access import Caller, require
 from server.jobs import FINISHED
 from server.problems import Problem, documented
-from server.schemas import NewSession, SessionList, SessionOut
+from server.schemas import NewSession, SessionEdit, SessionList, SessionOut
 from server.service import Service, ServiceOf
 from server.store import new_id
 
@@ -43,6 +43,14 @@ def list_sessions(service: ServiceOf, caller: Reader) -> SessionList:
 def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionOut:
     record = service.store.session(session_id)
     return SessionOut.model_validate({**record, "captures": [c["id"] for c in _captures(service, session_id)]})
+
+
+@router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
+def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
+    """Another label or consent note."""
+    given = {name: text for name, text in wanted.model_dump(exclude_unset=True).items() if text is not None}
+    service.store.save_session(service.store.session(session_id) | given)
+    return get_session(service, caller, session_id)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))

@@ -41,14 +41,14 @@ def screenshots() -> Path:
 def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
     """The real work on the simulated studio."""
     data = tmp_path_factory.mktemp("studio") / "data"
-    with running_service(data, work="server.work:reconstruct_capture", poll_s="0.25") as service:
+    with running_service(data, work="server.work:reconstruct_capture", poll_s="0.25", console="true") as service:
         yield service
 
 
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[RunningService]:
     """The tiny work: what is looked at here is the pages."""
-    with running_service(tmp_path / "data") as running:
+    with running_service(tmp_path / "data", console="true") as running:
         yield running
 
 
@@ -363,6 +363,48 @@ def test_two_pages_agree_and_a_removal_is_taken_back(browser: Browser, service: 
     expect(jobs.locator("[data-state=succeeded]")).to_have_count(1, timeout=30_000)
     one.check_clean()
     two.check_clean()
+
+
+def test_a_session_is_begun_filled_and_erased(
+    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+) -> None:
+    upload(service, tmp_path, 1)
+    v = visit(browser, service.url)
+    page = v.go("/captures")
+    expect(page.locator(".row-button")).to_have_count(1)
+    page.locator("#new-session").click()
+    page.get_by_label("Subject").fill("Anna")
+    page.get_by_label("Consent").fill("signed 2026-11-21")
+    page.get_by_role("button", name="Begin").click()
+    expect(page.locator("#session option:checked")).to_have_text("Anna (0)")
+    expect(page.get_by_text("No captures in this session yet")).to_be_visible()
+    page.locator("input[type=file]").set_input_files([archive(tmp_path, 2)])
+    expect(page.locator(".thumb img").first).to_be_visible(timeout=30_000)
+    page.get_by_label("Label").fill("profile")
+    page.get_by_label("Expression").fill("smile")
+    page.keyboard.press("Tab")
+    expect(page.locator(".row-button", has_text="Anna · smile")).to_have_count(1)
+    expect(page.locator(".row-button strong")).to_have_text("profile")
+    keep_screenshots(page, screenshots, "captures-session")
+    rig = v.go("/")
+    expect(rig.locator("#session option:checked")).to_have_text("Anna")  # what is shot now belongs to it
+    page = v.go("/captures")
+    page.locator("#method").select_option("simplex")
+    page.locator("#reconstruct-all").click()
+    expect(page.get_by_text("Queued 1 job.")).to_be_visible(timeout=30_000)
+    job = httpx.get(service.url + "/v1/jobs").json()["jobs"][0]
+    assert (job["settings"], job["session"] is not None) == ({"method": "simplex"}, True)
+    page.locator("#erase").click()
+    page.get_by_role("button", name="Keep").click()
+    page.locator("#erase").click()
+    page.locator("#erase-for-good").click()
+    expect(page.locator("#session option:checked")).to_have_text("all captures", timeout=30_000)
+    expect(page.locator(".row-button strong")).to_have_text("subject 1")
+    captures = httpx.get(service.url + "/v1/captures").json()["captures"]
+    assert [capture["label"] for capture in captures] == ["subject 1"]
+    assert httpx.get(service.url + "/v1/jobs").json()["jobs"] == []
+    assert len([*(service.data / "cache/captures").iterdir()]) == 1
+    v.check_clean()
 
 
 def test_a_job_is_cancelled_and_restarted_with_other_settings(

@@ -84,9 +84,9 @@ class RunningService:
 
 @contextmanager
 def running_service(data: Path, *, worker: bool = True, **settings: str) -> Iterator[RunningService]:
-    """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given. A test that fails shows
-    the end of the log."""
-    chosen = {"work": "tests.server.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1"} | settings
+    """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given, and there are no pages,
+    which take their time to import. A test that fails shows the end of the log."""
+    chosen = {"work": "tests.server.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
     environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
     service = RunningService(data, environment, free_port(), worker)
     service.start()

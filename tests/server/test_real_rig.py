@@ -1,5 +1,6 @@
 """Real cameras behind the HTTP interface: a service with a rig.toml, and eleven streams and a box that it opens."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,10 @@ from rig.config import read_rig_config
 from rig.layout import write_rig
 from rig.operate import take_plates
 from rig.studio.serve import DeviceFault, StudioDevices
+from server.console.live import RigSource
+from server.console.pages.rig import sync_of
+from server.rigs import open_rig
+from server.settings import ServiceSettings
 from tests.rig.test_session import flat_rig
 from tests.rig.textured_studio import NAMES, FlatStudio
 from tests.server.services import running_service
@@ -41,7 +46,7 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         assert made.status_code == 201, made.text
         capture = made.json()
         assert [camera["name"] for camera in capture["cameras"]] == list(NAMES)
-        sync = capture["shot"]["sync"]["cameras"]
+        sync = sync_of(capture["shot"])
         assert all(sync[name]["status"] == "in sync" and sync[name]["skew_ms"] is not None for name in NAMES)
         assert [found["id"] for found in client.get("/v1/captures").json()["captures"]] == [capture["id"]]
         image = client.get(f"/v1/captures/{capture['id']}/images/cam05").content
@@ -68,6 +73,25 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         assert client.post("/v1/captures", json={}).status_code == 201
         assert client.post("/v1/captures", json={"seed": 1}).status_code == 422
         assert len(client.get("/v1/captures").json()["captures"]) == 2
+
+
+def test_the_live_view_takes_all_pictures_in_one_look(studio: StudioDevices, tmp_path: Path) -> None:
+    rig = open_rig(ServiceSettings(data=tmp_path / "data", rig=studio.folder / "rig.toml"))
+    try:
+        source = RigSource(rig)
+        looks = [source.frames() for _ in range(2)]
+        for frames in looks:
+            assert [frame["name"] for frame in frames] == list(NAMES)
+            assert {_decoded(frame["jpeg"]).shape for frame in frames} == {(240, 320, 3)}
+        judged = [[frame["name"] for frame in frames if "blur_px" in frame] for frames in looks]
+        assert judged == [["cam01"], ["cam02"]], "each look judges another camera"
+        studio.inject(DeviceFault("hung", "cam04"))
+        deadline = time.monotonic() + 20
+        while "fault" not in (lost := {frame["name"]: frame for frame in source.frames()}["cam04"]):
+            assert time.monotonic() < deadline
+        assert lost["jpeg"] is None
+    finally:
+        rig.close()
 
 
 def _decoded(data: bytes) -> np.ndarray:

@@ -260,6 +260,20 @@ def test_features_are_stored_or_refused_by_name(http: httpx.Client, archive: byt
     assert http.get(f"/v1/captures/{capture}/features").json()["points"] == points
 
 
+def test_labels_and_sessions_can_be_put_right(http: httpx.Client, archive: bytes) -> None:
+    session = http.post("/v1/sessions", json={"label": "Anna"}).json()["id"]
+    capture = upload(http, archive, label="first").json()["id"]
+    moved = http.patch(f"/v1/captures/{capture}", json={"session": session, "expression": "smile"}).json()
+    assert (moved["session"], moved["label"], moved["expression"]) == (session, "first", "smile")
+    assert http.get(f"/v1/sessions/{session}").json()["captures"] == [capture]
+    renamed = http.patch(f"/v1/sessions/{session}", json={"consent": "signed"}).json()
+    assert (renamed["label"], renamed["consent"], renamed["captures"]) == ("Anna", "signed", [capture])
+    assert http.patch(f"/v1/captures/{capture}", json={"session": "0" * 28}).status_code == 404
+    assert http.patch(f"/v1/captures/{capture}", json={"name": "x"}).status_code == 422
+    alone = http.patch(f"/v1/captures/{capture}", json={"session": None}).json()
+    assert (alone["session"], alone["expression"]) == (None, "smile")
+
+
 def test_erasing_a_session_leaves_nothing_of_it(service: RunningService, http: httpx.Client, archive: bytes) -> None:
     session = http.post("/v1/sessions", json={"label": "Subject 7", "consent": "signed 2024-05-01"}).json()["id"]
     captures = [upload(http, archive, session=session, label="zebra").json()["id"] for _ in range(2)]

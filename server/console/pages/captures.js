@@ -1,14 +1,26 @@
-// A list of captures at the left, the pictures of the chosen one at the right.
-import { clock, send, size } from "/console/static/words.js";
+// Sessions and captures at the left, the pictures of the chosen one at the right.
+import { clock, keepSession, openSession, send, size } from "/console/static/words.js";
 
 export default {
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ chosen: null, outlines: false, drawing: 0, large: null, over: false, uploads: [], busy: "" }),
+  data: () => ({ chosen: null, outlines: false, drawing: 0, large: null, over: false, uploads: [], busy: "", session: openSession(), form: null, erasing: false, draft: {}, writing: false, method: "", model: "" }),
   computed: {
-    captures() { return (this.state.captures || []).filter((c) => !c.removed); },
+    sessions() { return this.state.sessions || []; },
+    open() { return this.sessions.find((s) => s.id === this.session) || null; },
+    captures() { return (this.state.captures || []).filter((c) => !c.removed && (!this.open || c.session === this.open.id)); },
+    models() { return this.state.models || []; },
     removed() { return (this.state.captures || []).filter((c) => c.removed); },
     current() { return this.captures.find((c) => c.id === this.chosen) || this.captures[0] || null; },
+  },
+  watch: {
+    sessions(all) {
+      const made = this.begun && all.find((s) => s.label === this.begun.label && !this.begun.known.includes(s.id));
+      if (made) { this.session = made.id; this.begun = null; }
+      else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
+    },
+    session(id) { keepSession(id); this.erasing = false; this.large = null; },
+    current: { handler(c) { if (!this.writing) this.draft = c ? { label: c.label, expression: c.expression, session: c.session || "" } : {}; }, immediate: true },
   },
   template: `
     <section class="page" aria-label="Captures" @dragover.prevent="over = true" @dragleave="over = false" @drop.prevent="drop">
@@ -17,12 +29,26 @@ export default {
         <template v-if="current">
           <button class="b" :aria-pressed="outlines" @click="outlines = !outlines">Silhouettes</button>
           <a class="b" :href="'/features/' + current.id">Pick features</a>
-          <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct', current.id)">Reconstruct</button>
+          <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct', current.id, { method, model })">Reconstruct</button>
           <button class="b" id="remove" :disabled="!!busy" @click="act('remove', current.id)">Remove</button>
         </template>
       </header>
       <div class="columns" style="grid-template-columns: 19rem minmax(0, 1fr)">
         <div class="stack" style="min-height: 0">
+          <div class="panel pad stack small" role="region" aria-label="Session">
+            <div class="line" style="align-items: end"><label class="field grow">Session<select v-model="session" id="session"><option value="">all captures</option><option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }} ({{ count(s.id) }})</option></select></label>
+              <button class="b" id="new-session" @click="form = { label: '', consent: '' }">New</button></div>
+            <form v-if="form" class="stack" style="gap: .4rem" @submit.prevent="begin" aria-label="New session">
+              <label class="field">Subject<input v-model="form.label" maxlength="500" required ref="subject" placeholder="name or number"></label>
+              <label class="field">Consent<input v-model="form.consent" maxlength="500" placeholder="who signed what, when"></label>
+              <div class="line"><button class="b main-action" :disabled="!!busy">Begin</button><button type="button" class="b quiet" @click="form = null">Leave it</button></div></form>
+            <template v-else-if="open">
+              <label class="field">Consent<input :value="open.consent" maxlength="500" placeholder="no note" @change="act('edit_session', open.id, { consent: $event.target.value })"></label>
+              <div v-if="erasing" class="stack" style="gap: .4rem" role="alertdialog" aria-label="Erase the session"><p class="warn">Erase {{ name(open) }}: {{ count(open.id) }} {{ count(open.id) === 1 ? 'capture' : 'captures' }}, heads, jobs and caches? It cannot be taken back.</p>
+                <div class="line"><button class="b danger" id="erase-for-good" :disabled="!!busy" @click="act('erase', open.id); erasing = false">Erase for good</button><button class="b quiet" @click="erasing = false">Keep</button></div></div>
+              <div v-else class="line"><button class="b" id="reconstruct-all" :disabled="!!busy || !count(open.id)" @click="act('reconstruct_session', open.id, { method, model })">Reconstruct all</button><button class="b quiet push" id="erase" :disabled="!!busy" @click="erasing = true">Erase ...</button></div>
+            </template>
+          </div>
           <div :class="['drop', { over }]">Drop an archive here (.zip, .tar, .tar.gz)
             <div style="margin-top: .4rem"><button class="b" @click="$refs.file.click()">Choose a file</button>
             <input ref="file" type="file" hidden multiple accept=".zip,.tar,.gz,.tgz" aria-label="Archive of a capture" @change="take($event.target.files); $event.target.value = ''"></div></div>
@@ -36,15 +62,22 @@ export default {
             <button v-for="c in captures" :key="c.id" class="row-button" :aria-current="current && c.id === current.id" @click="chosen = c.id">
               <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
               <span class="small muted">{{ clock(c.created) }} &middot; {{ c.source === 'rig' ? 'rig' : 'upload' }} &middot; {{ c.cameras.length }} cameras &middot; {{ size(c.bytes) }}</span>
-              <span v-if="c.session || c.expression || c.features" class="small muted">{{ [c.session, c.expression, c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
+              <span v-if="c.session || c.expression || c.features" class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression, c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
             </button>
           </div>
         </div>
         <div class="panel pad scroll" style="position: relative" tabindex="0" role="region" aria-label="Pictures">
           <div v-if="!state.loading && !current" class="empty" style="height: 100%; align-content: center">
-            <h2>No captures yet</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
+            <h2>{{ open ? 'No captures in this session yet' : 'No captures yet' }}</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
             <a class="b main-action" href="/">Go to the rig</a></div>
-          <div v-else-if="current && large === null" class="thumbs">
+          <form v-if="current && large === null" class="line wrap" style="align-items: end; margin-bottom: .7rem" aria-label="About the capture" @submit.prevent @focusin="writing = true" @focusout="writing = false">
+            <label class="field grow">Label<input v-model="draft.label" maxlength="500" :placeholder="clock(current.created)" @change="act('edit', current.id, { label: draft.label })"></label>
+            <label class="field grow">Expression<input v-model="draft.expression" maxlength="500" placeholder="neutral, smile ..." @change="act('edit', current.id, { expression: draft.expression })"></label>
+            <label class="field">Session<select v-model="draft.session" style="max-width: 11rem" @change="act('edit', current.id, { session: draft.session || null })"><option value="">none</option><option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option></select></label>
+            <label class="field">Solver<select v-model="method" id="method"><option value="">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
+            <label v-if="models.length > 1" class="field">Model<select v-model="model" id="model"><option value="">default</option><option v-for="m in models.filter(m => m !== 'default')" :key="m">{{ m }}</option></select></label>
+          </form>
+          <div v-if="current && large === null" class="thumbs four">
             <button v-for="(camera, i) in current.cameras" :key="current.id + camera" class="thumb" style="padding: 0; border: 0; cursor: zoom-in" :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }" :aria-label="'Enlarge ' + camera" @click="large = i">
               <img :src="address(camera, '.jpg')" :alt="'Picture of ' + camera" loading="lazy">
               <img v-if="outlines" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
@@ -62,8 +95,11 @@ export default {
   unmounted() { window.removeEventListener("keydown", this.key); },
   methods: {
     address(camera, kind) { return `/console/captures/${this.current.id}/${encodeURIComponent(camera)}${kind}`; },
-    act(name, id) { this.busy = name; this.$emit("act", { name, id }); },
+    act(name, id, more) { this.busy = name; this.$emit("act", { name, id, ...more }); },
     acted() { this.busy = ""; },
+    name(session) { return session ? session.label || clock(session.created) : ""; },
+    count(id) { return (this.state.captures || []).filter((c) => c.session === id && !c.removed).length; },
+    begin() { this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) }; this.act("new_session", "", this.form); this.form = null; },
     tag(c) {
       if (!c.job) return { text: "new", kind: "" };
       if (c.job.state === "running") return { text: `${Math.round(100 * c.job.progress)} %`, kind: "accent" };
@@ -83,7 +119,7 @@ export default {
         const entry = { id: Math.random(), name: file.name, share: 0, state: "0 %", done: false, detail: "", errors: [] };
         this.uploads = [entry, ...this.uploads];
         const mine = this.uploads[0];
-        const { status, document } = await send("/console/captures", file, { label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => {
+        const { status, document } = await send("/console/captures", file, { label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, ""), ...(this.open ? { session: this.open.id } : {}) }, (share) => {
           mine.share = share; mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking";
         });
         mine.done = true;

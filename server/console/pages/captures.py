@@ -6,13 +6,15 @@ from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
+from pipeline.eigenheads.model import list_models
 from server.console.page import Action, Page, shared, signed_in
 from server.console.removal import Removals
 from server.console.theme import page_frame
 from server.problems import Problem
-from server.routes.captures import delete_capture
-from server.routes.jobs import submit_job
-from server.schemas import NewJob
+from server.routes.captures import delete_capture, edit_capture
+from server.routes.jobs import submit_job, submit_session
+from server.routes.sessions import edit_session, erase_session, make_session
+from server.schemas import CaptureEdit, NewJob, NewSession, NewSessionJobs, SessionEdit
 from server.service import Service
 
 SHOWN = 500
@@ -30,21 +32,69 @@ def captures_state(service: Service) -> dict[str, Any]:
     jobs: dict[str, dict[str, Any]] = {}
     for job in service.jobs.find(limit=SHOWN):
         jobs.setdefault(job["capture_id"], {"id": job["id"], "state": job["state"], "progress": job["progress"]})
-    sessions = {record["id"]: record["label"] or record["id"][-6:] for record in service.store.sessions()}
     captures = []
     for record in service.store.captures():
         about = {key: record[key] for key in ("id", "created", "source", "label", "expression", "front", "features")}
         about |= {"cameras": [camera["name"] for camera in record["cameras"]], "bytes": record["bytes"]}
-        about |= {"session": sessions.get(record["session"] or ""), "job": jobs.get(record["id"])}
+        about |= {"session": record["session"], "job": jobs.get(record["id"])}
         captures.append(about | {"size": record["cameras"][0], "removed": record["id"] in waiting})
         if len(captures) == SHOWN:
             break
-    return {"captures": captures, "undo_s": removals.wait_s}
+    return {
+        "captures": captures,
+        "sessions": sessions_list(service),
+        "models": shared.get("models", 30.0, lambda: list(list_models())),
+        "undo_s": removals.wait_s,
+    }
+
+
+def sessions_list(service: Service) -> list[dict[str, Any]]:
+    """Newest first."""
+    names = ("id", "created", "label", "consent")
+    return [{name: record[name] for name in names} for record in service.store.sessions()]
 
 
 def reconstruct(page: Page, event: dict[str, Any]) -> str:
-    job = submit_job(page.service, page.caller, NewJob.model_validate({"capture_id": event["id"]}), Response())
+    wanted = {"capture_id": event["id"], **chosen_work(event)}
+    job = submit_job(page.service, page.caller, NewJob.model_validate(wanted), Response())
     return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
+
+
+def reconstruct_session(page: Page, event: dict[str, Any]) -> str:
+    wanted = NewSessionJobs.model_validate(chosen_work(event))
+    jobs = submit_session(page.service, page.caller, event["id"], wanted).jobs
+    return f"Queued {len(jobs)} {'job' if len(jobs) == 1 else 'jobs'}. Watch them on the page Jobs."
+
+
+def chosen_work(event: dict[str, Any]) -> dict[str, Any]:
+    """Model and solver of the form; what is not chosen is the service's default."""
+    settings = {"method": event["method"]} if event.get("method") else {}
+    return {"model": event.get("model") or None, "settings": settings}
+
+
+def edit(page: Page, event: dict[str, Any]) -> None:
+    given = {name: event[name] for name in ("label", "expression", "session") if name in event}
+    edit_capture(page.service, page.caller, event["id"], CaptureEdit.model_validate(given))
+    shared.forget("captures")
+
+
+def new_session(page: Page, event: dict[str, Any]) -> str:
+    wanted = NewSession(label=event.get("label", ""), consent=event.get("consent", ""))
+    made = make_session(page.service, page.caller, wanted, Response())
+    shared.forget("captures")
+    return f"Session {made.label or made.id[-6:]}: what is taken or uploaded now belongs to it."
+
+
+def edit_consent(page: Page, event: dict[str, Any]) -> None:
+    given = {name: event[name] for name in ("label", "consent") if name in event}
+    edit_session(page.service, page.caller, event["id"], SessionEdit.model_validate(given))
+    shared.forget("captures")
+
+
+def erase(page: Page, event: dict[str, Any]) -> str:
+    erase_session(page.service, page.caller, event["id"])
+    shared.clear()  # reports of its heads among them
+    return "Erased: images, heads, jobs and all that was kept of them."
 
 
 def remove(page: Page, event: dict[str, Any]) -> None:
@@ -70,6 +120,11 @@ def undo(page: Page, event: dict[str, Any]) -> str:
 
 CapturesPage.actions = {
     "reconstruct": Action("submit", reconstruct),
+    "reconstruct_session": Action("submit", reconstruct_session),
+    "edit": Action("capture", edit),
+    "new_session": Action("capture", new_session),
+    "edit_session": Action("capture", edit_consent),
+    "erase": Action("capture", erase),
     "remove": Action("capture", remove),
     "undo": Action("capture", undo),
 }

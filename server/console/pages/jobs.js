@@ -44,6 +44,7 @@ export default {
             <form v-if="form" class="panel pad stack" style="background: var(--raised)" @submit.prevent="restart" aria-label="Restart with other settings">
               <div class="line wrap" style="align-items: end">
                 <label class="field">Method<select v-model="form.method"><option value="">as set</option><option value="contour">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
+                <label v-if="state.models.length > 1" class="field">Model<select v-model="form.model"><option value="">as before</option><option v-for="m in state.models" :key="m">{{ m }}</option></select></label>
                 <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option></select></label>
                 <label class="field">Front camera<input v-model="form.front" placeholder="guessed" size="8"></label></div>
               <label class="field">Further settings, JSON<textarea v-model="form.more" rows="3" spellcheck="false"></textarea></label>
@@ -77,7 +78,7 @@ export default {
     overlay(name) { return `/console/jobs/${this.job.id}/overlays/${name}.png`; },
     act(name) { this.busy = name; this.$emit("act", { name, id: this.job.id }); },
     acted() { this.busy = ""; },
-    open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { method, detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
+    open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { method, model: "", detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
     restart() { this.busy = "restart"; this.$emit("act", { name: "restart", id: this.job.id, ...this.form }); this.form = null; },
   },
 };

@@ -7,6 +7,7 @@ from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
+from pipeline.eigenheads.model import list_models
 from rig.errors import InputError
 from server.console.page import Action, Page, shared, signed_in
 from server.console.pages.rig import read_report
@@ -22,10 +23,14 @@ LOG_LINES = 200
 
 class JobsPage(Page, component="jobs.js"):
     def look(self) -> dict[str, Any]:
-        state = shared.get("jobs", 0.3, lambda: {"jobs": jobs_list(self.service)})
+        state = shared.get("jobs", 0.3, lambda: jobs_state(self.service))
         chosen = self.choice.get("job") or (state["jobs"][0]["id"] if state["jobs"] else None)
         known = next((job["id"] for job in state["jobs"] if job["id"] == chosen), None)
         return state | {"detail": None if known is None else job_detail(self.service, known)}
+
+
+def jobs_state(service: Service) -> dict[str, Any]:
+    return {"jobs": jobs_list(service), "models": shared.get("models", 30.0, lambda: list(list_models()))}
 
 
 def jobs_list(service: Service) -> list[dict[str, Any]]:
@@ -82,7 +87,8 @@ def log_lines(events: list[Any]) -> list[dict[str, Any]]:
 
 
 def restart(page: Page, event: dict[str, Any]) -> str:
-    job = restart_job(page.service, page.caller, event["id"], Response(), Restart(settings=chosen_settings(event)))
+    wanted = Restart(settings=chosen_settings(event), model=event.get("model") or None)
+    job = restart_job(page.service, page.caller, event["id"], Response(), wanted)
     page.choice["job"] = job.id
     return f"Queued job {job.id[-6:]}."
 

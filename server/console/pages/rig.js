@@ -1,5 +1,5 @@
 // Eleven tiles. Pictures and their exposure and sharpness come by one stream; the rest is the page's state.
-import { clock, fixed, typing } from "/console/static/words.js";
+import { clock, fixed, keepSession, openSession, typing } from "/console/static/words.js";
 
 const COUNT_S = 3;
 const STALE_MS = 2500;
@@ -9,8 +9,13 @@ const SOFT_PX = 2.0; // spread of an edge from which a contour is measurably wor
 export default {
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ live: {}, fault: "", now: Date.now(), count: 0, busy: "", frames: 0 }),
+  data: () => ({ live: {}, fault: "", now: Date.now(), count: 0, busy: "", frames: 0, session: openSession(), label: "", expression: "" }),
+  watch: {
+    session(id) { keepSession(id); },
+    "state.sessions"(all) { if (all && this.session && !this.open) this.session = ""; },
+  },
   computed: {
+    open() { return (this.state.sessions || []).find((s) => s.id === this.session) || null; },
     cameras() { return this.state.cameras || []; },
     lead() {
       if (this.state.loading) return "Reading the rig's state";
@@ -61,11 +66,12 @@ export default {
         <aside class="panel pad stack scroll" aria-label="State of the rig">
           <h2>{{ advice.length ? 'To do' : 'Ready to capture' }}</h2>
           <ul v-if="advice.length" class="faults small"><li v-for="(a, i) in advice" :key="i" :class="a.kind">{{ a.text }}</li></ul>
-          <p v-else class="muted small">Exposure, sharpness and sync are in order. Seat the subject, look at the front camera, press the space bar.</p>
-          <div class="small muted stack" style="gap: .2rem; margin-top: auto">
-            <span><i :class="['dot', calibration.kind]"></i> {{ calibration.text }}<template v-if="state.in_use?.rms_px">, {{ fixed(state.in_use.rms_px, 2) }} px</template></span>
-            <a href="/calibration">Calibration</a><a v-if="state.last" href="/captures">Captures</a>
-          </div>
+          <p v-else class="muted small">Exposure, sharpness and sync are in order.</p>
+          <div class="small stack" style="gap: .3rem; margin-top: auto">
+            <label class="field">Session<select v-model="session" id="session"><option value="">none</option><option v-for="s in state.sessions || []" :key="s.id" :value="s.id">{{ s.label || clock(s.created) }}</option></select></label>
+            <div class="line"><label class="field grow">Label<input v-model="label" maxlength="500"></label><label class="field grow">Expression<input v-model="expression" maxlength="500" placeholder="neutral"></label></div></div>
+          <div class="small muted line"><i :class="['dot', calibration.kind]"></i><a href="/calibration" class="cut" aria-label="Calibration">{{ calibration.text }}<template v-if="state.in_use?.rms_px">, {{ fixed(state.in_use.rms_px, 2) }} px</template></a>
+            <a v-if="state.last" href="/captures" class="push">Captures</a></div>
         </aside>
       </div>
       <div v-if="count" class="countdown" role="alert"><span>{{ count }}</span></div>
@@ -108,7 +114,7 @@ export default {
     },
     stop() { clearInterval(this.counter); this.count = 0; },
     plates() { if (!this.busy) this.act("plates"); },
-    act(name) { this.busy = name; this.$emit("act", { name }); },
+    act(name) { this.busy = name; this.$emit("act", { name, label: this.label, expression: this.expression, session: this.open?.id }); },
     acted() { this.busy = ""; },
     key(event) {
       if (typing(event)) return;

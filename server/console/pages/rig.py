@@ -9,6 +9,7 @@ from starlette.responses import RedirectResponse
 
 from server.console.media import live_view
 from server.console.page import Action, Page, shared, signed_in
+from server.console.pages.captures import sessions_list
 from server.console.theme import page_frame
 from server.routes.captures import take_capture
 from server.routes.rig import take_background
@@ -26,10 +27,10 @@ def rig_state(service: Service) -> dict[str, Any]:
     rig = service.rig.describe()
     last = next(service.store.captures(), None)
     shot = (last or {}).get("shot") or {}
+    sync = sync_of(shot)
     moved = moved_cameras(service)
     cameras = [
-        {**camera, "sync": shot.get("cameras", {}).get(camera["name"]), "moved": camera["name"] in moved}
-        for camera in rig["cameras"]
+        {**camera, "sync": sync.get(camera["name"]), "moved": camera["name"] in moved} for camera in rig["cameras"]
     ]
     return {
         "kind": rig["kind"],
@@ -38,8 +39,14 @@ def rig_state(service: Service) -> dict[str, Any]:
         "faults": rig["faults"] + [fault for fault in [live_view(service).fault] if fault],
         "calibration": rig["calibration"],
         "in_use": calibration_in_use(service),
+        "sessions": sessions_list(service),
         "last": None if last is None else {"id": last["id"], "created": last["created"], "source": last["source"]},
     }
+
+
+def sync_of(shot: dict[str, Any]) -> dict[str, Any]:
+    """Status and skew of each camera in a capture's certificate, of a real rig or of the simulated studio."""
+    return shot.get("sync", shot).get("cameras", {})
 
 
 def calibration_in_use(service: Service) -> dict[str, Any] | None:
@@ -73,7 +80,8 @@ def read_report(service: Service, job_id: str) -> dict[str, Any]:
 
 
 def capture(page: Page, event: dict[str, Any]) -> str:
-    wanted = NewCapture(label=event.get("label", ""), session=event.get("session"), expression="", seed=None)
+    about = {name: event.get(name) or "" for name in ("label", "expression")}
+    wanted = NewCapture(**about, session=event.get("session") or None, seed=None)
     record = take_capture(page.service, page.caller, wanted, Response())
     return f"Captured {len(record.cameras)} pictures. They are on the page Captures."
 

@@ -27,6 +27,10 @@ export function fixed(value, digits) {
   return value === null || value === undefined ? "-" : Number(value).toFixed(digits);
 }
 
+// The session that the operator works in, kept for the pages of this browser tab.
+export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
+export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }
+
 // Sends one file as the form part "file"; resolves with {status, document} and never rejects.
 export function send(address, file, fields, progress) {
   return new Promise((resolve) => {
