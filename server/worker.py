@@ -276,6 +276,8 @@ class Worker:
         strays = {row.executor_id for row in running if row.executor_id not in known}
         gone = [*dead, *sorted(strays)]
         if gone:
+            # Not the public resume_workflow: that takes a job from whoever has it by now, revives a cancelled one, and
+            # forgets how many workers the job took down with it.
             handles = DBOS._recover_pending_workflows(gone)
             for handle in handles:
                 log.warning("job taken over", job=handle.get_workflow_id())
