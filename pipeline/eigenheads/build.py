@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from pipeline.eigenheads.correspondence import Matching, correspond
 from pipeline.eigenheads.model import HeadModel, ModelParts, assemble, model_path, read_parts, save_model
+from pipeline.eigenheads.parallel import workers
 from pipeline.eigenheads.scan_checks import Checked, check
 from pipeline.eigenheads.scans import Scan, find_scans, read_scan
 from pipeline.eigenheads.training import Training, train
@@ -75,16 +77,19 @@ def read_checked(
     folder: Path, template: HeadModel, *, report: Report | None = None
 ) -> tuple[list[Checked], dict[str, str]]:
     """The sound scans of a folder, and what is wrong with the others by name. Raises InputError for an empty folder."""
-    good, bad = [], {}
     paths = find_scans(folder)
-    for k, path in enumerate(paths):
-        try:
-            good.append(check(read_scan(path), template))
-        except InputError as fault:
-            bad[path.stem] = str(fault)
-        if report:
-            report("checking scans", (k + 1) / len(paths))
-    return good, bad
+    with workers(2, len(paths)) as crew:
+        found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
+    good = [entry for entry in found if isinstance(entry, Checked)]
+    return good, {path.stem: fault for path, fault in zip(paths, found, strict=True) if isinstance(fault, str)}
+
+
+def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
+    """The sound scan, or what is wrong with it."""
+    try:
+        return check(read_scan(path), template)
+    except InputError as fault:
+        return str(fault)
 
 
 def corresponded_cages(

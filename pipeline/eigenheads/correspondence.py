@@ -8,8 +8,8 @@ every vertex looks for the scan's point that is near *and* faces the same way, a
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sparse
@@ -20,6 +20,7 @@ from scipy.spatial import KDTree
 from pipeline.eigenheads.cylinder import CylinderIndex, coordinates, points_at
 from pipeline.eigenheads.landmarks import NAMES, stacked
 from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.parallel import Workers, workers
 from pipeline.eigenheads.pca import align, rigid_fit
 from pipeline.eigenheads.prior import mixed_modes
 from pipeline.eigenheads.scans import Scan
@@ -29,6 +30,7 @@ from rig.geometry import cross_matrix
 from rig.mesh import vertex_normals
 
 Report = Callable[[str, float], None]
+Frame = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]  # rotation and translation, frame from scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +47,7 @@ class Matching:
     plane_mm: float = 1.0  # residual that weighs as much as one standard deviation of a mode, per cm2
     mark_mm: float = 0.7
     mark_weight: float = 0.3  # of a landmark in the smooth refinement, beside 1 of a matched vertex
-    workers: int = 2
+    workers: int = 2  # processes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,17 +57,16 @@ class Correspondence:
     heads: Float[np.ndarray, "N V 3"]
     void: Bool[np.ndarray, "N V"]
     reference: int
-    frame_from_scan: list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]]
+    frame_from_scan: list[Frame]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """A scan in the common frame, prepared for resampling and refinement."""
+    """A scan in the common frame, prepared for refinement."""
 
     vertices: Float[np.ndarray, "S 3"]
     normals: Float[np.ndarray, "S 3"]
     marks: Float[np.ndarray, "26 3"]
-    cylinder: CylinderIndex
 
 
 def correspond(
@@ -73,24 +74,24 @@ def correspond(
 ) -> Correspondence:
     """Corresponded heads on the template's cage connectivity. Scans must have passed ``scan_checks.check``."""
     matching = matching or Matching()
-    say = report or (lambda stage, fraction: None)
     frames = common_frame(scans, template)
-    targets = [prepared(scan, *frame) for scan, frame in zip(scans, frames, strict=True)]
-    marks = np.array([t.marks for t in targets])
-    reference = nearest_mean(marks)
-    shape = on_reference(targets[reference], template, matching)
-    stages = ("first pass", "second pass")
-    heads, void = np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
-    for stage in stages:
-        heads, void = _pass(shape, targets, template, matching, stage, say)
-        reference = nearest_mean(heads)
-        shape = heads[reference]
-    if matching.refine:
-        heads = _refined(targets, template, matching, say)
+    given = list(zip(scans, frames, strict=True))
+    reference = nearest_mean(np.array([stacked(scan.landmarks) @ r.T + t for scan, (r, t) in given]))
+    with workers(matching.workers, len(scans)) as crew:
+        shape = on_reference(prepared(scans[reference], *frames[reference]), template, matching)
+        heads, void = np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
+        for stage in ("first pass", "second pass"):
+            sample = partial(_resampled, shape, _landmark_rows(template), matching)
+            found = crew.over(sample, given, stage, report)
+            heads, void = np.array([head for head, _ in found]), np.array([mask for _, mask in found])
+            reference = nearest_mean(heads)
+            shape = heads[reference]
+        if matching.refine:
+            heads = _refined(given, template, matching, crew, report)
     return Correspondence(heads, void, reference, frames)
 
 
-def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[tuple[np.ndarray, np.ndarray]]:
+def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[Frame]:
     """Rigid motions into the head frame: landmarks aligned with each other, their mean with the template's."""
     marks = np.array([stacked(scan.landmarks) for scan in scans])
     ours = template.vertices(np.zeros(0))[[template.landmarks[name] for name in NAMES]]
@@ -109,7 +110,7 @@ def prepared(scan: Scan, rotation: np.ndarray, translation: np.ndarray) -> Targe
         normals = averaging @ normals
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     marks = stacked(scan.landmarks) @ rotation.T + translation
-    return Target(vertices, normals, marks, CylinderIndex(vertices, scan.faces))
+    return Target(vertices, normals, marks)
 
 
 def _averaging(faces: Int[np.ndarray, "F 3"], count: int) -> sparse.csr_array:
@@ -128,56 +129,68 @@ def nearest_mean(shapes: Float[np.ndarray, "N L 3"]) -> int:
 def on_reference(target: Target, template: HeadModel, matching: Matching) -> Float[np.ndarray, "V 3"]:
     """The reference scan's surface on the template's cage vertices."""
     surface = template.vertices(np.zeros(0))[: len(template.mean)]
-    index = np.array([template.landmarks[name] for name in NAMES])
+    index = _landmark_rows(template)
     warped = landmark_warp(surface[index], target.marks, surface)
     return refined(warped, template.levels["cage"].faces, index, target, _tree(target, matching), matching)
 
 
 def warp_and_resample(
-    shape: Float[np.ndarray, "V 3"], index: Int[np.ndarray, " L"], target: Target, matching: Matching
+    shape: Float[np.ndarray, "V 3"],
+    index: Int[np.ndarray, " L"],
+    marks: Float[np.ndarray, "L 3"],
+    cylinder: CylinderIndex,
+    matching: Matching,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
     """Steps 3 and 4: the warped reference, its resampling on the target, and where that is void (there: warped)."""
-    warped = landmark_warp(shape[index], target.marks, shape, smoothing=matching.landmark_smoothing_mm)
+    warped = landmark_warp(shape[index], marks, shape, smoothing=matching.landmark_smoothing_mm)
     angles, heights, radii = coordinates(warped)
-    cast = target.cylinder.cast(angles, heights, radii)
+    cast = cylinder.cast(angles, heights, radii)
     void = ~(np.abs(cast.radii - radii) < matching.reach_mm)
     sampled = points_at(angles, heights, np.where(void, radii, cast.radii))
-    sampled[index], void[index] = target.marks, False  # landmarks stay fixed
+    sampled[index], void[index] = marks, False  # landmarks stay fixed
     return warped, sampled, void
 
 
-def _pass(
-    shape: np.ndarray, targets: list[Target], template: HeadModel, matching: Matching, stage: str, say: Report
-) -> tuple[Float[np.ndarray, "N V 3"], Bool[np.ndarray, "N V"]]:
-    index = np.array([template.landmarks[name] for name in NAMES])
-    heads, voids = [], []
-    for k, target in enumerate(targets):
-        _, sampled, void = warp_and_resample(shape, index, target, matching)
-        heads.append(sampled)
-        voids.append(void)
-        say(stage, (k + 1) / len(targets))
-    return np.array(heads), np.array(voids)
+def _resampled(
+    shape: Float[np.ndarray, "V 3"], index: Int[np.ndarray, " L"], matching: Matching, given: tuple[Scan, Frame]
+) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
+    scan, (rotation, translation) = given
+    vertices = scan.vertices @ rotation.T + translation
+    marks = stacked(scan.landmarks) @ rotation.T + translation
+    return warp_and_resample(shape, index, marks, CylinderIndex(vertices, scan.faces), matching)[1:]
 
 
-def _refined(targets: list[Target], template: HeadModel, matching: Matching, say: Report) -> Float[np.ndarray, "N V 3"]:
-    index = np.array([template.landmarks[name] for name in NAMES])
-    faces = template.levels["cage"].faces
-
+def _refined(
+    given: Sequence[tuple[Scan, Frame]],
+    template: HeadModel,
+    matching: Matching,
+    crew: Workers,
+    report: Report | None,
+) -> Float[np.ndarray, "N V 3"]:
     count = len(template.mean)
     mean = template.vertices(np.zeros(0))[:count]
     modes = mixed_modes(mean, template.basis("full", len(template.modes), np.arange(count)).astype(float))
+    one = partial(_most_probable, mean, modes, template.levels["cage"].faces, _landmark_rows(template), matching)
+    return np.array(crew.over(one, given, "refining", report))
 
-    def one(target: Target) -> np.ndarray:
-        tree = _tree(target, matching)
-        likeness = statistical(mean, modes, faces, index, target, tree, matching)
-        return refined(likeness, faces, index, target, tree, matching)
 
-    out = []
-    with ThreadPoolExecutor(matching.workers) as pool:
-        for k, head in enumerate(pool.map(one, targets)):
-            out.append(head)
-            say("refining", (k + 1) / len(targets))
-    return np.array(out)
+def _most_probable(
+    mean: Float[np.ndarray, "V 3"],
+    modes: Float[np.ndarray, "M V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    index: Int[np.ndarray, " L"],
+    matching: Matching,
+    given: tuple[Scan, Frame],
+) -> Float[np.ndarray, "V 3"]:
+    scan, frame = given
+    target = prepared(scan, *frame)
+    tree = _tree(target, matching)
+    likeness = statistical(mean, modes, faces, index, target, tree, matching)
+    return refined(likeness, faces, index, target, tree, matching)
+
+
+def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
+    return np.array([template.landmarks[name] for name in NAMES])
 
 
 def _tree(target: Target, matching: Matching) -> KDTree:

@@ -14,6 +14,9 @@ from pipeline.eigenheads.cylinder import CylinderIndex, points_at
 from pipeline.eigenheads.scans import Scan
 from rig.geometry import rotation_from_vector
 
+_JUMP_MM = 8.0  # neighbouring samples farther apart lie on two surfaces ...
+_STEEPEST = 4.0  # ... unless the grid is coarse: 4 mm apart, the side of a nose would come out as a hole
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scanner:
@@ -45,7 +48,7 @@ def scan_head(
     points = points_at(columns.ravel(), rows.ravel(), radii)
     marks = {n: vertices[v] + scanner.landmark_noise_mm * rng.standard_normal(3) for n, v in landmarks.items()}
     valid = np.isfinite(radii) & ~_swallowed(points, {n: vertices[v] for n, v in landmarks.items()}, scanner, rng)
-    mesh = _grid_faces(valid.reshape(rows.shape), points)
+    mesh = _grid_faces(valid.reshape(rows.shape), points, max(_JUMP_MM, _STEEPEST * scanner.spacing_mm))
     used, local = np.unique(mesh, return_inverse=True)
     turn = rotation_from_vector(scanner.turn_rad * rng.standard_normal(3))
     shift = scanner.shift_mm * rng.standard_normal(3)
@@ -83,8 +86,10 @@ def _swallowed(
     return lost
 
 
-def _grid_faces(valid: Bool[np.ndarray, "H A"], points: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "F 3"]:
-    """Triangles between neighbouring samples, round the seam too; none across a jump in depth."""
+def _grid_faces(
+    valid: Bool[np.ndarray, "H A"], points: Float[np.ndarray, "N 3"], jump_mm: float
+) -> Int[np.ndarray, "F 3"]:
+    """Triangles between neighbouring samples, round the seam too; none with a side of ``jump_mm`` or more."""
     rows, columns = valid.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     here, right = index[:-1], np.roll(index, -1, 1)[:-1]
@@ -93,4 +98,4 @@ def _grid_faces(valid: Bool[np.ndarray, "H A"], points: Float[np.ndarray, "N 3"]
     faces = faces[valid.ravel()[faces].all(1)]
     corners = points[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max(1)
-    return faces[longest < 8.0]
+    return faces[longest < jump_mm]

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.eigenheads import worth
 from pipeline.eigenheads.correspondence import Matching, common_frame, on_reference, prepared, warp_and_resample
+from pipeline.eigenheads.cylinder import CylinderIndex
 from pipeline.eigenheads.landmarks import NAMES
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.scanner import Scanner, scan_head
@@ -104,7 +105,8 @@ def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
     matching = Matching()
     index = np.array([model.landmarks[name] for name in NAMES])
     shape = on_reference(reference, model, matching)
-    warped, sampled, void = warp_and_resample(shape, index, target, matching)
+    cylinder = CylinderIndex(target.vertices, scans[1].faces)
+    warped, sampled, void = warp_and_resample(shape, index, target.marks, cylinder, matching)
     cage = model.levels["cage"].faces
     steps = (
         ("reference", shape, cage, None),
