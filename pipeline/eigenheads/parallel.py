@@ -8,7 +8,8 @@ from multiprocessing import get_context
 from typing import TypeVar
 
 Report = Callable[[str, float], None]
-Item, Result = TypeVar("Item"), TypeVar("Result")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 FEW = 12  # with fewer items the processes' start (two seconds) costs more than they save
 _CHUNK = 4  # what a task carries besides its item (a prior of 35 MB) travels once a chunk

@@ -74,8 +74,10 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Feature points, packed: view, pixel, and what the model says of their landmarks (head frame, mm)."""
+    """Feature points, packed: landmark vertex (row of the full level), view, pixel, and what the model says of the
+    landmark (head frame, mm)."""
 
+    vertex: Int[np.ndarray, " n"]
     view: Int[np.ndarray, " n"]
     pixel: Float[np.ndarray, "n 2"]
     mean: Float[np.ndarray, "n 3"]
@@ -354,9 +356,25 @@ def pack_features(
     if not found:
         return None
     vertex, view, pixel = (np.array(column) for column in zip(*found, strict=True))
-    mean = model.levels["full"].operator[vertex] @ model.mean
-    basis = model.basis("full", len(model.modes), vertex)
-    return Observed(view, pixel.astype(float), mean.astype(float), basis)
+    return Observed(vertex, view, pixel.astype(float), *landmark_basis(model, vertex))
+
+
+def landmark_basis(
+    model: HeadModel, vertex: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
+    """Mean and all modes at vertices of the full level."""
+    mean = np.asarray(model.levels["full"].operator[vertex] @ model.mean, float)
+    return mean, model.basis("full", len(model.modes), vertex)
+
+
+def widened(problem: Problem, model: HeadModel, levels: tuple[str, ...]) -> Problem:
+    """The same problem with a model of the same mesh that has more modes, solved on ``levels``."""
+    features = problem.features
+    if features is not None:
+        mean, basis = landmark_basis(model, features.vertex)
+        features = replace(features, mean=mean, basis=basis)
+    bases = {name: level_basis(model, name) for name in levels}
+    return replace(problem, model=model, bases=bases, features=features)
 
 
 def start_state(problem: Problem, world_from_head: Similarity) -> State:

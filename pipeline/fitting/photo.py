@@ -17,9 +17,8 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.eigenheads.kernel import with_fine_kernel
-from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.consistency import Round, hair_patches, look, observe
-from pipeline.fitting.contour import Problem, Solved, Stage, State, level_basis, run_stage
+from pipeline.fitting.contour import Problem, Solved, Stage, State, run_stage, widened
 from pipeline.fitting.patches import Patches, make_patches
 from pipeline.fitting.photographs import load_photographs
 from pipeline.fitting.surface import surface_residual
@@ -85,11 +84,6 @@ def unfollowed(problem: Problem, state: State, lost: Int[np.ndarray, " u"]) -> F
     distance, near = KDTree(full[np.concatenate([seen.vertex, lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
     weight = np.exp(-0.5 * (distance / NEAR_MM) ** 2)
     return MISFIT_FACTOR * np.sqrt((weight * square[near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 0.1))
-
-
-def widened(problem: Problem, model: HeadModel, levels: tuple[str, ...]) -> Problem:
-    """The same problem with more modes, solved on ``levels``."""
-    return replace(problem, model=model, bases={name: level_basis(model, name) for name in levels})
 
 
 def patches_for(problem: Problem, settings: PhotoSettings) -> Patches:

@@ -47,7 +47,7 @@ def photographs_of(
     model, settings = load_model(), Settings().segmentation
     for _ in range(count):
         taken = simulate(drawn_subject(model, rng), rig, PRESET, rng, renderer=renderer)
-        yield dict(segment(taken.capture, settings))
+        yield dict(segment(taken.capture, rig, settings, report=lambda stage, fraction: None))
 
 
 def run(

@@ -20,8 +20,8 @@ def served_studio(folder: Path, *options: str) -> Iterator[dict[str, Any]]:
     process = subprocess.Popen(
         [*CLI, "simulate", str(folder), "--serve", "--json", *options], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
+    assert process.stdout is not None
     try:
-        assert process.stdout is not None
         line = process.stdout.readline()
         assert line, f"the studio ended with status {process.wait()} before it opened"
         yield json.loads(line)

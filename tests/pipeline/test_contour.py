@@ -17,6 +17,7 @@ from pipeline.fitting.contour import (
     make_problem,
     rim_rows,
     schedule,
+    widened,
 )
 from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.settings import FittingSettings
@@ -139,3 +140,20 @@ def test_kernel_modes_are_orthogonal_to_the_span_and_carry_the_process(model):
     # Nystroem and the projection only ever take variance away, all in all; most of it must be left.
     assert carried.sum() < prior.sum()
     assert np.median(carried / prior) > 0.4
+
+
+@pytest.mark.gl
+def test_feature_points_follow_a_wider_model(model, planted):
+    """More modes, all at zero, change neither where the landmarks are nor what their misses cost."""
+    rig, coefficients, pose, silhouettes = planted
+    nose = model.landmarks["pronasale"]
+    at = pose.apply(model.vertices(coefficients)[[nose]])
+    features = {"pronasale": {camera.name: camera.project(at)[0] + 3.0 for camera in list(rig)[:3]}}
+    few = with_modes(model, 20)
+    problem = make_problem(few, pose, silhouettes, rig, SETTINGS, features)
+    wide = widened(problem, model, ("p95",))
+    stage = schedule(SETTINGS, 20)[0]
+    none = np.zeros((len(rig), PER_CAMERA))
+    narrow_cost = evaluate(problem, State(coefficients[:20], pose, none), stage, 3.0, None).cost
+    padded = np.concatenate([coefficients[:20], np.zeros(len(model.modes) - 20)])
+    assert evaluate(wide, State(padded, pose, none), stage, 3.0, None).cost == pytest.approx(narrow_cost, rel=1e-5)

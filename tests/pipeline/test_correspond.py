@@ -101,7 +101,7 @@ def _motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndar
     """scipy's own rigid fit, as a check on ours."""
     from scipy.spatial.transform import Rotation
 
-    rotation, _ = Rotation.align_vectors(target - target.mean(0), source - source.mean(0))
+    rotation = Rotation.align_vectors(target - target.mean(0), source - source.mean(0))[0]
     return rotation.as_matrix(), target.mean(0) - rotation.as_matrix() @ source.mean(0)
 
 
