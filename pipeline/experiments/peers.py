@@ -17,6 +17,9 @@ The error is the mean over the face region's vertices, world frame, no realignme
 silhouettes to vertices, each solver warm, all on the same cores. Needs the dependency group ``peers``.
 """
 
+# pyright: reportMissingImports=false
+# The peers' packages are a dependency group of their own: `uv sync --group peers`.
+
 import os
 import time
 from collections.abc import Callable

@@ -9,6 +9,9 @@ the input mask's area in every pixel; Adam minimises it with a shrinking sigma.
 Needs the dependency group ``peers``.
 """
 
+# pyright: reportMissingImports=false
+# The peers' packages are a dependency group of their own: `uv sync --group peers`.
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
