@@ -23,8 +23,9 @@ STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after t
 class Background:
     """The plate as it would look now, its noise against the image, and how sure that is."""
 
-    expected: Float32[np.ndarray, "h w 3"]  # levels, 0 to 255
-    coarse: Float32[np.ndarray, "hc wc 3"]  # the same, averaged to the coarse level
+    plates: UInt8[np.ndarray, "p h w 3"]
+    field: Float32[np.ndarray, "hc wc 3"]  # what their mean is multiplied by
+    coarse: Float32[np.ndarray, "hc wc 3"]  # the product (levels), averaged to the coarse level
     noise: Float32[np.ndarray, "hc wc 3"]  # standard deviation (levels) of image minus expected, one full-size pixel
     inliers: Bool[np.ndarray, "hc wc"]  # coarse pixels that look like the plate
     gain: Float32[np.ndarray, " 3"]  # median of the field, RGB
@@ -44,10 +45,12 @@ def estimate_background(
 ) -> Background:
     """Fits the plates to an image in which the subject stands."""
     size = (image_coarse.shape[1], image_coarse.shape[0])
-    plate = _mean(plates)
-    plate_coarse = cv2.resize(plate, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    pixel_noise = _image_noise(image, plate)
-    gain = np.array([_mode_of_ratio(image_coarse[:, :, c], plate_coarse[:, :, c]) for c in range(3)], np.float32)
+    small = np.stack([cv2.resize(plate, size, interpolation=cv2.INTER_AREA) for plate in plates]).astype(np.float32)
+    plate_coarse = small.mean(axis=0)
+    few = (slice(None, None, 2), slice(None, None, 2))  # a histogram needs no more
+    gain = np.array(
+        [_mode_of_ratio(image_coarse[few][:, :, c], plate_coarse[few][:, :, c]) for c in range(3)], np.float32
+    )
     field = np.broadcast_to(gain, plate_coarse.shape)
     tolerance = settings.tolerance_levels + settings.tolerance_share * plate_coarse
     weight = np.zeros(plate_coarse.shape[:2], np.float32)
@@ -56,21 +59,12 @@ def estimate_background(
         slack = tolerance + plate_coarse * (0.03, 0.015, 0.0, 0.0)[step]
         weight = _tukey(((image_coarse - field * plate_coarse) / slack) ** 2)
         field = _gain_field(image_coarse, plate_coarse, weight, settings.field_share * size[0])
-    expected = cv2.resize(field, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR) * plate
     inliers = weight > 0.3
-    noise = _noise_by_level(image, expected, plate_coarse, inliers, pixel_noise)
-    noise = _with_temporal_noise(noise, plates, size)
+    stack = np.stack(plates)
+    noise = _noise_by_level(image, stack, field, plate_coarse, inliers)
+    noise = _with_temporal_noise(noise, small)
     middle = np.median(field[inliers], axis=0) if inliers.any() else gain
-    return Background(expected, field * plate_coarse, noise, inliers, middle.astype(np.float32))
-
-
-def _mean(plates: tuple[UInt8[np.ndarray, "h w 3"], ...]) -> np.ndarray:
-    if len(plates) == 1:
-        return plates[0]
-    total = np.zeros(plates[0].shape, np.float32)
-    for plate in plates:
-        cv2.accumulate(plate, total)
-    return total / len(plates)
+    return Background(stack, field, field * plate_coarse, noise, inliers, middle.astype(np.float32))
 
 
 def _mode_of_ratio(image: Float32[np.ndarray, "h w"], plate: Float32[np.ndarray, "h w"]) -> float:
@@ -111,9 +105,9 @@ def _gain_field(
     return cv2.resize(field, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32)
 
 
-def _image_noise(image: UInt8[np.ndarray, "h w 3"], plate: np.ndarray) -> Float32[np.ndarray, " 3"]:
+def _image_noise(image: UInt8[np.ndarray, "h w 3"], plates: UInt8[np.ndarray, "p h w 3"]) -> Float32[np.ndarray, " 3"]:
     """Standard deviation of image minus plate from differences of neighbours, which no light drift can reach."""
-    pairs = [image[::8, start::4].astype(np.float32) - plate[::8, start::4] for start in (0, 1)]
+    pairs = [image[::8, x::4].astype(np.float32) - plates[:, ::8, x::4].mean(axis=0) for x in (0, 1)]
     columns = min(pair.shape[1] for pair in pairs)
     steps = pairs[1][:, :columns] - pairs[0][:, :columns]
     return (1.4826 * np.median(np.abs(steps), axis=(0, 1)) / np.sqrt(2)).astype(np.float32) + 0.3
@@ -121,25 +115,25 @@ def _image_noise(image: UInt8[np.ndarray, "h w 3"], plate: np.ndarray) -> Float3
 
 def _noise_by_level(
     image: UInt8[np.ndarray, "h w 3"],
-    expected: Float32[np.ndarray, "h w 3"],
+    plates: UInt8[np.ndarray, "p h w 3"],
+    field: Float32[np.ndarray, "hc wc 3"],
     plate_coarse: Float32[np.ndarray, "hc wc 3"],
     inliers: Bool[np.ndarray, "hc wc"],
-    pixel_noise: Float32[np.ndarray, " 3"],
 ) -> Float32[np.ndarray, "hc wc 3"]:
     """The noise (levels) of every coarse pixel, from a curve over brightness that the background pixels draw."""
-    rows, columns = np.arange(0, image.shape[0], 6), np.arange(0, image.shape[1], 6)  # 20,000 samples are enough
-    kept = inliers[np.ix_(rows * inliers.shape[0] // image.shape[0], columns * inliers.shape[1] // image.shape[1])]
-    seen, wanted = image[np.ix_(rows, columns)][kept], expected[np.ix_(rows, columns)][kept]
-    residual, level = np.abs(seen - wanted), wanted @ np.full(3, 1 / 3, np.float32)
-    edges = np.linspace(0, 256, LEVEL_BINS + 1)
-    which = np.clip(np.digitize(level, edges) - 1, 0, LEVEL_BINS - 1)
+    rows, columns = np.arange(3, image.shape[0], 6), np.arange(3, image.shape[1], 6)  # 20,000 samples are enough
+    at = np.ix_(rows * inliers.shape[0] // image.shape[0], columns * inliers.shape[1] // image.shape[1])
+    kept = inliers[at]
+    wanted = (plates[:, 3::6, 3::6].mean(axis=0, dtype=np.float32) * field[at])[kept]
+    residual, level = np.abs(image[3::6, 3::6][kept] - wanted), wanted @ np.full(3, 1 / 3, np.float32)
+    which = np.minimum((level * (LEVEL_BINS / 256)).astype(np.int32), LEVEL_BINS - 1)
     centres, curve = [], []
     for k in range(LEVEL_BINS):
         if np.count_nonzero(which == k) >= 200:
-            centres.append((edges[k] + edges[k + 1]) / 2)
+            centres.append((k + 0.5) * 256 / LEVEL_BINS)
             curve.append(1.4826 * np.median(residual[which == k], axis=0))
     if not centres:
-        return np.broadcast_to(pixel_noise, plate_coarse.shape).astype(np.float32)
+        return np.broadcast_to(_image_noise(image, plates), plate_coarse.shape).astype(np.float32)
     brightness = plate_coarse @ np.full(3, 1 / 3, np.float32)
     channels = [np.interp(brightness, centres, np.array(curve)[:, c]) for c in range(3)]
     # 8-bit rounding of both images alone is worth sqrt(2 / 12) levels.
@@ -147,12 +141,11 @@ def _noise_by_level(
 
 
 def _with_temporal_noise(
-    noise: Float32[np.ndarray, "hc wc 3"], plates: tuple[UInt8[np.ndarray, "h w 3"], ...], size: tuple[int, int]
+    noise: Float32[np.ndarray, "hc wc 3"], plates: Float32[np.ndarray, "p hc wc 3"]
 ) -> Float32[np.ndarray, "hc wc 3"]:
     """Adds what several plates show beyond the curve: a flickering lamp, a curtain that moves."""
     if len(plates) < 3:
         return noise
-    small = np.stack([cv2.resize(plate, size, interpolation=cv2.INTER_AREA) for plate in plates]).astype(np.float32)
-    small /= np.maximum(small.mean(axis=(1, 2), keepdims=True), 1.0)  # exposure changes between plates are not noise
-    spread = small.std(axis=0, ddof=1) * np.mean([plate.mean() for plate in plates])
+    small = plates / np.maximum(plates.mean(axis=(1, 2), keepdims=True), 1.0)  # changes of exposure are not noise
+    spread = small.std(axis=0, ddof=1) * plates.mean()
     return np.sqrt(noise**2 + cv2.blur(spread**2, (3, 3))).astype(np.float32)

@@ -20,18 +20,22 @@ from jaxtyping import Bool, Float32, UInt8
 from numba import njit
 
 from pipeline.background import Background
+from pipeline.coarse import Decision
+from pipeline.regions import dilated, eroded, spread
 from pipeline.settings import SegmentationSettings
 from rig.mesh_files import linear_from_srgb
 
 INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour: beyond the blur of an edge (3 sigma)
 SOLID = 0.85  # alpha above which a pixel shows the subject's own colour, and not hair before the background
 WINDOW_PX = 3.0  # sigma of the window it is averaged in
-LEAN = 0.5  # standard deviation of alpha at which the coarse mask counts as much as the pixel
+LEAN = 1.0  # standard deviation of alpha at which the coarse mask counts as much as the pixel
 LINEAR = (255 * linear_from_srgb(np.arange(257) / 255.0)).astype(np.float32)  # by code, one more to interpolate to
 SHADE = (
-    0.15  # standard deviation of the subject's brightness at the rim, of full alpha: surfaces darken as they turn away
+    0.08  # standard deviation of the subject's brightness at the rim, of full alpha: surfaces darken as they turn away
 )
-FAR = 0.01  # weight of a window four times as wide, which speaks where the near one holds no pixel
+OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
+FAINT = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
+WIDE_PX = 2.5  # sigma of that window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,55 +46,40 @@ class Matte:
     contrast: Float32[np.ndarray, " c"]  # |F - B| in standard deviations, at every pixel of the contour
 
 
-def solve_matte(
-    image: UInt8[np.ndarray, "h w 3"],
-    image_coarse: Float32[np.ndarray, "hc wc 3"],
-    background: Background,
-    probability: Float32[np.ndarray, "hc wc"],
-    settings: SegmentationSettings,
-) -> Matte:
-    """Alpha of the subject whose coarse probability is given."""
-    mask = probability > 0.5
-    band = int(np.ceil(settings.band_px * mask.shape[1] / image.shape[1]))
-    outside, inside = ~dilated(mask, band), eroded(mask, 3 * band)  # hair is sparse far inside its outline
-    light = _light_outside(image_coarse, background, mask)
+def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings: SegmentationSettings) -> Matte:
+    """Alpha of the subject that was decided upon.
+
+    Where its colour is nothing like the plate, pixels are asked in a band that is wide enough for hair, which is sparse
+    far inside its outline. Elsewhere the decision, which has seen more pixels, is believed but for its border.
+    """
+    background, mask, clear = decision.background, decision.mask, decision.clear
+    probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
+    band = int(np.ceil(settings.band_px / decision.reduction))
+    asked = dilated(mask, 2) & ~eroded(mask, 2)
+    asked |= dilated(decision.mixed, 1) & dilated(mask, band) & ~eroded(mask, 3 * band)
+    asked &= clear | (dilated(mask, 1) & ~eroded(mask, 1))
+    zone = np.where(asked, np.where(clear, 1, 3), 2 * mask).astype(np.uint8)
+    light = background.field * _light_outside(decision.coarse, background, mask)
     sigma = background.noise @ np.full(3, 1 / 3, np.float32)
-    subject = spread(image_coarse, eroded(mask, 2), 2.0)
-    zone = np.ones(mask.shape, np.uint8)
-    zone[outside], zone[inside] = 0, 2
-    args = (LINEAR, image, background.expected, light, sigma, zone, probability)
-    first, _ = _alpha(*args, subject, LEAN, SHADE)
-    first = cv2.GaussianBlur(first, (0, 0), settings.alpha_blur_px)
-    second, contrast = _alpha(*args, _subject_inside(image, first, subject), LEAN, SHADE)
-    alpha = cv2.GaussianBlur(second, (0, 0), settings.alpha_blur_px)
+    args = (LINEAR, image, background.plates, light, sigma, zone, probability.astype(np.float32))
+    alpha, _, _ = _alpha(*args, decision.paint, LEAN, SHADE, True)
+    alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)
+    alpha, contrast, trust = _alpha(*args, _subject_inside(image, alpha, decision.paint), LEAN, SHADE, False)
+    alpha = _smooth(alpha, trust, settings.alpha_blur_px)
     return Matte(alpha, contrast[(np.abs(alpha - 0.5) < 0.25) & (contrast >= 0)])
 
 
-def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
-    """Where the subject is left by a border of ``steps`` pixels; the image's own border is none."""
-    return cv2.erode(mask.view(np.uint8), _disc(steps), borderValue=1).view(bool)
-
-
-def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
-    return cv2.dilate(mask.view(np.uint8), _disc(steps)).view(bool)
-
-
-def spread(
-    values: Float32[np.ndarray, "h w c"], where: Bool[np.ndarray, "h w"], sigma: float
-) -> Float32[np.ndarray, "h w c"]:
-    """Values carried from ``where`` to every pixel: a mean in a Gaussian window, a wider one where that is empty."""
-    weight = where.astype(np.float32)
-    stack = np.concatenate([values * weight[:, :, None], weight[:, :, None]], axis=2)
-    near = cv2.GaussianBlur(stack, (0, 0), sigma)
-    small = (max(4, values.shape[1] // 4), max(4, values.shape[0] // 4))
-    far = cv2.GaussianBlur(cv2.resize(stack, small, interpolation=cv2.INTER_AREA), (0, 0), max(sigma, 1.0) * 2)
-    near += FAR * cv2.resize(far, (values.shape[1], values.shape[0]), interpolation=cv2.INTER_LINEAR)
-    near += 1e-6 * stack.mean((0, 1))
-    return near[:, :, :-1] / np.maximum(near[:, :, -1:], 1e-9)
-
-
-def _disc(steps: int) -> UInt8[np.ndarray, "k k"]:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * steps + 1, 2 * steps + 1))
+def _smooth(
+    alpha: Float32[np.ndarray, "h w"], trust: Float32[np.ndarray, "h w"], sigma: float
+) -> Float32[np.ndarray, "h w"]:
+    """Alpha averaged by ``trust`` (1 / variance), in a window that is wider where it is low."""
+    near = cv2.GaussianBlur(alpha, (0, 0), sigma)
+    if not (trust < FAINT).any():
+        return near
+    weight = cv2.GaussianBlur(trust, (0, 0), WIDE_PX)
+    far = cv2.GaussianBlur(trust * alpha, (0, 0), WIDE_PX) / weight
+    share = np.clip(2 - 2 * weight / FAINT, 0, 1)
+    return near + share * (far - near)
 
 
 def _light_outside(
@@ -100,8 +89,8 @@ def _light_outside(
     clear = ~dilated(mask, 2)
     if not clear.any():
         return np.ones_like(image)
-    seen, wanted = (spread(values, clear, 2.5) for values in (image, background.coarse))
-    return np.clip(seen / np.maximum(wanted, 4.0), 0.3, 1.5)
+    both = spread(np.concatenate([image, background.coarse], axis=2), clear.astype(np.float32), 2.5)
+    return np.clip(both[:, :, :3] / np.maximum(both[:, :, 3:], 4.0), 0.3, 1.5)
 
 
 def _subject_inside(
@@ -110,10 +99,12 @@ def _subject_inside(
     """The subject's colour near its contour, at half resolution."""
     half = (image.shape[1] // 2, image.shape[0] // 2)
     inner = eroded(alpha > 0.5, INSIDE_PX) & (alpha > SOLID)
-    weight = cv2.resize(inner.view(np.uint8) * np.float32(1), half, interpolation=cv2.INTER_AREA)
-    colour = cv2.resize(image, half, interpolation=cv2.INTER_AREA).astype(np.float32)
-    sure = (weight > 0.99).astype(np.float32)[:, :, None]
-    total = cv2.GaussianBlur(np.concatenate([colour * sure, sure], axis=2), (0, 0), WINDOW_PX / 2)
+    sure = cv2.resize(255 * inner.view(np.uint8), half, interpolation=cv2.INTER_AREA) == 255
+    total = np.zeros((half[1], half[0], 4), np.float32)
+    total[:, :, :3] = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
+    total[:, :, 3] = 1.0
+    total *= sure[:, :, None]
+    total = cv2.GaussianBlur(total, (0, 0), WINDOW_PX / 2)
     total[:, :, :3] += 0.02 * cv2.resize(coarse, half, interpolation=cv2.INTER_LINEAR)
     return total[:, :, :3] / (total[:, :, 3:] + 0.02)
 
@@ -144,7 +135,7 @@ def _decoded(table: np.ndarray, code: float) -> float:
 def _alpha(
     table: np.ndarray,
     image: np.ndarray,
-    expected: np.ndarray,
+    plates: np.ndarray,
     light: np.ndarray,
     sigma: np.ndarray,
     zone: np.ndarray,
@@ -152,15 +143,18 @@ def _alpha(
     subject: np.ndarray,
     lean: float,
     shade: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Alpha (-0.5 to 1.5) of every pixel, and |F - B| in standard deviations in the band (-1 elsewhere).
+    first: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Alpha (-0.5 to 1.5) of every pixel, and in the band |F - B| in standard deviations of the image's noise (-1
+    elsewhere) and 1 / variance of alpha (1 elsewhere).
 
-    ``zone``: 0 outside, 1 band, 2 inside.
+    ``zone``: 0 outside, 1 band, 2 inside, 3 band in which the first guess of the subject's colour is no help.
     """
     height, width = image.shape[:2]
     ch, cw = zone.shape
     alpha = np.empty((height, width), np.float32)
     contrast = np.full((height, width), -1.0, np.float32)
+    trust = np.full((height, width), FAINT, np.float32)
     for y in range(height):
         zy = min(y * ch // height, ch - 1)
         ly, fly = _corner(y, height, ch)
@@ -168,15 +162,24 @@ def _alpha(
         for x in range(width):
             zx = min(x * cw // width, cw - 1)
             kind = zone[zy, zx]
-            if kind != 1:
+            if kind == 0 or kind == 2:
                 alpha[y, x] = 0.0 if kind == 0 else 1.0
                 continue
             lx, flx = _corner(x, width, cw)
+            p00, p01 = probability[ly, lx], probability[ly, lx + 1]
+            p10, p11 = probability[ly + 1, lx], probability[ly + 1, lx + 1]
+            prior = (1 - fly) * (p00 + flx * (p01 - p00)) + fly * (p10 + flx * (p11 - p10))
+            if first and kind == 3:
+                alpha[y, x] = prior
+                continue
             sx, fsx = _corner(x, width, subject.shape[1])
             noise = sigma[zy, zx]
-            ff, fb, bb, df, db, square = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums in standard deviations
+            ff, fb, bb, df, db, dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums in standard deviations
             for c in range(3):
-                b = expected[y, x, c] * _between(light, ly, lx, c, fly, flx)
+                b = 0.0
+                for k in range(len(plates)):
+                    b += plates[k, y, x, c]
+                b *= _between(light, ly, lx, c, fly, flx) / len(plates)
                 f = _between(subject, sy, sx, c, fsy, fsx)
                 code = min(int(0.5 * (f + b)), 255)
                 slope = (table[code + 1] - table[code]) * noise
@@ -186,14 +189,24 @@ def _alpha(
                 bb += b * b
                 df += (i - b) * f
                 db += (i - b) * b
-                square += (f - b) * (f - b)
-            p00, p01 = probability[ly, lx], probability[ly, lx + 1]
-            p10, p11 = probability[ly + 1, lx], probability[ly + 1, lx + 1]
-            prior = (1 - fly) * (p00 + flx * (p01 - p00)) + fly * (p10 + flx * (p11 - p10))
+                dd += (i - b) * (i - b)
             # Normal equations of I - B = q F - alpha B, with q = alpha (within shade) and alpha = prior (within LEAN).
             m11, m12, m22 = ff + 1 / shade**2, -fb - 1 / shade**2, bb + 1 / shade**2 + 1 / lean**2
             r1, r2 = df, -db + prior / lean**2
-            value = (m11 * r2 - m12 * r1) / (m11 * m22 - m12 * m12)
-            alpha[y, x] = min(1.5, max(-0.5, value))  # wide, because clipping noise at 0 and 1 would bend the ramp
-            contrast[y, x] = np.sqrt(square)
-    return alpha, contrast
+            determinant = m11 * m22 - m12 * m12
+            value = (m11 * r2 - m12 * r1) / determinant
+            square = ff - 2 * fb + bb
+            value = min(1.5, max(-0.5, value))  # wide, because clipping noise at 0 and 1 would bend the ramp
+            if (
+                first
+            ):  # what no mixture of the two explains, in any shade of the plate, is another colour of the subject
+                a = min(1.0, max(0.0, value))
+                left = dd - 2 * a * (df - db) + a * a * square
+                along = min(0.0, max(-0.4 * (1 - a), (db - a * (fb - bb)) / bb))
+                left += along * along * bb - 2 * along * (db - a * (fb - bb))
+                value += max(0.0, 1.0 - value) / (1.0 + np.exp(OTHER - 0.5 * left))
+            alpha[y, x] = value
+            known = max(determinant / m11 - 1 / lean**2, 1e-6)
+            contrast[y, x] = np.sqrt(known)
+            trust[y, x] = min(FAINT, known)
+    return alpha, contrast, trust

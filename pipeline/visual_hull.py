@@ -10,7 +10,7 @@ no eye sockets or philtrum; the paper shows it for that.
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from numba import njit
 
 from pipeline.silhouette import Silhouette
@@ -34,21 +34,27 @@ class NoHull(EigenheadError):
 
 
 def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Centre (world, mm) and edge (mm) of a cube that holds what the usable silhouettes show.
+    """``mask_extent`` of the usable silhouettes."""
+    return mask_extent({camera.name: silhouettes[camera.name].mask for camera in _believed(silhouettes, rig)}, rig)
+
+
+def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre (world, mm) and edge (mm) of a cube that holds what the masks show; they may be smaller than the images.
 
     The centre is where the rays through the masks' middles cross, the edge the largest mask's diagonal at that depth.
-    Without a usable mask it is the place that the cameras look at, and 400 mm.
+    Without a mask it is the place that the cameras look at, and 400 mm.
     """
     normal, right, views = 1e-9 * np.eye(3), np.zeros(3), []
-    for camera in _believed(silhouettes, rig):
-        mask = silhouettes[camera.name].mask
+    for name, mask in masks.items():
+        camera = rig[name]
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        scale = camera.intrinsics.width / mask.shape[1]
         middle = np.array([[(columns[0] + columns[-1]) / 2, (rows[0] + rows[-1]) / 2]])
-        ray = camera.rays_world(middle)[0]
+        ray = camera.rays_world((middle + 0.5) * scale - 0.5)[0]
         across = np.eye(3) - np.outer(ray, ray)
         normal += across
         right += across @ camera.centre_world
-        views.append((camera, np.hypot(np.ptp(rows), np.ptp(columns))))
+        views.append((camera, scale * np.hypot(np.ptp(rows), np.ptp(columns))))
     if not views:
         return rig.centre_world(), 400.0
     centre = np.linalg.solve(normal, right)
@@ -100,7 +106,9 @@ def _field(
     votes = np.zeros(coarse.shape, np.int32)
     everywhere = np.ones((blocks,) * 3, bool)
     for camera in cameras:
-        _add_view(coarse, votes, everywhere, 1, corner, wide, _parameters(camera), silhouettes[camera.name].distance)
+        _add_view(
+            coarse, votes, everywhere, 1, corner, wide, camera_parameters(camera), silhouettes[camera.name].distance
+        )
     _settle(coarse, votes, LEAST_SHARE * len(cameras))
     # The field grows by at most a millimetre a millimetre (and a little: perspective), so that only blocks whose
     # corners are within their own diagonal of the surface can hold any of it.
@@ -113,7 +121,9 @@ def _field(
     exact = np.full(fine.shape, -np.inf, np.float32)
     step = wide / COARSE
     for camera in cameras:
-        _add_view(exact, votes, active, COARSE, corner, step, _parameters(camera), silhouettes[camera.name].distance)
+        _add_view(
+            exact, votes, active, COARSE, corner, step, camera_parameters(camera), silhouettes[camera.name].distance
+        )
     _settle(exact, votes, LEAST_SHARE * len(cameras))
     known = np.zeros(fine.shape, bool)
     _mark(known, active)
@@ -142,7 +152,8 @@ def _mark(known: np.ndarray, active: np.ndarray) -> None:
         ] = True
 
 
-def _parameters(camera: Camera) -> Float[np.ndarray, " 22"]:
+def camera_parameters(camera: Camera) -> Float[np.ndarray, " 22"]:
+    """Rotation, translation, fx fy cx cy, k1 k2 p1 p2 k3 and the squared turning radius, for compiled projections."""
     k, pose = camera.intrinsics, camera.camera_from_world
     d = k.distortion
     lens = [k.fx, k.fy, k.cx, k.cy, d.k1, d.k2, d.p1, d.p2, d.k3, d.turning_radius() ** 2]

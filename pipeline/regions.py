@@ -1,0 +1,34 @@
+"""Growing and shrinking masks, and carrying values out of them."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+FAR = 0.01  # weight of a window four times as wide, which speaks where the near one holds no pixel
+
+
+def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
+    """Where the subject is left by a border of ``steps`` pixels; the image's own border is none."""
+    return cv2.erode(mask.view(np.uint8), _disc(steps), borderValue=1).view(bool)
+
+
+def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
+    return cv2.dilate(mask.view(np.uint8), _disc(steps)).view(bool)
+
+
+def spread(
+    values: Float32[np.ndarray, "h w c"], weight: Float32[np.ndarray, "h w"], sigma: float
+) -> Float32[np.ndarray, "h w c"]:
+    """Values carried to every pixel from where there is weight: a mean in a Gaussian window, and in a wider one where
+    that is empty."""
+    stack = np.concatenate([values * weight[:, :, None], weight[:, :, None]], axis=2)
+    near = cv2.GaussianBlur(stack, (0, 0), sigma)
+    small = (max(4, values.shape[1] // 4), max(4, values.shape[0] // 4))
+    far = cv2.GaussianBlur(cv2.resize(stack, small, interpolation=cv2.INTER_AREA), (0, 0), max(sigma, 1.0) * 2)
+    near += FAR * cv2.resize(far, (values.shape[1], values.shape[0]), interpolation=cv2.INTER_LINEAR)
+    near += 1e-6 * stack.mean((0, 1))
+    return near[:, :, :-1] / np.maximum(near[:, :, -1:], 1e-9)
+
+
+def _disc(steps: int) -> UInt8[np.ndarray, "k k"]:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * steps + 1, 2 * steps + 1))

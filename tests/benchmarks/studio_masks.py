@@ -1,0 +1,50 @@
+"""Masks of the simulated studio's preset against the truth: contour RMS, IoU, and whether bad views say so.
+
+python -m tests.benchmarks.studio_masks --captures 20
+
+Coverage of the subject is the truth: the contour is judged where it is one half at the resolution that a mask has, the
+overlap at the lens's own (see tests/pipeline/test_segmentation_studio.py).
+"""
+
+import argparse
+import sys
+
+import numpy as np
+
+from rig.render.renderer import Renderer
+from rig.studio.preset import PRESET
+from tests.pipeline.test_segmentation_studio import RESOLUTION_PX, coverage, iou, offsets, take
+
+WORST_PX, LEAST_IOU = 0.8, 0.995
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--captures", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first capture")
+    arguments = parser.parse_args()
+    rows = []
+    with Renderer.create() as renderer:
+        for seed in range(arguments.first, arguments.first + arguments.captures):
+            taken, silhouettes = take(seed, renderer)
+            for name, silhouette in silhouettes.items():
+                off = offsets(silhouette, coverage(taken, name, RESOLUTION_PX))
+                overlap = iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5)
+                said = "; ".join(silhouette.quality.warnings)
+                rows.append((float(np.sqrt((off**2).mean())), overlap, f"{seed} {name}", said))
+    rms, overlap = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    bad = (rms > WORST_PX) | (overlap < LEAST_IOU)
+    lines = [
+        f"{len(rows)} views of {arguments.captures} captures",
+        f"contour RMS px: median {np.median(rms):.3f}, 90 % {np.quantile(rms, 0.9):.3f}, worst {rms.max():.2f}",
+        f"IoU: median {np.median(overlap):.4f}, worst {overlap.min():.4f}",
+    ]
+    wrong = sorted((row for row, beyond in zip(rows, bad, strict=True) if beyond), reverse=True)
+    silent = sum(not said for _, _, _, said in wrong)
+    lines.append(f"views beyond {WORST_PX} px or below {LEAST_IOU}: {len(wrong)}, of which silent: {silent}")
+    lines += [f"  {name}: {off:.2f} px, IoU {share:.4f}, {said or 'nothing said'}" for off, share, name, said in wrong]
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
