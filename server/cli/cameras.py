@@ -1,0 +1,112 @@
+"""Commands about calibration: board, calibrate, refine, convert."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from server.cli.answers import Json, answer, progress_bar
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+@app.command(epilog="Example: eigenhead board --kind charuco --squares 9x6 --square-mm 25 --out board.pdf")
+def board(
+    out: Annotated[Path, typer.Option(help="The PDF to write; board.toml goes beside it.", dir_okay=False)],
+    kind: Annotated[str, typer.Option(help="checkerboard or charuco.")] = "checkerboard",
+    squares: Annotated[str, typer.Option(help="COLUMNSxROWS, counted in squares.")] = "9x6",
+    square_mm: Annotated[float, typer.Option(help="Side of a square.")] = 25.0,
+    json_out: Json = False,
+) -> None:
+    """Write a calibration board at true scale, with a ruler to check the print."""
+    from calibration.board import board_from_document, write_board, write_board_pdf
+
+    columns, _, rows = squares.partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise typer.BadParameter(f"{squares!r} is not like 9x6", param_hint="--squares")
+    document = {"kind": kind, "columns": int(columns), "rows": int(rows), "square_mm": square_mm}
+    chosen = board_from_document(document, "board")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_board_pdf(chosen, out)
+    write_board(chosen, out.with_name("board.toml"))
+    written = {"pdf": str(out), "board": str(out.with_name("board.toml"))}
+    answer(written, json_out, list(written.values()))
+
+
+@app.command(epilog="Example: eigenhead calibrate shots --board board.toml --out cameras.json")
+def calibrate(
+    images: Annotated[Path, typer.Argument(help="IMAGES/<camera>/<shot>.<ext>; same shot name, same moment.")],
+    board: Annotated[Path, typer.Option(help="The board.toml.", exists=True, dir_okay=False)],
+    out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
+    front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
+    previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
+    json_out: Json = False,
+) -> None:
+    """Calibrate a rig from pictures of a board."""
+    from calibration.board import read_board
+    from calibration.calibrate import CalibrationRefused, write_calibration
+    from calibration.calibrate import calibrate as run
+    from calibration.report import write_report
+    from rig.layout import read_rig
+
+    known = None if previous is None else read_rig(previous)
+    page = out.with_suffix(".html")
+    try:
+        with progress_bar() as report:
+            found = run(images, read_board(board), front=front, previous=known, report=report)
+    except CalibrationRefused as refusal:
+        if refusal.calibration is not None:
+            write_report(refusal.calibration, page)
+        raise
+    write_calibration(found, out)
+    write_report(found, page)
+    figures = found.figures()
+    cameras = [f"{name}  {figure['rms_px']:.3f} px" for name, figure in figures["cameras"].items()]
+    total = f"{figures['rms_px']:.3f} px over {figures['used_share']:.1%} of the corners"
+    answer(found.document(), json_out, [str(out), str(page), *cameras, total, *found.warnings])
+
+
+@app.command(epilog="Example: eigenhead refine shots/anna shots/ben shots/cleo shots/dora --out cameras.json")
+def refine(
+    captures: Annotated[list[Path], typer.Argument(help="Capture folders or archives, better 5 or more.", exists=True)],
+    out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Start from this cameras.json, not from the captures' own.", exists=True)
+    ] = None,
+    focal: Annotated[bool, typer.Option(help="Refine focal lengths too.")] = False,
+    model: Annotated[str | None, typer.Option(help="A head model whose rims speak as well: a name or file.")] = None,
+    json_out: Json = False,
+) -> None:
+    """Refine a calibration by the silhouettes of several captures; kept only if each agrees with the others."""
+    from calibration.refinement_report import refinement_page
+    from rig.files import write_atomically
+    from rig.layout import write_rig
+    from server.refine import refine_locally
+
+    page = out.with_suffix(".html")
+    with progress_bar() as report:
+        run = refine_locally(captures, calibration=calibration, focal=focal, model=model, report=report)
+    write_rig(run.refinement.rig, out)
+    write_atomically(page, refinement_page(run).encode())
+    verdict = "refined" if run.refinement.kept else "not changed"
+    cameras = [f"{name}  {px:.2f} px at the subject" for name, px in run.refinement.change_px.items()]
+    answer(run.document(), json_out, [f"{out}  {verdict}: {run.refinement.reason}", str(page), *cameras, *run.warnings])
+
+
+@app.command(epilog="Example: eigenhead convert cameras.json --to colmap --out sparse/0")
+def convert(
+    source: Annotated[Path, typer.Argument(help="A rig's file, or a folder that holds one.", exists=True)],
+    out: Annotated[Path, typer.Option(help="The file to write; for COLMAP the folder.")],
+    to: Annotated[str, typer.Option(help="eigenhead, colmap, colmap-text, caliscope or aniposelib.")] = "eigenhead",
+    json_out: Json = False,
+) -> None:
+    """Turn a calibration into another program's format, or another program's into ours."""
+    from rig.errors import InputError
+    from rig.layout_files import find_rig_file, read_rig_file, write_rig_file
+
+    file = find_rig_file(source) if source.is_dir() else source
+    if file is None:
+        raise InputError(str(source), ["holds no cameras.json, COLMAP model, camera_array.toml or aniposelib file"])
+    rig = read_rig_file(file)
+    write_rig_file(rig, out, to)
+    answer({"out": str(out), "cameras": list(rig.names)}, json_out, [f"{out}  {len(rig)} cameras"])

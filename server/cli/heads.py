@@ -1,0 +1,154 @@
+"""Commands that make heads: reconstruct, simulate, demo, experiments."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from server.cli.answers import Json, answer, progress_bar
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+@app.command(epilog="Example: eigenhead reconstruct shots/anna.tar.gz --out heads/anna --method contour")
+def reconstruct(
+    capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
+    out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
+    method: Annotated[str | None, typer.Option(help="contour or simplex.")] = None,
+    model: Annotated[str | None, typer.Option(help="A model's name or file.")] = None,
+    front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
+    detail: Annotated[str | None, typer.Option(help="span, kernel or photo.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
+    json_out: Json = False,
+) -> None:
+    """Reconstruct one capture without the service."""
+    from server.local import reconstruct_locally, settings_document
+
+    document = settings_document(settings, method=method, front=front, detail=detail)
+    with progress_bar() as report:
+        written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
+    answer(written, json_out, [f"{out / 'head.ply'}"])
+
+
+@app.command(
+    epilog="Example: eigenhead simulate shots/anna --seed 7 --fault bumped:cam03=0.5   "
+    "eigenhead simulate studio --serve --port 8700"
+)
+def simulate(
+    out: Annotated[
+        Path | None,
+        typer.Argument(help="The capture folder to write (--serve: the rig's); the truth goes to OUT.truth."),
+    ] = None,
+    subject: Annotated[str, typer.Option(help="random, mean, or a mesh file (head frame, mm).")] = "random",
+    seed: Annotated[int, typer.Option(help="Of subject, looks, pose and noise.", min=0)] = 0,
+    noise: Annotated[float | None, typer.Option(help="Sensor noise, share of full scale.", min=0, max=1)] = None,
+    light_drift: Annotated[float | None, typer.Option(help="From plate to shot, share.", min=0, max=1)] = None,
+    defocus: Annotated[float | None, typer.Option(help="Blur, pixels.", min=0)] = None,
+    rolling_ms: Annotated[float | None, typer.Option(help="Readout of a rolling shutter.", min=0, max=200)] = None,
+    hair: Annotated[bool, typer.Option(help="Give the subject hair.")] = True,
+    fault: Annotated[list[str] | None, typer.Option(help="KIND[:CAMERA][=AMOUNT]; may be repeated.")] = None,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
+    fps: Annotated[float, typer.Option(help="--serve: of the live views.", min=0.5, max=30)] = 4.0,
+    json_out: Json = False,
+) -> None:
+    """Take a capture with the simulated studio, and write the truth beside it; or serve the studio as real devices.
+
+    --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
+    given) with which the rig commands and the service work as with a real rig."""
+    from dataclasses import replace
+
+    from rig.render.renderer import Renderer
+    from rig.studio.preset import PRESET
+    from server.shoot import simulate_folder
+
+    chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
+    preset = replace(PRESET, hair=hair and PRESET.hair, **{k: v for k, v in chosen.items() if v is not None})
+    if serve:
+        _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
+                      faults=fault or [])  # fmt: skip
+        return
+    if out is None:
+        raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
+    with progress_bar() as report, Renderer.create() as renderer:
+        report("simulate", 0.0)
+        truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer)
+    answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
+    """Serves until Ctrl-C, which is how it ends well."""
+    from contextlib import ExitStack, suppress
+
+    from server.studio import OpenStudio, serve_studio
+
+    with ExitStack() as bar, suppress(KeyboardInterrupt):
+        report = bar.enter_context(progress_bar())
+
+        def ready(studio: OpenStudio) -> None:
+            bar.close()
+            answer(studio.document(), json_out, studio.lines())
+            sys.stdout.flush()
+
+        serve_studio(folder, ready=ready, report=report, **options)
+
+
+@app.command(epilog="Example: eigenhead demo --out out/demo")
+def demo(
+    out: Annotated[Path, typer.Option(help="Where the result goes.", file_okay=False)] = Path("out/demo"),
+    seed: Annotated[int, typer.Option(help="Subject and noise of the simulated studio.", min=0)] = 1,
+    json_out: Json = False,
+) -> None:
+    """The main job end to end: simulated rig, capture, service, head."""
+    from server.demo import run_demo
+
+    with progress_bar() as report:
+        done = run_demo(out, seed=seed, report=report)
+    error = done["error_mm"]
+    answer(
+        done,
+        json_out,
+        [
+            f"head           {done['ply']}",
+            f"contact sheet  {done['contact_sheet']}",
+            f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
+            *(
+                f"  {name:<12} {of['error_mm']['mean']:.2f} mm mean, {of['seconds']:.1f} s, {of['evaluations']} steps"
+                for name, of in done["methods"].items()
+            ),
+            f"time           {done['seconds']:.1f} s",
+        ],
+    )
+
+
+@app.command(epilog="Example: eigenhead experiments limit --subjects 3 --json")
+def experiments(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, posterior, "
+            "views, span or detail."
+        ),
+    ],
+    model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
+    subjects: Annotated[int | None, typer.Option(help="How many, instead of the experiment's own.", min=1)] = None,
+    simplex: Annotated[
+        int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
+    ] = None,
+    shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
+    out: Annotated[
+        Path | None, typer.Option(help="Keeps rows there, so that a stopped run goes on; and the table and pictures.")
+    ] = None,
+    json_out: Json = False,
+) -> None:
+    """Repeat the paper's experiments, and ours."""
+    from server.experiments import run_experiment
+
+    with progress_bar() as report:
+        found = run_experiment(
+            name, model=model, subjects=subjects, simplex=simplex, shared=shared, folder=out, report=report
+        )
+    answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])

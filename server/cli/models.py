@@ -1,0 +1,103 @@
+"""Commands about head models: model list, info, import, build, fetch, show."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from server.cli.answers import Json, answer, progress_bar
+
+model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_mode=None)
+
+
+@model_app.command("list", epilog="Example: eigenhead model list")
+def model_list(json_out: Json = False) -> None:
+    """List the head models at hand."""
+    from pipeline.eigenheads.model import list_models
+
+    found = {name: str(path) for name, path in list_models().items()}
+    answer({"models": found}, json_out, [f"{name}  {path}" for name, path in found.items()])
+
+
+@model_app.command("info", epilog="Example: eigenhead model info --json")
+def model_info(
+    name: Annotated[str, typer.Argument(help="A model's name or file.")] = "default", json_out: Json = False
+) -> None:
+    """Say what a head model is made of."""
+    from pipeline.eigenheads.info import model_info as describe
+    from pipeline.eigenheads.model import load_model
+
+    document = describe(load_model(name))
+    answer(document, json_out, [f"{key:<18} {value}" for key, value in document.items() if key != "figures"])
+
+
+@model_app.command("import", epilog="Example: eigenhead model import ICT-FaceKit --name ict")
+def model_import(
+    source: Annotated[Path, typer.Argument(help="ICT-FaceKit, statismo or Basel HDF5, or npz.", exists=True)],
+    name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
+    json_out: Json = False,
+) -> None:
+    """Make a foreign head model one of ours."""
+    from pipeline.eigenheads.imports import import_model
+    from pipeline.eigenheads.model import models_folder, save_model
+
+    with progress_bar() as report:
+        parts = import_model(source, name=name, report=report)
+        path = models_folder() / f"{parts.name}.npz"
+        save_model(path, parts)
+    answer({"name": parts.name, "file": str(path)}, json_out, [f"{parts.name}  {path}"])
+
+
+@model_app.command("build", epilog="Example: eigenhead model build scans --out model.npz")
+def model_build(
+    scans: Annotated[Path, typer.Argument(help="A folder of PLY, OBJ or GLB scans and their landmarks.", exists=True)],
+    out: Annotated[Path, typer.Option(help="The model file to write.", dir_okay=False)],
+    name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
+    skip_bad: Annotated[bool, typer.Option(help="Leave out scans that cannot be used, instead of stopping.")] = False,
+    json_out: Json = False,
+) -> None:
+    """Build a head model from raw scans (section 3.2)."""
+    from pipeline.eigenheads.build import build_model
+
+    with progress_bar() as report:
+        built = build_model(scans, out, name=name or out.stem, on_bad="skip" if skip_bad else "stop", report=report)
+    document = {
+        "file": str(out),
+        "used": list(built.used),
+        "repaired": {scan: list(words) for scan, words in built.repaired.items()},
+        "skipped": dict(built.skipped),
+    }
+    told = [f"repaired {scan}: {'; '.join(words)}" for scan, words in built.repaired.items()]
+    told += [f"left out {scan}: {why}" for scan, why in built.skipped.items()]
+    answer(document, json_out, [*told, f"{out}  from {len(built.used)} scans"])
+
+
+@model_app.command("fetch", epilog="Example: eigenhead model fetch ict-facekit")
+def model_fetch(
+    name: Annotated[str, typer.Argument(help="ict-facekit.")],
+    source: Annotated[str | None, typer.Option(help="Another address or folder to take it from.")] = None,
+    json_out: Json = False,
+) -> None:
+    """Fetch a published head model, show its licence, and make it one of ours."""
+    from pipeline.eigenheads.fetch import fetch_model
+
+    with progress_bar() as report:
+        fetched = fetch_model(name, source=source, report=report)
+    document = {"name": name, "file": str(fetched.path), "commit": fetched.commit, "licence": fetched.licence_text}
+    answer(document, json_out, [fetched.licence_text, f"{name}  {fetched.path}"])
+
+
+@model_app.command("show", epilog="Example: eigenhead model show default --out out/model")
+def model_show(
+    name: Annotated[str, typer.Argument(help="A model's name or file.")] = "default",
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.", file_okay=False)] = Path("out/model"),
+    modes: Annotated[int, typer.Option(help="How many modes to draw.", min=1)] = 5,
+    json_out: Json = False,
+) -> None:
+    """Draw a model's modes, a correspondence, and how compact, general and specific it is (figures 2 and 3)."""
+    from pipeline.eigenheads.model import load_model
+    from pipeline.eigenheads.show import show_model
+
+    with progress_bar() as report:
+        drawn = [str(path) for path in show_model(load_model(name), out, modes=modes, report=report)]
+    answer({"pictures": drawn}, json_out, drawn)

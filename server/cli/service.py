@@ -1,0 +1,106 @@
+"""Commands that run the service and look after it: serve, worker, doctor, keys."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from server.cli.answers import Data, Json, answer, service_settings
+
+app = typer.Typer(rich_markup_mode=None)
+keys_app = typer.Typer(help="API keys of the service.", no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.command(epilog="Example: eigenhead serve --data /srv/eigenhead --port 8600")
+def serve(
+    data: Data = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="0 takes a free one.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig.toml of real cameras; without it the simulated studio.")] = None,
+    worker: Annotated[bool, typer.Option(help="Run a worker beside the service.")] = True,
+    console: Annotated[bool | None, typer.Option(help="Serve the operator's pages.")] = None,
+) -> None:
+    """Run the service, and a worker beside it."""
+    from server.log import set_up
+    from server.serve import run_service
+
+    settings = service_settings(data=data, host=host, port=port, rig=rig, console=console)
+    set_up(settings.log_json)
+    run_service(settings, worker=worker, ready=lambda url: print(f"eigenhead listens on {url}", file=sys.stderr))
+
+
+@app.command(epilog="Example: EIGENHEAD_DATABASE_URL=postgresql://db/eigenhead eigenhead worker --data /mnt/heads")
+def worker(
+    data: Data = None,
+    queue: Annotated[str | None, typer.Option(help="The queue to serve.")] = None,
+    concurrency: Annotated[int | None, typer.Option(help="Jobs at once.", min=1)] = None,
+    until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
+) -> None:
+    """Run a worker that takes jobs from the service's queue."""
+    from server.log import set_up
+    from server.worker import run_worker
+
+    settings = service_settings(data=data, queue=queue, concurrency=concurrency)
+    set_up(settings.log_json)
+    run_worker(settings, until_eof=until_eof)
+
+
+@app.command(epilog="Example: eigenhead doctor")
+def doctor(data: Data = None, json_out: Json = False) -> None:
+    """Say what is wrong with this machine, and what to do."""
+    from server.doctor import examine
+
+    findings = examine(service_settings(data=data))
+    width = max(len(name) for name in findings)
+    lines = [f"{'ok   ' if f['ok'] else 'WRONG'}  {name:<{width}}  {f['detail']}" for name, f in findings.items()]
+    answer(findings, json_out, lines)
+    if not all(finding["ok"] for finding in findings.values()):
+        sys.exit(1)
+
+
+@keys_app.command("add", epilog="Example: eigenhead keys add console --scope read --scope capture --scope submit")
+def keys_add(
+    name: str,
+    scope: Annotated[list[str], typer.Option(help="read, capture, submit or admin; may be repeated.")] = ["admin"],  # noqa: B006
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Make an API key; it is shown this once."""
+    from server.access import SCOPES
+
+    unknown = set(scope) - set(SCOPES)
+    if unknown:
+        raise typer.BadParameter(f"{', '.join(sorted(unknown))}: there are {', '.join(SCOPES)}", param_hint="--scope")
+    with _keys(data) as keys:
+        key = keys.add(name, tuple(scope))
+    answer({"id": key.split("_")[1], "key": key}, json_out, [key])
+
+
+@keys_app.command("list", epilog="Example: eigenhead keys list")
+def keys_list(data: Data = None, json_out: Json = False) -> None:
+    """List the API keys, without their secrets."""
+    with _keys(data) as keys:
+        found = keys.all()
+    answer({"keys": found}, json_out, [f"{key['id']}  {key['name']}  {' '.join(key['scopes'])}" for key in found])
+
+
+@keys_app.command("remove", epilog="Example: eigenhead keys remove 3f2a90b1c4d5")
+def keys_remove(key_id: str, data: Data = None) -> None:
+    """Revoke an API key."""
+    with _keys(data) as keys:
+        keys.remove(key_id)
+
+
+@contextmanager
+def _keys(data: Path | None) -> Iterator[Any]:
+    from server.access import Keys
+    from server.database import open_database
+
+    engine = open_database(service_settings(data=data))
+    try:
+        yield Keys(engine)
+    finally:
+        engine.dispose()
