@@ -11,7 +11,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -109,9 +109,8 @@ def board_shots(
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[Fault, ...]]]:
     """`eigenhead rig board`: shots of a calibration board into ``out/<camera>/<shot>.png``, for `eigenhead calibrate`.
 
-    Needs no calibration and no clean plates. Yields, for each shot, its name, the cameras whose pictures were written,
-    and the faults, without those of views that the board itself hides; waits ``pause_s`` before each, for the board to
-    be moved. Names go on after those that are there. Raises ShotFailed where no camera delivers.
+    Yields, for each shot, its name, the cameras whose pictures were written, and the faults; waits ``pause_s`` before
+    each, for the board to be moved. Names go on after those that are there. Raises ShotFailed where no camera delivers.
     """
     taken = {path.stem for path in out.glob("*/*.png")}
     names = (name for name in map("shot{:03}".format, itertools.count()) if name not in taken)
@@ -119,15 +118,24 @@ def board_shots(
         session.warm_up()
         for name in itertools.islice(names, count):
             time.sleep(pause_s)
-            shot = session.shoot()
-            faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
-            spoilt = {fault.camera for fault in faults if fault.is_error}
-            good = () if None in spoilt else tuple(camera for camera in shot.images if camera not in spoilt)
-            if not good:
-                raise ShotFailed(faults)
-            for camera in good:
-                write_image(out / camera / f"{name}.png", shot.images[camera])
-            yield name, good, faults
+            shot = board_shot(session)
+            for camera, image in shot.images.items():
+                write_image(out / camera / f"{name}.png", image)
+            yield name, tuple(shot.images), shot.faults
+
+
+def board_shot(session: RigSession) -> Shot:
+    """One shot of a calibration board, with a session that is open and warm: needs no calibration and no clean plates.
+
+    Holds the pictures of the cameras that deliver, and the faults without those of views that the board itself hides.
+    Raises ShotFailed where no camera delivers."""
+    shot = session.shoot()
+    faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
+    spoilt = {fault.camera for fault in faults if fault.is_error}
+    images = {} if None in spoilt else {name: image for name, image in shot.images.items() if name not in spoilt}
+    if not images:
+        raise ShotFailed(faults)
+    return replace(shot, images=images, faults=faults)
 
 
 def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:

@@ -44,6 +44,29 @@ def ingest_folder(bench: Bench, report: Report, *, folder: str, image_pixels: in
     return check_capture(Path(folder), image_pixels, report)
 
 
+def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> dict[str, Any]:
+    """A shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
+    root = Path(folder)
+    for entry in root.iterdir():
+        if entry.name != "images":
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    files = sorted((root / "images").iterdir())
+    sizes = {}
+    for path in files:
+        with Image.open(path, formats=IMAGE_FORMATS) as header:
+            sizes[path.stem] = header.size
+    huge = [f"{name} is {w} x {h} pixels" for name, (w, h) in sizes.items() if w * h > image_pixels]
+    if huge:
+        raise InputError("capture", [f"{fault}; at most {image_pixels:,} are accepted" for fault in huge])
+    return {
+        "board": True,
+        "cameras": [{"name": name, "width": width, "height": height} for name, (width, height) in sizes.items()],
+        "front": files[0].stem,
+        "inputs": {path.relative_to(root).as_posix(): _sha256(path) for path in files},
+        "bytes": sum(path.stat().st_size for path in files),
+    }
+
+
 def check_capture(root: Path, image_pixels: int, report: Report) -> dict[str, Any]:
     rig_file = find_rig_file(root)
     if rig_file is None:

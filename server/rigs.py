@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from rig.capture import Capture, write_capture
+from rig.capture import Capture, write_capture, write_image
 from rig.config import RigConfig, read_rig_config
 from rig.errors import EigenheadError, InputError
 from rig.layout import Rig, read_rig, write_rig
+from rig.operate import board_shot
 from rig.plates import link_plates
 from rig.session import RigSession
 from rig.shot import ShotFailed
@@ -38,8 +39,10 @@ class RigBackend(Protocol):
         """id, kind, ready, cameras, faults, calibration."""
         ...
 
-    def capture(self, folder: Path, *, seed: int | None) -> dict[str, Any]:
-        """Takes a shot into ``folder/files``; returns its certificate. Raises a 503 problem naming what is missing."""
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+        """Takes a shot into ``folder/files``; returns its certificate. Raises a 503 problem naming what is missing.
+
+        ``board``: of the calibration board, for which a rig needs no calibration and not every camera."""
         ...
 
     def look(self) -> Mapping[str, ImageRgb]:
@@ -75,7 +78,8 @@ class SimulatedRig:
         calibrated = "own" if self._calibration.is_file() else "studio"
         return _state("simulated", "simulated", cameras, [], calibrated)
 
-    def capture(self, folder: Path, *, seed: int | None) -> dict[str, Any]:
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+        """The studio has no board to show: its pictures are of a person all the same."""
         with self._one_at_a_time:
             try:
                 shot = self._child.run("server.shoot:simulated", {"folder": str(folder), "seed": seed})
@@ -143,12 +147,15 @@ class RealRig:
             faults.append("no calibration: calibrate the rig and put the calibration to use")
         return _state(self._config.name, "real", cameras, faults, None if rig is None else "own")
 
-    def capture(self, folder: Path, *, seed: int | None) -> dict[str, Any]:
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
         if seed is not None:
             raise InputError("request", ["seed: only the simulated studio takes one"])
+        if board:
+            return self._board_shot(folder)
         rig = self._calibrated()
         if rig is None:
-            raise Problem(503, "not-calibrated", "The rig has no calibration: make one, then PUT it to use.")
+            detail = "The rig has no calibration: take shots of the board, make one of them, then PUT it to use."
+            raise Problem(503, "not-calibrated", detail)
         with self._lock:
             session = self._opened()
             shot = session.shoot()
@@ -158,6 +165,17 @@ class RealRig:
             images = {name: image for name, image in shot.images.items() if name in rig}
             write_capture(folder / "files", Capture(images), rig)
             link_plates(session.plates, folder / "files" / "background")
+        return shot.document()
+
+    def _board_shot(self, folder: Path) -> dict[str, Any]:
+        with self._lock:
+            try:
+                shot = board_shot(self._opened())
+            except ShotFailed as error:
+                faults = [str(fault) for fault in error.faults]
+                raise Problem(503, "shot-failed", f"No picture of the board: {'; '.join(faults)}", faults) from error
+        for name, image in shot.images.items():
+            write_image(folder / "files" / "images" / f"{name}.png", image)
         return shot.document()
 
     def look(self) -> Mapping[str, ImageRgb]:

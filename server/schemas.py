@@ -25,6 +25,7 @@ class NewCapture(Received):
     label: Text = ""
     expression: Text = ""
     seed: int | None = Field(None, ge=0, lt=2**31, description="subject and noise of the simulated studio")
+    board: bool = Field(False, description="of the calibration board: needs no calibration, cannot be reconstructed")
 
 
 class SessionEdit(Received):
@@ -93,6 +94,7 @@ class CaptureOut(BaseModel):
     cameras: list[Size]
     front: str
     features: bool
+    board: bool = Field(False, description="pictures of the calibration board, which cannot be reconstructed")
     bytes: int
     inputs: dict[str, str] = Field(description="sha256 of every file, by name")
     shot: dict[str, Any] | None = Field(None, description="the rig's sync certificate")

@@ -242,8 +242,8 @@ class StudioDevices:
         """Develops what the cameras see now, with the lamps on and off, before anybody looks."""
         with ThreadPoolExecutor(2) as pool:
             films = [film for films in pool.map(self._films_of, self.names) for film in films.items()]
-        # The empty studio comes back with every subject that leaves: its films are kept.
-        self._films = {look: film for look, film in self._films.items() if look.seated != self.present} | dict(films)
+        # The empty studio comes back with every subject that leaves: its films are kept, theirs are not.
+        self._films = {look: film for look, film in self._films.items() if not look.seated} | dict(films)
         for name in self.names:
             self.streams.show(name, self._films[self._look(name)])
 

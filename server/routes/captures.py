@@ -44,16 +44,18 @@ FIELDS = ("session", "label", "expression")
 
 @router.post("/captures", status_code=201, responses=documented(400, 404, 413, 415, 507))
 def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response: Response) -> CaptureOut:
-    """Triggers the rig now; answers once every camera delivered (201) or the fault is known (503)."""
+    """Triggers the rig now; answers once every camera delivered (201) or the fault is known (503).
+
+    ``board``: pictures of the calibration board, from the cameras that deliver, for ``POST /v1/calibrations``."""
     service.store.reserve(SHOT_BYTES, service.settings.free_bytes)
     if wanted.session is not None:
         service.store.session(wanted.session)
     with service.store.incoming() as folder:
         capture = folder / "capture"
-        shot = service.rig.capture(capture, seed=wanted.seed)
+        shot = service.rig.capture(capture, seed=wanted.seed, board=wanted.board)
         with service.children.one() as child:
             arguments = {"folder": str(capture / "files"), "image_pixels": service.settings.image_pixels}
-            content = child.run("server.ingest:ingest_folder", arguments)
+            content = child.run(f"server.ingest:ingest_{'board' if wanted.board else 'folder'}", arguments)
         record = service.add_capture(capture, "rig", content, wanted.model_dump(), shot)
     return _created(record, response)
 
@@ -76,6 +78,12 @@ async def accept_upload(service: Service, request: Request) -> tuple[dict[str, A
         check_about(about)
         record = await service.threads.check(service.accept_archive, archive, folder, about)
     return record, fields
+
+
+def refuse_board(record: dict[str, Any]) -> None:
+    """Raises a 409 problem for pictures of the calibration board, which show no head."""
+    if record.get("board"):
+        raise Problem(409, "board-shot", "The capture is of the calibration board; it can only be calibrated from.")
 
 
 def check_about(about: dict[str, Any]) -> None:
@@ -139,10 +147,10 @@ def get_background(service: ServiceOf, caller: Reader, request: Request, capture
     return _image(service, request, capture_id, "background", camera)
 
 
-@router.put("/captures/{capture_id}/features", responses=documented(400, 404, 413, 415, 507))
+@router.put("/captures/{capture_id}/features", responses=documented(400, 404, 409, 413, 415, 507))
 def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: NewFeatures) -> CaptureOut:
     """Stores feature points; 422 names every point that the capture cannot have. Jobs made from now on use them."""
-    service.store.capture(capture_id)
+    refuse_board(service.store.capture(capture_id))
     arguments = {
         "folder": str(service.store.folder("captures", capture_id) / "files"),
         "document": features.model_dump(),

@@ -13,6 +13,7 @@ from server.access import Caller, require
 from server.files import send_file
 from server.jobs import FINISHED
 from server.problems import Problem, documented, not_found
+from server.routes.captures import refuse_board
 from server.schemas import JobList, JobOut, NewJob, NewSessionJobs, Restart, State
 from server.service import Service, ServiceOf
 
@@ -47,6 +48,7 @@ def submit(
     queue: str | None = None,
     priority: int = 100,
 ) -> dict[str, Any]:
+    refuse_board(capture)
     if queue is not None and queue not in service.settings.queues:
         raise InputError("queue", [f"{queue!r:.40} is no queue; there are: {', '.join(service.settings.queues)}"])
     service.store.reserve(0, service.settings.free_bytes)
@@ -77,7 +79,7 @@ def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wante
     service.store.session(session_id)
     jobs = []
     for capture in service.store.captures():
-        if capture["session"] == session_id:
+        if capture["session"] == session_id and not capture.get("board"):
             request = checked_request(capture["id"], wanted.model, wanted.settings)
             jobs.append(submit(service, caller, capture, request, None, None, wanted.priority))
     return JobList.model_validate({"jobs": jobs})

@@ -1,6 +1,7 @@
 """Real cameras behind the HTTP interface: a service with a rig.toml, and eleven streams and a box that it opens."""
 
 import time
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from server.settings import ServiceSettings
 from tests.rig.test_session import flat_rig
 from tests.rig.textured_studio import NAMES, FlatStudio
 from tests.server.services import running_service
+from tests.shared_data import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
 
@@ -73,6 +75,73 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         assert client.post("/v1/captures", json={}).status_code == 201
         assert client.post("/v1/captures", json={"seed": 1}).status_code == 422
         assert len(client.get("/v1/captures").json()["captures"]) == 2
+
+
+class BoardPictures:
+    """An ImageSource: recordings of a calibration board, one shot at a time, with sensor noise of their own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.shot = folder, 0
+        self._noise = np.random.default_rng(0)
+
+    def __call__(self, camera: str, time_s: float) -> np.ndarray:
+        picture = cv2.imread(str(self.folder / camera / f"shot{self.shot:02}.jpg"))
+        assert picture is not None
+        noisy = picture[:, :, ::-1] + self._noise.standard_normal(picture.shape, np.float32)
+        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.timeout(600)
+def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> None:
+    """Four cameras that show the recorded board, shot by shot; the first shots lack a camera."""
+    board, names = BoardPictures(shared("data/multicam-board")), tuple(f"cam_{i}" for i in range(4))
+    (tmp_path / "studio").mkdir()
+    with (
+        StudioDevices(tmp_path / "studio", names, board, board) as studio,
+        running_service(tmp_path / "data", rig=str(studio.folder / "rig.toml")) as service,
+        httpx.Client(base_url=service.url, timeout=100) as client,
+    ):
+        state = client.get("/v1/rig").json()
+        assert (state["calibration"], state["ready"]) == (None, False)
+        assert client.post("/v1/rig/background").status_code == 200
+        refused = client.post("/v1/captures", json={})
+        assert refused.status_code == 503
+        assert refused.json()["type"].endswith("not-calibrated")
+        captures = []
+        for shot in range(26):
+            studio.seat(False)
+            board.shot = shot
+            studio.seat(True)
+            if shot == 0:
+                studio.inject(DeviceFault("hung", "cam_2"))
+            taken = client.post("/v1/captures", json={"label": "board", "board": True})
+            studio.clear()
+            assert taken.status_code == 201, taken.text
+            captures.append(taken.json())
+        assert [len(capture["cameras"]) for capture in captures] == [3, *[4] * 25]
+        assert captures[0]["board"]
+        of_board = captures[1]["id"]
+        assert client.post("/v1/jobs", json={"capture_id": of_board}).status_code == 409
+        assert client.put(f"/v1/captures/{of_board}/features", json={"points": {}}).status_code == 409
+        described = tomllib.loads((board.folder / "board.toml").read_text())
+        wanted = {"board": described, "captures": [capture["id"] for capture in captures]}
+        made = client.post("/v1/calibrations", json=wanted)
+        assert made.status_code == 202, made.text
+        done = made.json()
+        while done["state"] in ("queued", "running"):
+            time.sleep(0.5)
+            done = client.get(made.headers["location"]).json()
+        assert done["state"] == "succeeded", done["error"]
+        assert done["pictures"] == {"cam_0": 26, "cam_1": 26, "cam_2": 25, "cam_3": 26}
+        assert done["figures"]["rms_px"] <= 1.1
+        used = client.put("/v1/rig/calibration", json={"calibration_id": done["id"]}).json()
+        assert (used["calibration"], used["ready"]) == ("own", True)
+        studio.seat(False)
+        board.shot = 0  # as on the clean plates
+        studio.seat(True)
+        capture = client.post("/v1/captures", json={})
+        assert capture.status_code == 201, capture.text
+        assert (len(capture.json()["cameras"]), capture.json()["board"]) == (4, False)
 
 
 def test_the_live_view_takes_all_pictures_in_one_look(studio: StudioDevices, tmp_path: Path) -> None:

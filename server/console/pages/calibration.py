@@ -89,9 +89,7 @@ def shoot(page: Page, event: dict[str, Any]) -> str:
 
     board, service = board_of(event), page.service
     board_from_document(board)
-    record = take_capture(
-        service, page.caller, NewCapture(label=LABEL, session=None, expression="", seed=None), Response()
-    )
+    record = take_capture(service, page.caller, NewCapture.model_validate({"label": LABEL, "board": True}), Response())
     files = service.store.folder("captures", record.id) / "files"
     with service.children.one() as child:
         found = child.run("server.console.coverage:" + detect_shot.__name__, {"files": str(files), "board": board})

@@ -27,9 +27,11 @@ export default {
       <header>
         <h1>Captures</h1><span class="lead">{{ state.loading ? 'Reading' : captures.length + (captures.length === 1 ? ' capture' : ' captures') }}</span>
         <template v-if="current">
-          <button class="b" :aria-pressed="outlines" @click="outlines = !outlines">Silhouettes</button>
-          <a class="b" :href="'/features/' + current.id">Pick features</a>
-          <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct', current.id, { method, model })">Reconstruct</button>
+          <template v-if="!current.board">
+            <button class="b" :aria-pressed="outlines" @click="outlines = !outlines">Silhouettes</button>
+            <a class="b" :href="'/features/' + current.id">Pick features</a>
+            <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct', current.id, { method, model })">Reconstruct</button>
+          </template>
           <button class="b" id="remove" :disabled="!!busy" @click="act('remove', current.id)">Remove</button>
         </template>
       </header>
@@ -80,12 +82,12 @@ export default {
           <div v-if="current && large === null" class="thumbs four">
             <button v-for="(camera, i) in current.cameras" :key="current.id + camera" class="thumb" style="padding: 0; border: 0; cursor: zoom-in" :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }" :aria-label="'Enlarge ' + camera" @click="large = i">
               <img :src="address(camera, '.jpg')" :alt="'Picture of ' + camera" loading="lazy">
-              <img v-if="outlines" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
+              <img v-if="outlines && !current.board" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
               <span>{{ camera }}{{ camera === current.front ? ' · front' : '' }}</span></button>
           </div>
           <div v-else-if="current" style="height: 100%; display: grid; grid-template-rows: auto minmax(0, 1fr); gap: .6rem">
             <div class="line"><strong>{{ current.cameras[large] }}</strong><span class="push group"><button class="b" @click="step(-1)" aria-label="Previous camera">&larr;</button><button class="b" @click="step(1)" aria-label="Next camera">&rarr;</button></span><button class="b" @click="large = null">All cameras <kbd>Esc</kbd></button></div>
-            <div class="thumb" style="aspect-ratio: auto"><img :src="address(current.cameras[large], '.image')" :alt="'Picture of ' + current.cameras[large]"><img v-if="outlines" :src="address(current.cameras[large], '.silhouette.png')" alt=""></div>
+            <div class="thumb" style="aspect-ratio: auto"><img :src="address(current.cameras[large], '.image')" :alt="'Picture of ' + current.cameras[large]"><img v-if="outlines && !current.board" :src="address(current.cameras[large], '.silhouette.png')" alt=""></div>
           </div>
         </div>
       </div>

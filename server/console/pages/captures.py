@@ -36,7 +36,7 @@ def captures_state(service: Service) -> dict[str, Any]:
     for record in service.store.captures():
         about = {key: record[key] for key in ("id", "created", "source", "label", "expression", "front", "features")}
         about |= {"cameras": [camera["name"] for camera in record["cameras"]], "bytes": record["bytes"]}
-        about |= {"session": record["session"], "job": jobs.get(record["id"])}
+        about |= {"session": record["session"], "job": jobs.get(record["id"]), "board": record.get("board", False)}
         captures.append(about | {"size": record["cameras"][0], "removed": record["id"] in waiting})
         if len(captures) == SHOWN:
             break

@@ -29,7 +29,9 @@ class FeaturesPage(Page, component="features.js"):
 
     def look(self) -> dict[str, Any]:
         captures = [
-            {key: c[key] for key in ("id", "label", "created", "features")} for c in self.service.store.captures()
+            {key: c[key] for key in ("id", "label", "created", "features")}
+            for c in self.service.store.captures()
+            if not c.get("board")
         ]
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         if chosen is None or all(capture["id"] != chosen for capture in captures):

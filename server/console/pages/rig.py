@@ -81,7 +81,7 @@ def read_report(service: Service, job_id: str) -> dict[str, Any]:
 
 def capture(page: Page, event: dict[str, Any]) -> str:
     about = {name: event.get(name) or "" for name in ("label", "expression")}
-    wanted = NewCapture(**about, session=event.get("session") or None, seed=None)
+    wanted = NewCapture.model_validate({**about, "session": event.get("session") or None})
     record = take_capture(page.service, page.caller, wanted, Response())
     return f"Captured {len(record.cameras)} pictures. They are on the page Captures."
 
