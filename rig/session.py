@@ -10,7 +10,7 @@ fails is a named fault of the shot; an exception is for what is no shot at all (
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,6 +34,7 @@ MakeDriver = Callable[[CameraConfig, Path], Driver]
 _LIVE_WAIT_PERIODS = 3.0  # how long a camera that runs by itself may take for its next frame
 _ARM_TO_FIRE_S = 0.02  # for the live view's frame that is under way
 _CLOSE_S = 3.0
+_SILENT_S = 10.0  # a camera that gave a look nothing holds up no other look for so long
 _DIAGNOSIS_S = 1.0  # to look at pictures when nothing could be fired
 
 
@@ -57,6 +58,7 @@ class RigSession:
         self._box: TriggerBox | None = None
         self._box_error: TriggerError | None = None
         self._last_seen: dict[str, Frame] = {}  # for what stands still
+        self._silent_until_s: dict[str, float] = {}
         self._busy = threading.Lock()
         for camera in config.cameras:
             try:
@@ -119,11 +121,12 @@ class RigSession:
                 feed.wait_frames(self.config.shot.warm_up_frames, deadline_s)
             self._look(deadline_s + self.config.shot.timeout_s)
 
-    def look(self) -> Mapping[str, ImageRgb]:
-        """A picture of each camera that has one, of no particular moment."""
+    def look(self, only: Collection[str] | None = None) -> Mapping[str, ImageRgb]:
+        """A picture of each camera (``only``: of these, which alone are waited for) that has one, of no particular
+        moment."""
         with self._busy:
             self._lights_on()
-            frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s)
+            frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s, only)
             return {name: frame.image for name, frame in frames.items()}
 
     def shoot(self) -> Shot:
@@ -141,6 +144,7 @@ class RigSession:
         """Takes the clean plates of the empty studio and keeps them. Raises ShotFailed, the old plates then stay."""
         with self._busy:
             self._lights_on()
+            self._silent_until_s.clear()
             taken: dict[str, list[ImageRgb]] = {name: [] for name in self.config.names}
             for _ in range(self.config.shot.plates):
                 frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s)
@@ -209,21 +213,29 @@ class RigSession:
             if frame is not None:
                 self._last_seen[name] = frame
 
-    def _look(self, deadline_s: float) -> dict[str, Frame]:
-        """The next frame of every camera; those that wait for a trigger get one when no live view comes."""
+    def _look(self, deadline_s: float, only: Collection[str] | None = None) -> dict[str, Frame]:
+        """The next frame of every camera; those that wait for a trigger get one when no live view comes.
+
+        One that gave nothing the last time is not waited for again until ``_SILENT_S`` have passed; what it sends while
+        others are waited for is taken."""
         now_s = time.monotonic()
-        for feed in self._feeds.values():
+        feeds = {name: feed for name, feed in self._feeds.items() if only is None or name in only}
+        for feed in feeds.values():
             feed.want(now_s)
             feed.due(now_s)
             feed.trigger()
-        half_s = now_s + (deadline_s - now_s) / 4
-        frames = {name: feed.collect(now_s, half_s) for name, feed in self._feeds.items()}
-        missing = [name for name, frame in frames.items() if frame is None and self._feeds[name].state().opened]
-        if any(self._feeds[name].camera.trigger == "external" for name in missing) and self._fire() is not None:
-            frames |= {name: self._feeds[name].collect(now_s, deadline_s) for name in missing}
-        for feed in self._feeds.values():
+        awaited = [name for name in feeds if self._silent_until_s.get(name, 0.0) <= now_s]
+        early_s = now_s + (deadline_s - now_s) / 4
+        missing = [n for n in awaited if feeds[n].collect(now_s, early_s) is None and feeds[n].state().opened]
+        if any(feeds[name].camera.trigger == "external" for name in missing) and self._fire() is not None:
+            for name in missing:
+                feeds[name].collect(now_s, deadline_s)
+        frames = {name: feed.collect(now_s, 0.0) for name, feed in feeds.items()}
+        for feed in feeds.values():
             feed.unwant()
         found = {name: frame for name, frame in frames.items() if frame is not None}
+        silent = {name: time.monotonic() + _SILENT_S for name in awaited if name not in found}
+        self._silent_until_s = {n: s for n, s in self._silent_until_s.items() if n not in found} | silent
         self._last_seen |= found
         return found
 

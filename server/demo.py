@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from pipeline.overlays import PANEL
+from rig.capture import write_image
 from rig.errors import EigenheadError
 from server.client import Client, Unreachable
 from server.serve import listen
@@ -90,7 +91,7 @@ def side_by_side(found: dict[str, dict[str, Any]], target: Path) -> None:
         headings = ["input, and before the fit"] * len(both) + [told]
         for part, heading in zip([*both, sheet[:, 2 * PANEL[0] :]], headings, strict=True):
             columns.append(np.vstack([_strip(part.shape[1], heading), part.astype(np.uint8)]))
-    cv2.imwrite(str(target), np.hstack(columns))
+    write_image(target, np.hstack(columns)[:, :, ::-1])
 
 
 def _strip(width: int, text: str) -> np.ndarray:

@@ -185,7 +185,8 @@ class RealRig:
     def preview(self, camera: str) -> bytes:
         if camera not in self._config.names:
             raise Problem(404, "not-found", f"The rig has no camera {camera!r:.80}.")
-        image = self.look().get(camera)
+        with self._lock:
+            image = self._opened().look([camera]).get(camera)
         if image is None:
             raise Problem(503, "camera-missing", f"{camera} delivers no picture; GET /v1/rig says why.", [camera])
         return jpeg(image)

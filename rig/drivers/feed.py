@@ -17,6 +17,7 @@ from rig.drivers.base import Arrival, CameraLost, Driver, DriverError, Frame, Gr
 _SLICE_S = 0.2  # how long a grab may hold up closing
 _SOFTWARE_SLICE_S = 0.02  # and the command to a camera that is triggered by software
 _REOPEN_S = 1.0  # after a camera was lost
+_SLOWEST_S = 1.0  # between frames of a camera that runs by itself: what comes more rarely was released, one by one
 _KEPT = 32  # frames that wait to be collected: half a second at 60 a second
 
 
@@ -76,7 +77,7 @@ class CameraFeed:
                 self._opened,
                 self._count,
                 self._arrivals_s[-1] if self._arrivals_s else None,
-                median(gaps) if gaps else None,
+                median(gaps) if gaps and median(gaps) <= _SLOWEST_S else None,
                 None if self._error is None else str(self._error),
                 self._unmet,
             )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -53,6 +54,25 @@ def config(studio: StudioDevices) -> RigConfig:
         take_plates(config)
     studio.seat(True)
     return config
+
+
+def test_a_hung_camera_holds_up_one_look_and_no_other(studio: StudioDevices, config: RigConfig) -> None:
+    """A look at all of them waits for a frame, a tenth of a second here; one that waits for a hung camera takes twice
+    the shot's time-out, 4 s."""
+    with RigSession(config) as session:
+        session.warm_up()
+        studio.inject(DeviceFault("hung", "cam01"))
+        assert set(session.look(["cam00"])) == {"cam00"}
+        assert set(session.look()) == {"cam00", "cam02"}
+        began_s = time.monotonic()
+        for _ in range(3):
+            assert set(session.look()) == {"cam00", "cam02"}
+        assert session.look(["cam01"]) == {}
+        assert time.monotonic() - began_s < 2 * config.shot.timeout_s
+        studio.clear()
+        until_s = time.monotonic() + 20
+        while set(session.look()) != set(THREE):
+            assert time.monotonic() < until_s
 
 
 def test_capture_writes_a_folder_that_reads_back(config: RigConfig, tmp_path: Path) -> None:

@@ -56,14 +56,14 @@ def make_capture(service: RunningService, folder: Path) -> str:
     return response.json()["id"]
 
 
-def submit(service: RunningService, capture: str, number: int) -> str:
+def submit(service: RunningService, capture: str, number: int, settings: dict[str, Any] | None = None) -> str:
     """Until it is accepted, as a client does: the key makes it one job."""
     deadline = time.monotonic() + 60
     while True:
         try:
             response = httpx.post(
                 service.url + "/v1/jobs",
-                json={"capture_id": capture},
+                json={"capture_id": capture, "settings": settings},
                 headers={"Idempotency-Key": f"job {number}"},
                 timeout=10,
             )
@@ -112,6 +112,50 @@ def test_a_hundred_jobs_survive_thirty_kills(kind: str, tmp_path: Path) -> None:
         }
         assert heads == {undisturbed["head.ply"]["sha256"]}
         assert not [path for job in jobs for path in (service.data / "jobs" / job).glob("attempt-*")]
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.timeout(900)
+def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path) -> None:
+    """Five reconstructions of a simulated shot, four SIGKILLs into one that runs: every second one takes the service
+    too. report.json tells times of its own; every other file is the undisturbed one."""
+    rng = random.Random(4)
+    with (
+        running_service(tmp_path / "data", work="server.work:reconstruct_capture", silent_s="5") as service,
+        httpx.Client(base_url=service.url, timeout=120) as client,
+    ):
+        capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
+        settings = {"detail": "span"}
+        first = submit(service, capture, 0, settings)
+        undisturbed = files_of(await_state(client, first, ("succeeded", "failed"), 240))
+        assert {"head.ply", "head.glb", "contact_sheet.png"} <= undisturbed.keys()
+        jobs = [submit(service, capture, number, settings) for number in range(1, 6)]
+        for number in range(4):
+            await_running(client, jobs)
+            time.sleep(rng.uniform(0.2, 3.0))
+            if number % 2:
+                service.kill()
+            for pid in worker_pids(service):
+                os.kill(pid, signal.SIGKILL)
+            if number % 2:
+                service.start()
+        ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
+        assert [job["state"] for job in ended] == ["succeeded"] * 5
+        assert [files_of(job) for job in ended] == [undisturbed] * 5
+
+
+def files_of(job: dict[str, Any]) -> dict[str, str]:
+    """sha256 of a job's files, without what tells how long it took."""
+    return {name: file["sha256"] for name, file in job["files"].items() if name != "report.json"}
+
+
+def await_running(client: httpx.Client, jobs: list[str]) -> None:
+    """Until one of the jobs runs."""
+    deadline = time.monotonic() + 60
+    while all(client.get(f"/v1/jobs/{job}").json()["state"] != "running" for job in jobs):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @contextmanager
