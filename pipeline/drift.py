@@ -26,7 +26,7 @@ NOISE_FLOOR_PX = 0.4  # of one tangency: two contours of 0.25 px, never less how
 ROBUST_SIGMAS = 3.0
 EQUATIONS_LEAST = 5  # of a camera: two unknowns, and enough left over to judge them
 SIGMAS_LEAST, SHIFT_LEAST_PX = 6.0, 1.5  # docs/results.md: false alarms against misses
-GAIN_LEAST = 0.4  # share of the camera's own robust misfit that its shift must explain
+GAIN_LEAST = 0.4  # share of the camera's own robust misfit that its shift must explain, and of all but one of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,11 +171,11 @@ def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | Non
     others = [t.excess_px[0] for t in tangencies if name not in t.cameras]
     noise = max(NOISE_FLOOR_PX, 1.4826 * float(np.median(np.abs(others)))) if others else NOISE_FLOOR_PX
     shift, information = _robust_shift(rows, excess, noise)
-    before, after = _misfit(excess, noise), _misfit(excess - rows @ shift, noise)
+    before, after = _misfits(excess, noise), _misfits(excess - rows @ shift, noise)
     deviation = float(np.sqrt(np.trace(np.linalg.inv(information + 1e-9 * np.eye(2)))))
     size = float(np.linalg.norm(shift))
     sigmas = float(np.sqrt(shift @ information @ shift))
-    if sigmas < SIGMAS_LEAST or size < SHIFT_LEAST_PX or after > (1.0 - GAIN_LEAST) * before:
+    if sigmas < SIGMAS_LEAST or size < SHIFT_LEAST_PX or not _explains(before, after):
         return None
     turn = np.degrees(np.arctan(size / camera.intrinsics.fx))
     return Drift(name, shift, deviation, float(turn), sigmas)
@@ -210,6 +210,14 @@ def _robust_shift(rows: np.ndarray, excess: np.ndarray, noise: float) -> tuple[n
     return shift, information
 
 
-def _misfit(miss: np.ndarray, noise: float) -> float:
+def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -> bool:
+    """Whether the shift takes enough of the misfits away, and not of a single one alone: a bad stretch of one outline
+    is met by one tangent plane, a moved camera by all of its own."""
+    others = np.arange(len(before)) != np.argmax(before - after)
+    return all(after[k].sum() <= (1.0 - GAIN_LEAST) * before[k].sum() for k in (slice(None), others))
+
+
+def _misfits(miss: Float[np.ndarray, " n"], noise: float) -> Float[np.ndarray, " n"]:
+    """Robust misfit of each equation, 0 to 1."""
     scale = ROBUST_SIGMAS * noise
-    return float((miss**2 / (miss**2 + scale**2)).sum())
+    return miss**2 / (miss**2 + scale**2)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.drift import find_drift, find_tangencies
+from pipeline.drift import Tangency, _judge, find_drift, find_tangencies
 from pipeline.eigenheads.model import load_model
 from pipeline.silhouette import silhouette_from_mask
 from rig.geometry import RigidTransform, rotation_from_vector
@@ -57,3 +57,33 @@ def test_two_moved_cameras_are_both_named(seen):
     rig, silhouettes = seen
     moved = bumped(bumped(rig, "cam03", np.array([0.3, 0.0, 0.0])), "cam08", np.array([0.1, -0.25, 0.0]))
     assert {drift.camera for drift in find_drift(silhouettes, moved)} == {"cam03", "cam08"}
+
+
+# Normals and excess (px) of the planes that touched one camera's outline in a simulated photograph, whose mask lacked
+# hair where one of them does: only one other plane says anything of the same direction, and it says no.
+BAD_STRETCH = [
+    *((-0.76, 0.65, 5.98), (-0.74, -0.68, 0.85), (-0.15, 0.99, -0.09), (-0.17, -0.99, 1.49)),
+    *((-0.27, 0.96, 0.68), (-0.23, -0.97, 1.74), (0.07, 1.0, -1.6), (0.1, -1.0, 0.27)),
+]
+NOISE_PX = 0.54  # median of the other cameras' planes
+
+
+def planes(equations: list[tuple[float, float, float]]) -> list[Tangency]:
+    """Those of cam02, and some that it takes no part in."""
+    nowhere = np.zeros(2)
+    own = [
+        Tangency(("cam02", f"cam{k:02}"), (nowhere, nowhere), (1.0, 1.0), (np.array([x, y]), nowhere), (excess, 0.0))
+        for k, (x, y, excess) in enumerate(equations, 3)
+    ]
+    other = Tangency(("cam00", "cam01"), (nowhere, nowhere), (1.0, 1.0), (nowhere, nowhere), (NOISE_PX, -NOISE_PX))
+    return [*own, other]
+
+
+def test_a_bad_stretch_of_one_outline_is_no_moved_camera():
+    camera = default_layout()["cam02"]
+    assert _judge("cam02", planes(BAD_STRETCH), camera) is None
+    shift = np.array([-7.2, -0.7])
+    moved = [(x, y, x * shift[0] + y * shift[1]) for x, y, _ in BAD_STRETCH]
+    found = _judge("cam02", planes(moved), camera)
+    assert found is not None
+    np.testing.assert_allclose(found.shift_px, shift, atol=1e-3)
