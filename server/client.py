@@ -12,7 +12,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -108,15 +108,20 @@ class Client:
         return self.post("/v1/jobs", request, headers)
 
     def events(self, job_id: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        """(kind, document) of the job's events up to the end, across broken connections."""
+        """(kind, document) of the job's events up to the end, across broken connections. Raises Unreachable where no
+        connection comes about for ``patience_s``; how long a job is silent does not matter."""
         last, deadline = "0", time.monotonic() + self._patience_s
         while True:
             try:
-                for kind, identity, document in self._stream(job_id, last):
-                    last, deadline = identity, time.monotonic() + self._patience_s
-                    yield kind, document
-                    if kind == "end":
-                        return
+                with self._stream(job_id, last) as events:
+                    try:
+                        for kind, identity, document in events:
+                            last = identity
+                            yield kind, document
+                            if kind == "end":
+                                return
+                    finally:
+                        deadline = time.monotonic() + self._patience_s
             except httpx.TransportError as error:
                 if time.monotonic() > deadline:
                     raise Unreachable(self.url, error) from error
@@ -153,11 +158,15 @@ class Client:
         metadata = ",".join(f"{k} {base64.b64encode(v.encode()).decode()}" for k, v in about.items() if v)
         headers = TUS | {"Upload-Length": str(size)} | ({"Upload-Metadata": metadata} if metadata else {})
         location = self._request("POST", "/v1/uploads", headers=headers).headers["location"]
-        offset, capture = 0, None
+        offset, capture, deadline = 0, None, time.monotonic() + self._patience_s
         with archive.open("rb") as stream:
             while capture is None:
                 report("upload", offset / max(size, 1))
-                offset, capture = self._send_part(location, stream, offset)
+                before, (offset, capture) = offset, self._send_part(location, stream, offset)
+                if offset > before:
+                    deadline = time.monotonic() + self._patience_s
+                elif capture is None and time.monotonic() > deadline:
+                    raise ServiceError(503, "upload-stalled", f"The upload stands still at {offset:,} bytes.", [])
         return self.get(capture)
 
     def _send_part(self, location: str, stream: Any, offset: int) -> tuple[int, str | None]:
@@ -178,23 +187,18 @@ class Client:
         head = self._request("HEAD", location, headers=TUS)
         return int(head.headers["upload-offset"]), head.headers.get("location")
 
-    def _stream(self, job_id: str, last: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    @contextmanager
+    def _stream(self, job_id: str, last: str) -> Iterator[Iterator[tuple[str, str, dict[str, Any]]]]:
+        """The events of one connection that came about. Raises httpx.TransportError for one that did not."""
         headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
         timeout = httpx.Timeout(10.0, read=30.0)  # the service sends a comment every 15 s
         with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:
             if response.status_code in RETRY_STATUSES:
-                return
+                raise httpx.RemoteProtocolError(f"status {response.status_code}")
             if response.status_code >= 400:
                 response.read()
                 _raise_for(response)
-            fields: dict[str, str] = {}
-            for line in response.iter_lines():
-                if line:
-                    name, _, value = line.partition(":")
-                    fields[name] = value.strip()
-                elif "data" in fields:
-                    yield fields.get("event", ""), fields.get("id", last), json.loads(fields["data"])
-                    fields = {}
+            yield _events(response, last)
 
     def _request(self, method: str, path: str, *, repeat: bool = True, **options: Any) -> httpx.Response:
         deadline, wait = time.monotonic() + self._patience_s, 0.1
@@ -211,6 +215,17 @@ class Client:
                     return response
             time.sleep(wait)
             wait = min(2.0, wait * 2)
+
+
+def _events(response: httpx.Response, last: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    fields: dict[str, str] = {}
+    for line in response.iter_lines():
+        if line:
+            name, _, value = line.partition(":")
+            fields[name] = value.strip()
+        elif "data" in fields:
+            yield fields.get("event", ""), fields.get("id", last), json.loads(fields["data"])
+            fields = {}
 
 
 def _raise_for(response: httpx.Response) -> None:

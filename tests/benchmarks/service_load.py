@@ -3,6 +3,7 @@
     python -m tests.benchmarks.service_load soak [JOBS]      many small jobs: memory, descriptors, database size
     python -m tests.benchmarks.service_load clients [COUNT]  uploads at once: failures, seconds, lag of the event loop
     python -m tests.benchmarks.service_load workers [JOBS]   PostgreSQL: one pinned worker against two, by core
+    python -m tests.benchmarks.service_load heads [JOBS]     the same with reconstructions of a simulated shot
 
 ``soak`` and ``clients`` use small captures and the tests' tiny work: they measure the service, not the pipeline.
 ``workers`` burns real CPU.
@@ -112,24 +113,32 @@ def lag_p99_ms(metrics: str) -> float:
     return next(float(bound) * 1000 for bound, count in found if float(count) >= 0.99 * total)
 
 
-def workers(jobs: int, folder: Path) -> dict[str, Any]:
+def heads(jobs: int, folder: Path) -> dict[str, Any]:
+    """``workers`` with the pipeline; the silhouettes are found once, as for every capture."""
+    return workers(jobs, folder, work="server.work:reconstruct_capture")
+
+
+def workers(jobs: int, folder: Path, *, work: str = "tests.server.tiny:busy") -> dict[str, Any]:
     """Work that keeps a core busy; each worker is bound to a core of its own."""
-    times = {}
+    times, real = {}, work.startswith("server.")
     for count in (1, 2):
         with ExitStack() as stack:
             url = stack.enter_context(running_postgres())
-            settings = {"work": "tests.server.tiny:busy", "database_url": url}
             data = folder / f"data{count}"
-            service = stack.enter_context(running_service(data, worker=False, **settings))
-            client = stack.enter_context(httpx.Client(base_url=service.url, timeout=60))
-            capture = client.post("/v1/captures/uploads", files={"file": archive(folder, 24)}).json()["id"]
+            service = stack.enter_context(running_service(data, worker=False, work=work, database_url=url))
+            client = stack.enter_context(httpx.Client(base_url=service.url, timeout=120))
+            if real:
+                capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
+            else:
+                capture = client.post("/v1/captures/uploads", files={"file": archive(folder, 24)}).json()["id"]
+            request = {"capture_id": capture, "settings": {"detail": "span"}}
             for core in range(count):
                 stack.enter_context(pinned_worker(service, core))
-            warm = [client.post("/v1/jobs", json={"capture_id": capture}).json()["id"] for _ in range(2 * count)]
+            warm = [client.post("/v1/jobs", json=request).json()["id"] for _ in range(2 * count)]
             for job in warm:  # processes started, modules loaded
-                await_state(client, job, ("succeeded",), 120)
+                await_state(client, job, ("succeeded",), 240)
             began = time.monotonic()
-            submitted = [client.post("/v1/jobs", json={"capture_id": capture}).json()["id"] for _ in range(jobs)]
+            submitted = [client.post("/v1/jobs", json=request).json()["id"] for _ in range(jobs)]
             for job in submitted:
                 await_state(client, job, ("succeeded",), 600)
             times[count] = time.monotonic() - began
@@ -142,7 +151,8 @@ def workers(jobs: int, folder: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    measure, default = {"soak": (soak, 1000), "clients": (clients, 50), "workers": (workers, 20)}[sys.argv[1]]
+    known = {"soak": (soak, 1000), "clients": (clients, 50), "workers": (workers, 20), "heads": (heads, 10)}
+    measure, default = known[sys.argv[1]]
     count = int(sys.argv[2]) if len(sys.argv) > 2 else default
     with tempfile.TemporaryDirectory(prefix="eigenhead-load-") as folder:
         figures = measure(count, Path(folder))
