@@ -19,12 +19,12 @@ def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> 
     if not len(segments):
         return np.where(field > level, -np.inf, np.inf).astype(np.float32)
     above = (field > level).view(np.uint8)
-    whole = _chamfer(above)
+    whole = chamfer(above)
     _refine(whole, field, level, segments, BAND_PX)
     return whole
 
 
-def _chamfer(above: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def chamfer(above: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Signed distance from a mask; a transform ends at pixel centres, half a pixel beyond the contour."""
     inside = cv2.distanceTransform(above, cv2.DIST_L2, cv2.DIST_MASK_5)
     outside = cv2.distanceTransform(1 - above, cv2.DIST_L2, cv2.DIST_MASK_5)

@@ -12,10 +12,11 @@ from pipeline.fitting.fit import Fit
 from pipeline.fitting.rim import find_rim, make_topology, pack_views
 from pipeline.reconstruction import CameraFigures
 from pipeline.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
+from pipeline.zbuffer import depth_maps
 from rig.camera import Camera
 from rig.geometry import Similarity
 from rig.layout import Rig
-from rig.render.renderer import Renderer
+from rig.mesh import Mesh
 
 EXCLUDED_PX = 3.0  # a rim sample farther from the input than this is clutter or misfit, and hardly counts in the fit
 START_LEVEL = "p95"  # of the head before the fit, which is centimetres off: drawn in a third of the time
@@ -46,19 +47,30 @@ def camera_figures(
         here = rim.view == k
         length, residual = rim.length[here], rim.residual[here]
         observed, spoke = silhouettes[camera.name].mask, float(length.sum()) > 0
-        weights = boundary_weights(observed)
+        before, after = _costs(observed, started[camera.name], fitted[camera.name])
         return CameraFigures(
             used=fit.used.get(camera.name, False),
             iou=_overlap(observed, fitted[camera.name], _zone(camera, face)),
             contour_rms_px=float(np.sqrt((length @ residual**2) / length.sum())) if spoke else None,
             excluded_share=float(length[np.abs(residual) > EXCLUDED_PX].sum() / length.sum()) if spoke else None,
-            xor_cost=boundary_weighted_xor(observed, fitted[camera.name], weights),
-            xor_cost_start=boundary_weighted_xor(observed, started[camera.name], weights),
+            xor_cost=after,
+            xor_cost_start=before,
             samples=int(here.sum()),
         )
 
     with ThreadPoolExecutor(max_workers=2) as pool:  # distance transforms release the interpreter lock
         return dict(zip(rig.names, pool.map(figures_of, range(len(rig)), rig), strict=True))
+
+
+def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) -> list[float]:
+    """Eq. (5) of each model. Beyond the box around all of them nothing differs, and nothing there is nearest."""
+    everything = observed.copy()
+    for model in models:
+        everything |= model
+    left, top, width, height = cv2.boundingRect(everything.view(np.uint8))
+    box = slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
+    weights = boundary_weights(observed[box])
+    return [boundary_weighted_xor(observed[box], model[box], weights) for model in models]
 
 
 def _zone(camera: Camera, face_world: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "h w"]:
@@ -80,9 +92,8 @@ def _overlap(
     return float(np.count_nonzero(observed & fitted & zone) / union) if union else None
 
 
-def start_masks(
-    model: HeadModel, world_from_head: Similarity, rig: Rig, renderer: Renderer
-) -> dict[str, Bool[np.ndarray, "h w"]]:
+def start_masks(model: HeadModel, world_from_head: Similarity, rig: Rig) -> dict[str, Bool[np.ndarray, "h w"]]:
     """The mean head where the alignment put it, as each camera sees it."""
-    with renderer.silhouette_set(rig, model.levels[START_LEVEL].faces) as drawn:
-        return drawn.masks(world_from_head.apply(model.vertices(np.zeros(0), START_LEVEL)))
+    vertices = world_from_head.apply(model.vertices(np.zeros(0), START_LEVEL))
+    depths = depth_maps(rig, Mesh(vertices, model.levels[START_LEVEL].faces))
+    return {name: np.isfinite(depth) for name, depth in depths.items()}

@@ -3,7 +3,8 @@
     head.ply  head.glb  report.json  overlays/<camera>.png     fixed by the contract
     contact_sheet.png   input, silhouette difference before and after the fit (section 5.4), the head from new views
     turntable.png       the head from the right to the left profile
-    head.obj            on request
+    head.obj            on request (settings.outputs)
+    head_atlas.glb      on request: the head of head.glb with a texture that keeps the photographs' resolution
 
 Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
 """
@@ -16,22 +17,26 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.reconstruction import Reconstruction
 from pipeline.report import report_document
 from pipeline.settings import document_from_settings
+from pipeline.unwrap import Atlas
 from rig.capture import Capture, write_image
 from rig.files import write_atomically
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
-from rig.mesh_files import obj_bytes, write_glb, write_ply
+from rig.mesh_files import obj_bytes, textured_glb_bytes, write_glb, write_ply
 
 SHEET_ROWS = 4  # cameras on the contact sheet
+JPEG_QUALITY = 95  # of the atlas
 
 
-def write_result(folder: Path, result: Reconstruction, capture: Capture, *, obj: bool = False) -> None:
+def write_result(folder: Path, result: Reconstruction, capture: Capture) -> None:
     """Writes every file of the result; each under a temporary name first. Raises OSError where the disk is full."""
     head = head_mesh(result)
     head_normals = result.normals @ result.fit.world_from_head.rotation
@@ -45,12 +50,27 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, *, obj:
         comments=ply_comments(result),
     )
     write_glb(folder / "head.glb", head, normals=head_normals, colours=result.colours)
-    if obj:
+    if result.settings.outputs.obj:
         coloured = Mesh(result.mesh_world.vertices, result.mesh_world.faces, result.colours)
         write_atomically(folder / "head.obj", obj_bytes(coloured))
+    if result.atlas is not None:
+        write_atomically(folder / "head_atlas.glb", _atlas_glb(result.atlas, head, head_normals))
     _write_pictures(folder, result, capture, head)
     text = json.dumps(report_document(result), indent=1, allow_nan=False)
     write_atomically(folder / "report.json", text.encode())
+
+
+def _atlas_glb(atlas: Atlas, head: Mesh, normals: Float[np.ndarray, "v 3"]) -> bytes:
+    source = atlas.layout.source
+    options = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        JPEG_QUALITY,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
+    _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(atlas.image[:, :, ::-1]), options)
+    opened = Mesh(head.vertices[source], atlas.layout.faces)
+    return textured_glb_bytes(opened, normals=normals[source], uv=atlas.layout.uv, jpeg=jpeg.tobytes())
 
 
 def head_mesh(result: Reconstruction) -> Mesh:

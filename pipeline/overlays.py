@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.silhouette import signed_distance
+from pipeline.contour_distance import chamfer
 from pipeline.zbuffer import picture
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
@@ -34,11 +34,11 @@ def overlay(
     """The image with the input contour (sky blue) and the fitted head's contour (vermilion)."""
     line = max(1.0, 1.5 * image.shape[1] / 1024)
     painted = image.copy()
-    contours = ((input_distance, INPUT_COLOUR), (_smooth_distance(fitted_mask), FITTED_COLOUR))
-    for distance, _ in contours:
-        _paint(painted, distance, (0, 0, 0), line + 1.0, 0.45)
-    for distance, colour in contours:
-        _paint(painted, distance, colour, line, 1.0)
+    contours = [_near(input_distance, line), _near(_smooth_distance(fitted_mask), line)]
+    for near in contours:
+        _paint(painted, near, (0, 0, 0), line + 1.0, 0.45)
+    for near, colour in zip(contours, (INPUT_COLOUR, FITTED_COLOUR), strict=True):
+        _paint(painted, near, colour, line, 1.0)
     entries = [(label, (255, 255, 255))] if label else []
     return legend(painted, [*entries, ("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)])
 
@@ -117,17 +117,21 @@ def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"
             slice(max(top - MARGIN_PX, 0), top + height + MARGIN_PX),
             slice(max(left - MARGIN_PX, 0), left + width + MARGIN_PX),
         )
-        distance[own] = cv2.GaussianBlur(signed_distance(mask[own]), (0, 0), 1.0)
+        distance[own] = cv2.GaussianBlur(chamfer(mask[own].view(np.uint8)), (0, 0), 1.0)
     return distance
 
 
+def _near(distance: Float32[np.ndarray, "h w"], line: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (flat) that a line and its dark rim may touch, and how far they are from its middle."""
+    flat = distance.ravel()
+    index = np.flatnonzero((flat < line / 2 + 1) & (flat > -line / 2 - 1))
+    return index, np.abs(flat[index])
+
+
 def _paint(
-    canvas: ImageRgb,
-    distance: Float[np.ndarray, "h w"],
-    colour: tuple[int, int, int],
-    width: float,
-    strength: float,
+    canvas: ImageRgb, near: tuple[np.ndarray, np.ndarray], colour: tuple[int, int, int], width: float, strength: float
 ) -> None:
-    where = np.abs(distance) < width / 2 + 0.5
-    alpha = strength * np.clip(width / 2 + 0.5 - np.abs(distance[where]), 0.0, 1.0)
-    canvas[where] = np.round(canvas[where] + alpha[:, None] * (np.array(colour, np.float32) - canvas[where]))
+    index, distance = near
+    pixels = canvas.reshape(-1, 3)
+    alpha = strength * np.clip(width / 2 + 0.5 - distance, 0.0, 1.0)[:, None]
+    pixels[index] = np.round(pixels[index] + alpha * (np.array(colour, np.float32) - pixels[index]))

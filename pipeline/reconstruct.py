@@ -4,8 +4,11 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from pipeline.alignment import feature_alignment
 from pipeline.alignment_search import search_alignment
+from pipeline.atlas import paint_atlas
 from pipeline.drift import find_drift
 from pipeline.eigenheads.kernel import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_modes
@@ -21,6 +24,8 @@ from pipeline.segmentation import segment
 from pipeline.settings import Settings
 from pipeline.silhouette import Silhouette
 from pipeline.texture import texture
+from pipeline.unwrap import unwrap
+from pipeline.zbuffer import depth_maps
 from rig.capture import Capture
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
@@ -95,12 +100,16 @@ def reconstruct(
     clock("texture")
     full = model.levels["full"]
     mesh = Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), full.faces)
-    normals = mesh.normals()
-    coloured = texture(mesh, normals, capture, silhouettes, rig, settings.texture, renderer=renderer)
+    normals, depths = mesh.normals(), depth_maps(rig, mesh)
+    coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture)
+    atlas = None
+    if settings.outputs.atlas:
+        clock("atlas")
+        layout = unwrap(model.vertices(np.zeros(0)), full.faces)
+        atlas = paint_atlas(layout, mesh, normals, coloured, capture, silhouettes, rig, depths, settings.texture)
     clock("evidence")
-    before = start_masks(model, start, rig, renderer)
-    with renderer.silhouette_set(rig, full.faces) as drawn:
-        fitted_masks = drawn.masks(mesh.vertices)
+    before = start_masks(model, start, rig)
+    fitted_masks = {name: np.isfinite(depth) for name, depth in depths.items()}
     figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, before)
     quality = vertex_deviation_mm(model, fit)
     clock("")
@@ -127,6 +136,7 @@ def reconstruct(
         warnings=(*view_warnings(silhouettes), *moved, *warnings, *coloured.warnings),
         gains=coloured.gains,
         detail=detail,
+        atlas=atlas,
     )
 
 

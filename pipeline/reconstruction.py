@@ -15,6 +15,7 @@ from pipeline.fitting.fit import Fit
 from pipeline.measurements import Landmark, Measurement
 from pipeline.settings import Settings
 from pipeline.silhouette import Silhouette
+from pipeline.unwrap import Atlas
 from rig.mesh import Mesh
 
 
@@ -77,3 +78,4 @@ class Reconstruction:
     warnings: tuple[ReportWarning, ...] = ()
     detail: Detail = field(default_factory=lambda: Detail("span", "not stated"))
     gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
+    atlas: Atlas | None = None  # where the settings ask for it

@@ -1,4 +1,4 @@
-"""Texture (section 4.5): one colour a vertex, no atlas.
+"""Texture (section 4.5): one colour a vertex.
 
 Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour a vertex and how many images gave it.
 ``blend = "reference"`` is the paper's: a vertex counts in an image if it projects inside the silhouette and nothing
@@ -10,7 +10,7 @@ detail is not averaged away, a mean in linear light that gives little to what is
 highlight moves with the camera), and a smooth fill where no camera looks.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -23,19 +23,21 @@ from pipeline.fill import fill_unknown
 from pipeline.reconstruction import ReportWarning
 from pipeline.settings import TextureSettings
 from pipeline.silhouette import Silhouette
-from pipeline.visibility import Sight, see_vertices
+from pipeline.visibility import Sight, see_points
 from pipeline.zbuffer import camera_depths
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.layout import Rig
 from rig.mesh import Mesh
 from rig.mesh_files import srgb_from_linear
-from rig.render.renderer import Renderer
 
 REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
 LEAST_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it
 GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
+
+
+Rgb = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +46,8 @@ class Texture:
 
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
-    gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
+    gains: Mapping[str, Rgb] = field(default_factory=dict)  # linear, by camera
+    offsets: Mapping[str, Rgb] = field(default_factory=dict)
     filled: int = 0
     warnings: tuple[ReportWarning, ...] = ()
 
@@ -55,69 +58,69 @@ def texture(
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
     settings: TextureSettings,
-    *,
-    renderer: Renderer | None,
 ) -> Texture:
-    """Colours of the mesh from the photographs of the usable views.
-
-    ``renderer`` draws the depth maps of the reference blend, and is not asked by the default one.
-    """
-    usable = [name for name in rig.names if name in capture.images and silhouettes[name].quality.usable]
+    """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them."""
+    views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
-        if renderer is None:
-            raise ValueError("the reference blend needs a renderer for its depth maps")
-        return _reference(mesh_world, normals, capture, silhouettes, rig.subset(usable), renderer)
-    sights = _sights(mesh_world, normals, capture, silhouettes, rig.subset(usable), settings)
-    if not sights:
+        return _reference(mesh_world, normals, capture, silhouettes, views, depths)
+    if not len(views):
         return _untextured(len(normals))
-    weights = np.stack([sight.weights for sight in sights])
-    colours = np.stack([sight.colours for sight in sights])
-    gains, offsets = balance(weights, colours) if settings.balance else (np.ones((len(sights), 3)), np.zeros((1, 3)))
-    colours = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    linear, views = _blend(weights, colours, settings.highlight)
-    by_camera = {name: (float(g[0]), float(g[1]), float(g[2])) for name, g in zip(usable, gains, strict=True)}
-    return _finished(linear, views, mesh_world, by_camera)
+
+    def look(camera: Camera) -> Sight:
+        name = camera.name
+        given = capture.images[name], silhouettes[name], depths[name]
+        return see_points(camera, *given, mesh_world.vertices, normals, settings)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # the compiled kernels release the interpreter lock
+        sights = list(pool.map(look, views))
+    gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
+    if settings.balance:
+        gains, offsets = balance(*_stacked(sights))
+    linear, seen = blend(sights, gains, offsets, settings.highlight)
+    if not seen.any():
+        return _untextured(len(seen))
+    colours = np.rint(255 * srgb_from_linear(fill_unknown(linear, seen > 0, mesh_world.faces))).astype(np.uint8)
+    by_camera = _by_name(views, gains)
+    filled = int(np.count_nonzero(seen == 0))
+    return Texture(colours, seen, by_camera, _by_name(views, offsets), filled, _gain_warnings(by_camera))
 
 
-def _finished(
-    linear: Float[np.ndarray, "v 3"],
-    views: UInt8[np.ndarray, " v"],
-    mesh: Mesh,
-    gains: Mapping[str, tuple[float, float, float]],
-) -> Texture:
-    known = views > 0
-    if not known.any():
-        return _untextured(len(views))
-    colours = np.rint(255 * srgb_from_linear(fill_unknown(linear, known, mesh.faces))).astype(np.uint8)
-    warnings = [
+def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
+    """The cameras that may colour a head."""
+    return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
+
+
+def blend(
+    sights: Sequence[Sight], gains: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, "k 3"], highlight: float
+) -> tuple[Float[np.ndarray, "v 3"], UInt8[np.ndarray, " v"]]:
+    """Linear colour of each point and the number of views that gave it."""
+    weights, colours = _stacked(sights)
+    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    return _blend(weights, balanced, highlight)
+
+
+def _stacked(sights: Sequence[Sight]) -> tuple[Float32[np.ndarray, "k v"], Float32[np.ndarray, "k v 3"]]:
+    return np.stack([sight.weights for sight in sights]), np.stack([sight.colours for sight in sights])
+
+
+def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
+    return {name: (r, g, b) for name, (r, g, b) in zip(rig.names, values.tolist(), strict=True)}
+
+
+def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
+    return tuple(
         ReportWarning("camera_gain", f"{name} is {1 / min(gain):.2f} times as bright as the others: check its exposure")
         for name, gain in gains.items()
         if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
-    ]
-    return Texture(colours, views, gains, int(np.count_nonzero(~known)), tuple(warnings))
+    )
 
 
 def _untextured(count: int) -> Texture:
     code = round(255 * float(srgb_from_linear(np.array(GREY))))
     warning = ReportWarning("no_texture", "no camera with a usable silhouette sees the head, so that it is grey")
-    return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), {}, count, (warning,))
-
-
-def _sights(
-    mesh: Mesh,
-    normals: Float[np.ndarray, "v 3"],
-    capture: Capture,
-    silhouettes: Mapping[str, Silhouette],
-    rig: Rig,
-    settings: TextureSettings,
-) -> list[Sight]:
-    def look(camera: Camera) -> Sight:
-        image, silhouette = capture.images[camera.name], silhouettes[camera.name]
-        return see_vertices(camera, image, silhouette, mesh.vertices, normals, mesh.faces, settings)
-
-    with ThreadPoolExecutor(max_workers=2) as pool:  # the compiled kernels release the interpreter lock
-        return list(pool.map(look, rig))
+    return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), filled=count, warnings=(warning,))
 
 
 @njit(cache=True, nogil=True)
@@ -166,12 +169,11 @@ def _reference(
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
-    renderer: Renderer,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> Texture:
     """Section 4.5 to the letter, in the images' own codes; vertices that no camera sees are filled."""
     total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
     views = np.zeros(len(normals), np.uint8)
-    depths = renderer.depth(rig, mesh.vertices, mesh.faces)
     for camera in rig:
         pixels = camera.project(mesh.vertices)
         seen = _visible(camera, mesh.vertices, pixels, depths[camera.name], silhouettes[camera.name])

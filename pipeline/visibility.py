@@ -1,4 +1,4 @@
-"""Which vertex which camera sees, how well, and in what colour: the per-vertex work of section 4.5, compiled.
+"""Which point of a surface which camera sees, how well, and in what colour: the work of section 4.5, compiled.
 
 The paper asks for a projection inside the silhouette and no occlusion. Real edges are blurred and fits are not exact,
 so a margin is kept: to the contour (no background reaches the mesh), and to occluding edges of the head itself (no nose
@@ -9,12 +9,12 @@ A view beside an occluding edge, or at a flat angle, speaks only where there is 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, UInt8
 from numba import njit
 
 from pipeline.settings import TextureSettings
 from pipeline.silhouette import Silhouette
-from pipeline.zbuffer import camera_depths, rasterise
+from pipeline.zbuffer import camera_depths
 from rig.camera import Camera
 from rig.mesh_files import linear_from_srgb
 
@@ -26,25 +26,24 @@ POOR = 1e-4  # weight of a view that has nothing but excuses, by that of a good 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """One camera's view of every vertex: weight (0 = not seen) and linear colour (0 to 1)."""
+    """One camera's view of every point: weight (0 = not seen) and linear colour (0 to 1)."""
 
     weights: Float32[np.ndarray, " v"]
     colours: Float32[np.ndarray, "v 3"]
 
 
-def see_vertices(
+def see_points(
     camera: Camera,
     image: UInt8[np.ndarray, "h w 3"],
     silhouette: Silhouette,
-    vertices: Float[np.ndarray, "v 3"],
+    depth: Float32[np.ndarray, "h w"],
+    points: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
     settings: TextureSettings,
 ) -> Sight:
-    """What ``camera`` gives each vertex of a mesh in the world frame."""
-    pixels, depths = camera.project(vertices), camera_depths(camera, vertices)
-    depth, _ = rasterise(pixels, depths, faces, *image.shape[:2])
-    towards = camera.centre_world - vertices
+    """What ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
+    pixels, depths = camera.project(points), camera_depths(camera, points)
+    towards = camera.centre_world - points
     facing = np.einsum("vi,vi->v", normals, towards) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
     weights = _weights(
         pixels,

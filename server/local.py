@@ -15,8 +15,8 @@ from server.stages import Course, Expectation
 Report = Callable[[str, float], None]
 
 
-def settings_document(path: Path | None, **given: str | None) -> dict[str, Any]:
-    """Settings from a TOML or JSON file, then from options. Raises InputError."""
+def settings_document(path: Path | None, **given: str | dict[str, Any] | None) -> dict[str, Any]:
+    """Settings from a TOML or JSON file, then from options; tables are merged. Raises InputError."""
     document: dict[str, Any] = {}
     if path is not None:
         try:
@@ -26,7 +26,11 @@ def settings_document(path: Path | None, **given: str | None) -> dict[str, Any]:
             raise InputError(path.name, [f"cannot be read ({error})"]) from error
         if not isinstance(document, dict):
             raise InputError(path.name, ["is no table of settings"])
-    return document | {name: value for name, value in given.items() if value is not None}
+    for name, value in given.items():
+        old = document.get(name)
+        if value is not None:
+            document[name] = old | value if isinstance(old, dict) and isinstance(value, dict) else value
+    return document
 
 
 def reconstruct_locally(

@@ -38,7 +38,7 @@ from pipeline.settings import Settings, document_from_settings
 from pipeline.silhouette import Silhouette, silhouette_from_mask
 from pipeline.texture import texture
 from pipeline.visual_hull import visual_hull
-from pipeline.zbuffer import camera_depths, interpolate, rasterise
+from pipeline.zbuffer import camera_depths, depth_maps, interpolate, rasterise
 from rig.camera import Camera
 from rig.capture import Capture, read_capture
 from rig.errors import InputError
@@ -252,7 +252,7 @@ def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) 
     for level, fitted in every_level(_without(capture, camera), rest, model, ("span", "photo"), renderer).items():
         mesh, full = fitted.mesh(), model.levels["full"]
         seen = {name: silhouettes[name] for name in rest.names}
-        coloured = texture(mesh, mesh.normals(), capture, seen, rest, settings.texture, renderer=renderer)
+        coloured = texture(mesh, mesh.normals(), capture, seen, rest, depth_maps(rest, mesh), settings.texture)
         views = pack_views(rig.subset([camera]), {camera: bare.distance})
         rim = find_rim(make_topology(full.faces, full.face_region), mesh.vertices, views)
         found[level] = {

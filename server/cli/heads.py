@@ -19,13 +19,16 @@ def reconstruct(
     model: Annotated[str | None, typer.Option(help="A model's name or file.")] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     detail: Annotated[str | None, typer.Option(help="span, kernel or photo.")] = None,
+    obj: Annotated[bool, typer.Option("--obj", help="Write head.obj too, with vertex colours.")] = False,
+    atlas: Annotated[bool, typer.Option("--atlas", help="Write head_atlas.glb too, with a texture image.")] = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     json_out: Json = False,
 ) -> None:
     """Reconstruct one capture without the service."""
     from server.local import reconstruct_locally, settings_document
 
-    document = settings_document(settings, method=method, front=front, detail=detail)
+    outputs = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
+    document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
     answer(written, json_out, [f"{out / 'head.ply'}"])

@@ -13,6 +13,7 @@ from pipeline.settings import SegmentationSettings, TextureSettings
 from pipeline.silhouette import Silhouette
 from pipeline.texture import texture
 from pipeline.visual_hull import hull_extent, visual_hull
+from pipeline.zbuffer import depth_maps
 from rig.capture import Capture, read_capture
 from rig.layout import Rig
 from rig.mesh import Mesh
@@ -37,8 +38,8 @@ def test_texture(benchmark: BenchmarkFixture, scan: tuple[Capture, Rig, dict[str
     model = load_model()
     head = Mesh(model.vertices(np.zeros(1)) + hull_extent(silhouettes, rig)[0], model.levels["full"].faces)
     normals = head.normals()
-    arguments = (head, normals, capture, silhouettes, rig, TextureSettings())
-    benchmark.pedantic(texture, arguments, {"renderer": None}, rounds=5, warmup_rounds=1)
+    arguments = (head, normals, capture, silhouettes, rig, depth_maps(rig, head), TextureSettings())
+    benchmark.pedantic(texture, arguments, rounds=5, warmup_rounds=1)
 
 
 def test_visual_hull(benchmark: BenchmarkFixture, scan: tuple[Capture, Rig, dict[str, Silhouette]]) -> None:

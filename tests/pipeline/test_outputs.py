@@ -13,7 +13,7 @@ from pipeline.measurements import Landmark, Measurement
 from pipeline.outputs import write_result
 from pipeline.overlays import FITTED_COLOUR, INPUT_COLOUR, overlay
 from pipeline.reconstruction import CameraFigures, Reconstruction, ReportWarning
-from pipeline.settings import Settings
+from pipeline.settings import OutputSettings, Settings
 from pipeline.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.zbuffer import depth_map
 from rig.capture import Capture, read_image
@@ -59,7 +59,7 @@ def scene() -> tuple[Reconstruction, Capture]:
         landmarks={"pronasale": Landmark(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))},
         measurements={"nose_length": Measurement(52.0, float("nan"))},
         front="cam03",
-        settings=Settings(),
+        settings=Settings(outputs=OutputSettings(obj=True)),
         digests={"images/cam00.png": "cd" * 32},
         seconds={"segmentation": 0.5, "fitting": 1.5},
         warnings=(ReportWarning("view_left_out", "cam03 is left out"),),
@@ -70,7 +70,7 @@ def scene() -> tuple[Reconstruction, Capture]:
 @pytest.fixture(scope="module")
 def folder(scene: tuple[Reconstruction, Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("result")
-    write_result(out, *scene, obj=True)
+    write_result(out, *scene)
     return out
 
 
@@ -108,7 +108,7 @@ def test_ply_holds_the_world_mesh_with_its_colours_quality_and_views(folder: Pat
 
 def test_the_same_result_is_the_same_bytes(folder: Path, scene, tmp_path: Path) -> None:
     result, capture = scene
-    write_result(tmp_path, replace(result, seconds={"segmentation": 9.0}), capture, obj=True)
+    write_result(tmp_path, replace(result, seconds={"segmentation": 9.0}), capture)
     for file in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "report.json"):
         assert (tmp_path / file.relative_to(folder)).read_bytes() == file.read_bytes(), file.name
 

@@ -12,7 +12,7 @@ from pipeline.fill import fill_unknown
 from pipeline.settings import TextureSettings
 from pipeline.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.texture import Texture, texture
-from pipeline.zbuffer import depth_map
+from pipeline.zbuffer import depth_map, depth_maps
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.mesh_files import srgb_from_linear
@@ -23,13 +23,6 @@ from tests.pipeline.scenes import ellipsoid, fan
 EXPOSURES = np.array([0.8, 1.2, 0.9, 1.1, 1.2, 0.8, 1.0])[:, None] * np.array([1.0, 0.98, 1.03])
 
 
-class ZBuffer:
-    """Depth maps for the reference blend without OpenGL."""
-
-    def depth(self, rig, vertices, faces):
-        return {camera.name: depth_map(camera, vertices, faces)[0] for camera in rig}
-
-
 def colour(shot: Shot, **settings) -> Texture:
     chosen = TextureSettings(**settings)
     return texture(
@@ -38,8 +31,8 @@ def colour(shot: Shot, **settings) -> Texture:
         shot.capture,
         shot.silhouettes,
         shot.rig,
+        depth_maps(shot.rig, shot.mesh),
         chosen,
-        renderer=ZBuffer(),  # type: ignore[arg-type]
     )
 
 
@@ -108,7 +101,7 @@ def test_hidden_surfaces_take_no_colour_from_what_hides_them() -> None:
     image = np.rint(255 * srgb_from_linear(np.where(np.isfinite(depth)[:, :, None], linear, 0.3))).astype(np.uint8)
     silhouette = silhouette_from_mask(np.isfinite(depth))
     capture = Capture({"cam00": image})
-    found = texture(mesh, mesh.normals(), capture, {"cam00": silhouette}, rig, TextureSettings(), renderer=None)
+    found = texture(mesh, mesh.normals(), capture, {"cam00": silhouette}, rig, {"cam00": depth}, TextureSettings())
     lit = found.views[:count] > 0
     assert lit.sum() > 500
     assert (found.colours[:count][lit][:, 0] < 80).all()

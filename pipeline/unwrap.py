@@ -1,0 +1,199 @@
+"""A head laid out flat, for a texture with more detail than one colour a vertex has.
+
+The surface is cut from the nape over the back of the head to the crown and spread on a square, the neck at the bottom
+and the face in the middle. Every inner vertex is a mean of its neighbours with mean-value weights (Floater, *Mean value
+coordinates*, CAGD 2003), which by Tutte's theorem leaves no two triangles over each other; the square's sides bulge a
+little, so that it is strictly convex. What that map shrinks, the nose and above all the ears, is widened by rounds of
+reweighting (Yoshizawa, Belyaev and Seidel, *A fast and simple stretch-minimizing mesh parameterization*, SMI 2004),
+which keep the weights positive.
+
+Laid out from a model's mean head, texels of any two subjects correspond.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+import scipy.sparse.linalg
+from jaxtyping import Float, Int, UInt8
+
+from rig.errors import EigenheadError
+
+ROUNDS = 4  # of reweighting
+BULGE = 0.02  # of the square's side
+MARGIN = 0.01  # left free around the square
+SIDE_SHARE = 2 / 3  # of the cut that is one of the square's sides; the rest is half of its top
+
+
+class NoLayout(EigenheadError):
+    def __init__(self) -> None:
+        super().__init__(
+            "no texture atlas can be laid out for this model, whose surface is not one piece with one open border at "
+            "the neck; ask for vertex colours alone (settings.outputs.atlas = false)"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """The mesh with its cut open. ``source`` is the vertex that each of the layout's vertices was; ``uv`` lies in the
+    unit square, v downwards as in glTF."""
+
+    uv: Float[np.ndarray, "n 2"]
+    faces: Int[np.ndarray, "f 3"]
+    source: Int[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Atlas:
+    """A layout and its image."""
+
+    layout: Layout
+    image: UInt8[np.ndarray, "s s 3"]
+
+
+def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Layout:
+    """Lays out a head (head frame, one open border at the neck). Raises NoLayout for any other topology."""
+    border = _border(faces)
+    back = int(border[np.argmin(vertices[border, 2] + np.abs(vertices[border, 0]))])
+    crown = int(np.argmax(vertices[:, 1]))
+    cut, source = _cut_open(faces, len(vertices), _path(vertices, faces, back, crown))
+    points, loop = vertices[source], _border(cut)
+    starts = np.flatnonzero(source[loop] == back)
+    loop = np.roll(loop, -starts[0] if source[loop[(starts[0] + 1) % len(loop)]] in border else -starts[1])
+    corner, top = int(np.flatnonzero(source[loop] == back)[1]), int(np.flatnonzero(source[loop] == crown)[0])
+    frame = _frame(points[loop], corner, top)
+    if points[loop[: corner // 2], 0].mean() > 0:  # the neck begins at the subject's right, as seen from outside
+        frame[:, 0] = 1 - frame[:, 0]
+    weights = _mean_value_weights(points, cut, len(source))
+    uv = _settled(weights, len(source), loop, frame)
+    for _ in range(ROUNDS):
+        stretch = _stretch(points, uv, cut)
+        weights = weights @ scipy.sparse.diags_array(1 / stretch)
+        uv = _settled(weights, len(source), loop, frame)
+    return Layout(MARGIN + (1 - 2 * MARGIN) * uv, cut, source)
+
+
+def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """Directed edges: corner 0 to 1 of all faces, then 1 to 2, then 2 to 0."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def _border(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " b"]:
+    """The vertices of the one open border, in the order of its directed edges."""
+    known = {(int(a), int(b)) for a, b in _edges(faces)}
+    following = {a: b for a, b in known if (b, a) not in known}
+    vertices, edges = len(np.unique(faces)), (len(known) + len(following)) // 2
+    loop = [next(iter(following))] if following else []
+    while loop and following[loop[-1]] != loop[0]:
+        loop.append(following[loop[-1]])
+    if vertices - edges + len(faces) != 1 or len(loop) != len(following):
+        raise NoLayout
+    return np.array(loop)
+
+
+def _path(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], start: int, end: int
+) -> Int[np.ndarray, " p"]:
+    """The shortest way along edges, drawn to the plane of symmetry, and touching the border at its start alone."""
+    edges = _edges(faces)
+    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    length *= 1 + np.abs(vertices[edges].mean(axis=1)[:, 0])
+    inner = ~np.isin(edges, np.setdiff1d(_border(faces), [start])).any(axis=1)
+    graph = scipy.sparse.coo_array((length[inner], edges[inner].T), shape=(len(vertices),) * 2).tocsr()
+    _, before = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+    path = [end]
+    while path[-1] != start:
+        path.append(int(before[path[-1]]))
+    return np.array(path[::-1])
+
+
+def _cut_open(
+    faces: Int[np.ndarray, "f 3"], count: int, path: Int[np.ndarray, " p"]
+) -> tuple[Int[np.ndarray, "f 3"], Int[np.ndarray, " n"]]:
+    """Faces with the path's vertices doubled, but for its end; and the vertex that each vertex was."""
+    edges = _edges(faces)
+    face_of = {(int(a), int(b)): k % len(faces) for k, (a, b) in enumerate(edges)}
+    steps = {(int(a), int(b)) for a, b in pairwise(path)}
+    cut = faces.copy()
+    for i, vertex in enumerate(path[:-1].tolist()):
+        pending = [face_of[int(path[i + 1]), vertex]]  # to the right of the way
+        met: set[int] = set()
+        while pending:
+            face = pending.pop()
+            met.add(face)
+            a, b, c = np.roll(faces[face], -int(np.flatnonzero(faces[face] == vertex)[0])).tolist()
+            for other, way in ((face_of.get((b, a)), (a, b)), (face_of.get((a, c)), (a, c))):
+                if other is not None and other not in met and way not in steps and way[::-1] not in steps:
+                    pending.append(other)
+        rows = np.array(sorted(met))
+        cut[rows] = np.where(faces[rows] == vertex, count + i, cut[rows])
+    return cut, np.concatenate([np.arange(count), path[:-1]])
+
+
+def _frame(loop: Float[np.ndarray, "b 3"], corner: int, top: int) -> Float[np.ndarray, "b 2"]:
+    """Where the border lies: the neck from the lower left to the lower right, then up the cut and over the top."""
+    ends = np.concatenate([loop, loop[:1]])
+    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ends, axis=0), axis=1))])
+    neck, crown, whole = walked[corner], walked[top], walked[-1]
+    right, left = neck + SIDE_SHARE * (crown - neck), crown + (1 - SIDE_SHARE) * (whole - crown)
+    turn = np.interp(walked[:-1], [0, neck, right, crown, left, whole], [0, 1, 2, 2.5, 3, 4])
+    side, along = np.divmod(turn, 1.0)
+    bulge = BULGE * 4 * along * (1 - along)
+    x = np.choose(side.astype(int), [along, 1 - BULGE + bulge, 1 - along, BULGE - bulge])
+    y = np.choose(side.astype(int), [1 - BULGE + bulge, 1 - along, BULGE - bulge, along])
+    inset = np.choose(side.astype(int), [1, 0, 1, 0])
+    x = np.where(inset, BULGE + (1 - 2 * BULGE) * x, x)
+    y = np.where(inset, y, BULGE + (1 - 2 * BULGE) * y)
+    return np.stack([x, y], axis=1)
+
+
+def _mean_value_weights(
+    points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], count: int
+) -> scipy.sparse.csr_array:
+    """Row i: the weights of vertex i's neighbours, ``(tan(a / 2) + tan(b / 2)) / |ij|``."""
+    rows, columns, values = [], [], []
+    for k in range(3):
+        i, j, other = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
+        first, second = points[j] - points[i], points[other] - points[i]
+        lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
+        sine = np.linalg.norm(np.cross(first, second), axis=1)
+        cosine = np.einsum("fc,fc->f", first, second)
+        half = sine / np.maximum(lengths[0] * lengths[1] + cosine, 1e-12)  # tan(a / 2) = sin a / (1 + cos a)
+        for neighbour, length in zip((j, other), lengths, strict=True):
+            rows.append(i)
+            columns.append(neighbour)
+            values.append(half / np.maximum(length, 1e-9))
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return scipy.sparse.coo_array(entries, shape=(count, count)).tocsr()
+
+
+def _settled(
+    weights: scipy.sparse.csr_array, count: int, loop: Int[np.ndarray, " b"], frame: Float[np.ndarray, "b 2"]
+) -> Float[np.ndarray, "n 2"]:
+    """Every inner vertex at the weighted mean of its neighbours."""
+    uv = np.zeros((count, 2))
+    uv[loop] = frame
+    inner = np.setdiff1d(np.arange(len(uv)), loop)
+    rows = weights[inner]
+    rows = scipy.sparse.diags_array(1 / rows.sum(axis=1)) @ rows
+    system = scipy.sparse.eye_array(len(inner)) - rows[:, inner]
+    uv[inner] = scipy.sparse.linalg.splu(system.tocsc()).solve(rows[:, loop] @ frame)
+    return uv
+
+
+def _stretch(
+    points: Float[np.ndarray, "n 3"], uv: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, " n"]:
+    """Root mean square by which the surface around each vertex is longer than its picture, relative to the whole."""
+    a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
+    (s, t), (p, q) = (uv[faces[:, 1]] - uv[faces[:, 0]]).T, (uv[faces[:, 2]] - uv[faces[:, 0]]).T
+    determinant = s * q - t * p
+    along = ((b - a) * q[:, None] - (c - a) * t[:, None]) / determinant[:, None]
+    down = ((c - a) * s[:, None] - (b - a) * p[:, None]) / determinant[:, None]
+    square = 0.5 * ((along**2).sum(axis=1) + (down**2).sum(axis=1))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    over = np.bincount(faces.ravel(), np.repeat(area * square, 3), len(points))
+    found = np.sqrt(over / np.bincount(faces.ravel(), np.repeat(area, 3), len(points)))
+    return found / np.median(found)

@@ -1,0 +1,65 @@
+"""Seconds of a job's stages, from image files to result files, warm: medians and least of several rounds.
+
+python -m tests.benchmarks.image_stages --json
+
+``segmentation`` is eleven 1024 x 768 images, ``texture`` colours the model's full mesh from them; ``hull``, which no
+job needs, is the visual hull of the silhouettes. ``total`` is from opening the first file to the last one written.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.eigenheads.model import load_model
+from pipeline.outputs import write_result
+from pipeline.reconstruct import reconstruct
+from pipeline.settings import Settings
+from pipeline.visual_hull import visual_hull
+from rig.capture import read_capture
+from rig.render.renderer import Renderer
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--capture", type=Path, default=Path("../shared/data/captures/scan-a"))
+    parser.add_argument("--detail", choices=("span", "kernel", "photo"), default="span")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    model, settings = load_model(), replace(Settings(), detail=arguments.detail)
+    rounds: list[dict[str, float]] = []
+    own: dict[str, float] = {}
+    with Renderer.create() as renderer, tempfile.TemporaryDirectory() as scratch:
+        for _ in range(1 + arguments.rounds):
+            started = time.perf_counter()
+            capture, rig = read_capture(arguments.capture)
+            opened = time.perf_counter()
+            result = reconstruct(capture, rig, model, settings, renderer=renderer, report=lambda *_: None)
+            found = time.perf_counter()
+            write_result(Path(scratch), result, capture)
+            written = time.perf_counter()
+            visual_hull(result.silhouettes, rig)
+            hull = time.perf_counter() - written
+            own = {"read": opened - started, "write": written - found, "total": written - started, "hull": hull}
+            rounds.append({**result.seconds, **own})
+    del rounds[0]  # it compiles, or reads what was compiled
+    stages = ["read", *(name for name in rounds[0] if name not in own), "write", "total", "hull"]
+    median = {name: round(float(np.median([row[name] for row in rounds])), 3) for name in stages}
+    least = {name: round(min(row[name] for row in rounds), 3) for name in stages}
+    if arguments.json:
+        json.dump(
+            {"rounds": arguments.rounds, "detail": arguments.detail, "median_s": median, "least_s": least}, sys.stdout
+        )
+        sys.stdout.write("\n")
+    else:
+        sys.stdout.write("".join(f"{name:<14} {median[name]:7.3f} s   least {least[name]:.3f}\n" for name in stages))
+
+
+if __name__ == "__main__":
+    main()
