@@ -36,6 +36,7 @@ PLAIN = 3.0  # chi-squared by its median over the background, up to which a pixe
 HAIR_DEPTH = 6  # coarse pixels (24 px)
 SPECK = 3  # coarse pixels: a hole of this size is noise wherever it is
 MIXED = 0.1  # of the difference to the plate: standard deviation within a coarse pixel from which it is a mixture
+STRAND_SHADES = 0.75, 1.0, 1.33  # of the subject's colour nearby, in which strands before the plate may be
 FAINT = 100.0  # chi-squared of a mean over nine pixels
 UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must leave, and that by the whole
 THREE = np.ones(3, np.float32)  # a product with it sums the channels ten times faster than .sum(axis=2)
@@ -79,9 +80,7 @@ def decide(
     away, mixture = _mixture(image, coarse, background)
     paint = spread(coarse, eroded(raw, 1) * away / (1 + mixture**2), 2.0)
     clear = _apart(paint, background.coarse, variance) > CONCLUSIVE
-    other, unexplained = _other_colour(
-        coarse - background.coarse, paint - background.coarse, background.coarse, variance, settings
-    )
+    other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance, settings)
     clear &= ~dilated(other, 1)
     plain = clear & (chi2 < PLAIN * np.median(chi2[background.inliers])) if background.inliers.any() else clear & False
     mask, strangers = _subject_only(raw, plain, settings)
@@ -169,20 +168,21 @@ def _apart(
 
 def _other_colour(
     difference: Float32[np.ndarray, "h w 3"],
-    contrast: Float32[np.ndarray, "h w 3"],
+    paint: Float32[np.ndarray, "h w 3"],
     plate: Float32[np.ndarray, "h w 3"],
     variance: Float32[np.ndarray, "h w 3"],
     settings: SegmentationSettings,
 ) -> tuple[Bool[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Where neither the plate in any shade nor a mixture of it and the subject's colour nearby (``contrast`` from the
-    plate) explains a faint difference, so that the subject has another colour there; and the chi-squared that they
-    leave, of nine pixels' mean."""
+    """Where neither the plate in any shade nor a mixture of it and the subject's colour nearby (``paint``, in a few
+    shades: strands are not all alike) explains a faint difference, so that the subject has another colour there; and
+    the chi-squared that they leave, of nine pixels' mean."""
     weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
     faint = ((difference**2 * weight) @ THREE < FAINT).astype(np.float32)
     mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]
     square = (mean**2 * weight) @ THREE
     left = square
-    for direction, most in ((contrast, 1.0), (-plate, 1 - settings.darkest_shadow)):
+    mixtures = [(shade * paint - plate, 1.0) for shade in STRAND_SHADES]
+    for direction, most in ((-plate, 1 - settings.darkest_shadow), *mixtures):
         along, whole = (mean * direction * weight) @ THREE, (direction**2 * weight) @ THREE
         share = np.clip(along / np.maximum(whole, 1e-6), 0, most)
         left = np.minimum(left, square + share * (share * whole - 2 * along))

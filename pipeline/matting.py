@@ -28,6 +28,7 @@ from rig.mesh_files import linear_from_srgb
 INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour: beyond the blur of an edge (3 sigma)
 SOLID = 0.85  # alpha above which a pixel shows the subject's own colour, and not hair before the background
 WINDOW_PX = 3.0  # sigma of the window it is averaged in
+DEPTH = 6  # bands inside the outline up to which a gap before the plate is looked for: 48 px
 LEAN = 1.0  # standard deviation of alpha at which the coarse mask counts as much as the pixel
 LINEAR = (255 * linear_from_srgb(np.arange(257) / 255.0)).astype(np.float32)  # by code, one more to interpolate to
 SHADE = (
@@ -56,7 +57,7 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
     band = int(np.ceil(settings.band_px / decision.reduction))
     asked = dilated(mask, 2) & ~eroded(mask, 2)
-    asked |= dilated(decision.mixed, 1) & dilated(mask, band) & ~eroded(mask, 3 * band)
+    asked |= dilated(decision.mixed, 1) & dilated(mask, band) & ~eroded(mask, DEPTH * band)
     asked &= clear | (dilated(mask, 1) & ~eroded(mask, 1))
     zone = np.where(asked, np.where(clear, 1, 3), 2 * mask).astype(np.uint8)
     light = background.field * _light_outside(decision.coarse, background, mask)

@@ -1,17 +1,22 @@
 """Masks of the simulated studio's preset against the truth: contour RMS, IoU, and whether bad views say so.
 
 python -m tests.benchmarks.studio_masks --captures 20
+python -m tests.benchmarks.studio_masks --captures 4 --fault shadow --fault camouflage --fault exposure=0.1
+
+With faults every capture is taken anew with each of them, and a view may be wrong if it says so.
 
 Coverage of the subject is the truth: the contour is judged where it is one half at the resolution that a mask has, the
 overlap at the lens's own (see tests/pipeline/test_segmentation_studio.py).
 """
 
 import argparse
+import itertools
 import sys
 
 import numpy as np
 
 from rig.render.renderer import Renderer
+from rig.studio.faults import fault_from_text
 from rig.studio.preset import PRESET
 from tests.pipeline.test_segmentation_studio import RESOLUTION_PX, coverage, iou, offsets, take
 
@@ -22,26 +27,34 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="seed of the first capture")
+    parser.add_argument("--fault", action="append", default=[], help="KIND[:CAMERA][=AMOUNT]; may be repeated")
     arguments = parser.parse_args()
+    faults = [(fault_from_text(text),) for text in arguments.fault] or [()]
+    captures = range(arguments.first, arguments.first + arguments.captures)
     rows = []
     with Renderer.create() as renderer:
-        for seed in range(arguments.first, arguments.first + arguments.captures):
-            taken, silhouettes = take(seed, renderer)
+        for seed, given in itertools.product(captures, faults):
+            taken, silhouettes = take(seed, renderer, *given)
+            kind = "".join(f" {fault.kind}" for fault in given)
             for name, silhouette in silhouettes.items():
                 off = offsets(silhouette, coverage(taken, name, RESOLUTION_PX))
                 overlap = iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5)
                 said = "; ".join(silhouette.quality.warnings)
-                rows.append((float(np.sqrt((off**2).mean())), overlap, f"{seed} {name}", said))
+                rows.append((float(np.sqrt((off**2).mean())), overlap, f"{seed}{kind} {name}", said))
     rms, overlap = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     bad = (rms > WORST_PX) | (overlap < LEAST_IOU)
     lines = [
-        f"{len(rows)} views of {arguments.captures} captures",
+        f"{len(rows)} views of {arguments.captures * len(faults)} captures",
         f"contour RMS px: median {np.median(rms):.3f}, 90 % {np.quantile(rms, 0.9):.3f}, worst {rms.max():.2f}",
         f"IoU: median {np.median(overlap):.4f}, worst {overlap.min():.4f}",
     ]
     wrong = sorted((row for row, beyond in zip(rows, bad, strict=True) if beyond), reverse=True)
     silent = sum(not said for _, _, _, said in wrong)
     lines.append(f"views beyond {WORST_PX} px or below {LEAST_IOU}: {len(wrong)}, of which silent: {silent}")
+    alarmed = [row for row, beyond in zip(rows, bad, strict=True) if row[3] and not beyond]
+    lines.append(f"views within both that say something: {len(alarmed)}")
+    lines += [f"  {name}: {off:.2f} px, IoU {share:.4f}, {said}" for off, share, name, said in alarmed]
+    lines.append("beyond:")
     lines += [f"  {name}: {off:.2f} px, IoU {share:.4f}, {said or 'nothing said'}" for off, share, name, said in wrong]
     sys.stdout.write("\n".join(lines) + "\n")
 
