@@ -34,11 +34,25 @@ from rig.mesh_files import obj_bytes, textured_glb_bytes, write_glb, write_ply
 
 SHEET_ROWS = 4  # cameras on the contact sheet
 JPEG_QUALITY = 95  # of the atlas
+THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and every file waits for the disk
 
 
 def write_result(folder: Path, result: Reconstruction, capture: Capture) -> None:
     """Writes every file of the result; each under a temporary name first. Raises OSError where the disk is full."""
     head = head_mesh(result)
+    with ThreadPoolExecutor(max_workers=THREADS) as pool:
+        jobs = [
+            pool.submit(_write_meshes, folder, result, head),
+            pool.submit(_write_overviews, folder, result, capture, head),
+            *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
+        ]
+        for job in jobs:
+            job.result()
+    text = json.dumps(report_document(result), indent=1, allow_nan=False)
+    write_atomically(folder / "report.json", text.encode())
+
+
+def _write_meshes(folder: Path, result: Reconstruction, head: Mesh) -> None:
     head_normals = result.normals @ result.fit.world_from_head.rotation
     write_ply(
         folder / "head.ply",
@@ -55,9 +69,6 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture) -> None
         write_atomically(folder / "head.obj", obj_bytes(coloured))
     if result.atlas is not None:
         write_atomically(folder / "head_atlas.glb", _atlas_glb(result.atlas, head, head_normals))
-    _write_pictures(folder, result, capture, head)
-    text = json.dumps(report_document(result), indent=1, allow_nan=False)
-    write_atomically(folder / "report.json", text.encode())
 
 
 def _atlas_glb(atlas: Atlas, head: Mesh, normals: Float[np.ndarray, "v 3"]) -> bytes:
@@ -104,23 +115,20 @@ def _ascii(text: str) -> str:
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
 
 
-def _write_pictures(folder: Path, result: Reconstruction, capture: Capture, head: Mesh) -> None:
-    shown = [name for name in result.silhouettes if name in capture.images and name in result.fitted_masks]
+def _shown(result: Reconstruction, capture: Capture) -> list[str]:
+    return [name for name in result.silhouettes if name in capture.images and name in result.fitted_masks]
 
-    def draw(name: str) -> None:
-        silhouette = result.silhouettes[name]
-        drawn = overlay(capture.images[name], silhouette.distance, result.fitted_masks[name], name)
-        write_image(folder / "overlays" / f"{name}.png", drawn)
 
-    def draw_head() -> None:
-        panels = turntable(head, result.colours)
-        write_image(folder / "turntable.png", np.hstack(panels))
-        write_image(folder / "contact_sheet.png", _sheet(result, capture, shown, panels))
+def _write_overlay(folder: Path, result: Reconstruction, capture: Capture, name: str) -> None:
+    distance = result.silhouettes[name].distance
+    drawn = overlay(capture.images[name], distance, result.fitted_masks[name], name)
+    write_image(folder / "overlays" / f"{name}.png", drawn)
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # cv2, NumPy and the rasteriser release the interpreter lock
-        last = pool.submit(draw_head)
-        list(pool.map(draw, shown))
-        last.result()
+
+def _write_overviews(folder: Path, result: Reconstruction, capture: Capture, head: Mesh) -> None:
+    panels = turntable(head, result.colours)
+    write_image(folder / "turntable.png", np.hstack(panels))
+    write_image(folder / "contact_sheet.png", _sheet(result, capture, _shown(result, capture), panels))
 
 
 def _sheet(result: Reconstruction, capture: Capture, shown: list[str], panels: list[np.ndarray]) -> np.ndarray:

@@ -7,6 +7,7 @@ https://jfly.uni-koeln.de/color/); a dark rim keeps them readable on any image.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -44,7 +45,12 @@ def overlay(
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> ImageRgb:
-    """Eq. (4) as a picture: sky blue where only the input is, vermilion where only the model is, over a pale image."""
+    """Eq. (4) at a panel's size, over a pale image: sky blue where only the input is, vermilion where only the model."""
+    size = _fitted_size(image)
+    image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    observed, model = (
+        cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in (observed, model)
+    )
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     shade = np.round(0.35 * np.arange(256) + 150.0)
     pale, dark = shade.astype(np.uint8), (shade - 60.0).astype(np.uint8)
@@ -80,13 +86,15 @@ def turntable(
     distance = 6.0 * radius
     focal = 0.5 * min(width * 1.25, height) * distance / (0.9 * radius)
     lens = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    panels = []
-    for azimuth in np.radians(AZIMUTHS_DEG):
+
+    def draw(azimuth: float) -> ImageRgb:
         eye = centre + distance * np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
         camera = Camera("turntable", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
         drawn = picture(camera, mesh_head.vertices, mesh_head.faces, colours, PAPER)
-        panels.append(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA))
-    return panels
+        return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # the rasteriser releases the interpreter lock
+        return list(pool.map(draw, np.radians(AZIMUTHS_DEG)))
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, ImageRgb]]]) -> ImageRgb:
@@ -98,13 +106,18 @@ def contact_sheet(rows: Sequence[Sequence[tuple[str, ImageRgb]]]) -> ImageRgb:
 
 
 def _panel(image: ImageRgb) -> ImageRgb:
-    scale = min(PANEL[0] / image.shape[1], PANEL[1] / image.shape[0])
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    size = _fitted_size(image)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_CUBIC)
     out = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
     left, top = (PANEL[0] - size[0]) // 2, (PANEL[1] - size[1]) // 2
     out[top : top + size[1], left : left + size[0]] = small
     return out
+
+
+def _fitted_size(image: ImageRgb) -> tuple[int, int]:
+    """Width and height of an image that fills a panel."""
+    scale = min(PANEL[0] / image.shape[1], PANEL[1] / image.shape[0])
+    return max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
 
 
 def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:

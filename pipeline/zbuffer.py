@@ -111,4 +111,7 @@ def picture(
     pixels, depths = camera.project(vertices_world), camera_depths(camera, vertices_world)
     _, seen = rasterise(pixels, depths, faces, camera.intrinsics.height, camera.intrinsics.width)
     image = interpolate(seen, pixels, depths, faces, colours.astype(np.float32))
-    return np.where(np.isnan(image), np.array(background, np.float32), np.round(image)).astype(np.uint8)
+    canvas = np.full(image.shape, background, np.uint8)
+    shown = seen >= 0
+    canvas[shown] = np.round(image[shown])
+    return canvas
