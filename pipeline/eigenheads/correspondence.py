@@ -3,17 +3,19 @@
 Every scan is first moved rigidly (by its landmarks) into the head frame. The reference is the scan nearest the mean;
 its surface is given the default model's connectivity, since a scan's own hundred thousand vertices would make modes
 of a hundred megabytes (departure from the paper, which keeps the scan's vertices). The paper's steps then run as
-written. Landmarks alone leave the surface free to slide between them, so by default a non-rigid refinement follows:
-every vertex looks for the scan's point that is near *and* faces the same way, and displacements stay smooth.
+written. Landmarks alone leave the surface free to slide between them, so by default a refinement follows: the head that
+is most probable under what is known of heads (``prior``), given the scan's landmarks and surface, and from there a
+smooth displacement along the normals onto the scan.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
@@ -22,15 +24,28 @@ from pipeline.eigenheads.landmarks import NAMES, stacked
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.parallel import Workers, workers
 from pipeline.eigenheads.pca import align, rigid_fit
-from pipeline.eigenheads.prior import mixed_modes
+from pipeline.eigenheads.prior import Prior, registration_prior
 from pipeline.eigenheads.scans import Scan
 from pipeline.eigenheads.surface import edges_of, vertex_areas
 from pipeline.eigenheads.warp import landmark_warp
 from rig.geometry import cross_matrix
 from rig.mesh import vertex_normals
 
+_TAUBIN = (0.5, -0.53)  # a step that smooths and one that gives the size back
+_SMOOTHINGS = 4  # of both: noise of single points falls to half; with 8, fine shape goes too
+
 Report = Callable[[str, float], None]
 Frame = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]  # rotation and translation, frame from scan
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """One stage of looking for a head's points on a scan. Lengths in mm."""
+
+    steps: int
+    reach_mm: float  # a match farther than this is another part of the head
+    normal_mm: float  # a right angle between normals counts as much as this many mm
+    plane_mm: float  # residual that weighs as much as one standard deviation of a mode, per cm2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,13 +55,14 @@ class Matching:
     refine: bool = True
     reach_mm: float = 15.0  # a sample farther than this from the warped vertex is another part of the head: void
     landmark_smoothing_mm: float = 1.0  # landmarks are marked to about half a millimetre: do not bend for that
-    normal_mm: float = 12.0  # a right angle between normals counts as much as this many mm
-    stiffness: tuple[float, ...] = (30.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 0.5, 0.5)  # per iteration
-    slide: float = 0.0  # share of the tangential pull that is followed
-    statistical_steps: int = 6
-    plane_mm: float = 1.0  # residual that weighs as much as one standard deviation of a mode, per cm2
-    mark_mm: float = 0.7
-    mark_weight: float = 0.3  # of a landmark in the smooth refinement, beside 1 of a matched vertex
+    # Normals lead while the shape is millimetres off; close by they would pin a vertex to where its own, still wrong,
+    # normal points (0.43 mm instead of 0.19 on heads inside the span), so there nearness decides.
+    broad: Search = Search(5, 15.0, 12.0, 1.0)
+    fine: Search = Search(4, 4.0, 1.0, 0.05)
+    mark_mm: float = 0.5  # to which a landmark is marked, an axis
+    reference_stiffness: tuple[float, ...] = (30.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 0.5, 0.5)  # per iteration
+    stiffness: tuple[float, ...] = (3.0, 1.0, 0.5)
+    mark_weight: float = 0.3  # of a landmark in giving the reference its connectivity, beside 1 of a matched vertex
     workers: int = 2  # processes
 
 
@@ -102,11 +118,13 @@ def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[Frame]:
 
 
 def prepared(scan: Scan, rotation: np.ndarray, translation: np.ndarray) -> Target:
-    """The scan in the common frame, with normals smoothed over some millimetres (raw ones are mostly noise)."""
+    """The scan in the common frame, its noise smoothed away without shrinking it (Taubin 1995), and smooth normals."""
     vertices = scan.vertices @ rotation.T + translation
-    normals = vertex_normals(vertices, scan.faces)
     averaging = _averaging(scan.faces, len(vertices))
-    for _ in range(4):
+    for factor in _TAUBIN * _SMOOTHINGS:
+        vertices += factor * (averaging @ vertices - vertices)
+    normals = vertex_normals(vertices, scan.faces)
+    for _ in range(2):
         normals = averaging @ normals
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     marks = stacked(scan.landmarks) @ rotation.T + translation
@@ -131,7 +149,16 @@ def on_reference(target: Target, template: HeadModel, matching: Matching) -> Flo
     surface = template.vertices(np.zeros(0))[: len(template.mean)]
     index = _landmark_rows(template)
     warped = landmark_warp(surface[index], target.marks, surface)
-    return refined(warped, template.levels["cage"].faces, index, target, _tree(target, matching), matching)
+    fixed = {int(row): mark for row, mark in zip(index, target.marks, strict=True)}
+    return refined(
+        warped,
+        template.levels["cage"].faces,
+        target,
+        matching.broad,
+        matching.reference_stiffness,
+        fixed,
+        matching.mark_weight,
+    )
 
 
 def warp_and_resample(
@@ -168,15 +195,14 @@ def _refined(
     report: Report | None,
 ) -> Float[np.ndarray, "N V 3"]:
     count = len(template.mean)
-    mean = template.vertices(np.zeros(0))[:count]
-    modes = mixed_modes(mean, template.basis("full", len(template.modes), np.arange(count)).astype(float))
-    one = partial(_most_probable, mean, modes, template.levels["cage"].faces, _landmark_rows(template), matching)
+    faces, mean = template.levels["cage"].faces, template.vertices(np.zeros(0))[:count]
+    prior = registration_prior(mean, template.basis("full", len(template.modes), np.arange(count)), faces)
+    one = partial(_most_probable, prior, faces, _landmark_rows(template), matching)
     return np.array(crew.over(one, given, "refining", report))
 
 
 def _most_probable(
-    mean: Float[np.ndarray, "V 3"],
-    modes: Float[np.ndarray, "M V 3"],
+    prior: Prior,
     faces: Int[np.ndarray, "F 3"],
     index: Int[np.ndarray, " L"],
     matching: Matching,
@@ -184,81 +210,93 @@ def _most_probable(
 ) -> Float[np.ndarray, "V 3"]:
     scan, frame = given
     target = prepared(scan, *frame)
-    tree = _tree(target, matching)
-    likeness = statistical(mean, modes, faces, index, target, tree, matching)
-    return refined(likeness, faces, index, target, tree, matching)
+    likeness = statistical(prior, faces, index, target, matching)
+    return refined(likeness, faces, target, matching.fine, matching.stiffness)
 
 
 def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
     return np.array([template.landmarks[name] for name in NAMES])
 
 
-def _tree(target: Target, matching: Matching) -> KDTree:
+def _tree(target: Target, search: Search) -> KDTree:
     """Scan points by position and direction together."""
-    return KDTree(np.concatenate([target.vertices, target.normals * matching.normal_mm], 1), balanced_tree=False)
+    return KDTree(np.concatenate([target.vertices, target.normals * search.normal_mm], 1), balanced_tree=False)
 
 
 def statistical(
-    mean: Float[np.ndarray, "V 3"],
-    modes: Float[np.ndarray, "M V 3"],
+    prior: Prior,
     faces: Int[np.ndarray, "F 3"],
     index: Int[np.ndarray, " L"],
     target: Target,
-    tree: KDTree,
     matching: Matching,
 ) -> Float[np.ndarray, "V 3"]:
-    """The most probable head under mean + z modes, z ~ N(0, I), for the scan's landmarks and surface.
+    """The most probable head under the prior for the scan's landmarks and surface: broad modes first, then all.
 
     Smoothness cannot tell where on a plain cheek a vertex belongs; what is known of other heads helps. Residuals are
     point-to-plane, counted per cm2 of surface, landmarks in all three axes; six columns carry the pose.
     """
-    areas = vertex_areas(mean, faces)
-    shape = landmark_warp(mean[index], target.marks, mean, smoothing=20.0)
-    for _ in range(matching.statistical_steps):
-        near, weight = _matched(shape, faces, target, tree, matching)
-        information = weight * areas / 100.0 / matching.plane_mm**2
-        planes = target.normals[near]
-        rows_of = np.einsum("mvx,vx->vm", modes, planes)
-        offset = np.einsum("vx,vx->v", target.vertices[near] - mean, planes)
-        lever = np.concatenate([planes, np.cross(mean, planes)], 1)
-        marks = modes[:, index].reshape(len(modes), -1).T
-        mark_lever = np.concatenate(
-            [np.tile(np.eye(3), (len(index), 1)), np.concatenate([-cross_matrix(p) for p in mean[index]])], 1
-        )
-        jacobian = np.concatenate([np.hstack([rows_of, lever]), np.hstack([marks, mark_lever])])
-        wanted = np.concatenate([offset, (target.marks - mean[index]).ravel()])
-        trust = np.concatenate([information, np.full(3 * len(index), 1 / matching.mark_mm**2)])
-        weighted = jacobian * trust[:, None]
-        system = weighted.T @ jacobian
-        system[range(len(modes)), range(len(modes))] += 1.0
-        solution = np.linalg.solve(system, weighted.T @ wanted)
-        z, pose = solution[: len(modes)], solution[len(modes) :]
-        shape = mean + np.tensordot(z, modes, 1) + pose[:3] + np.cross(pose[3:], mean)
+    shape = landmark_warp(prior.mean[index], target.marks, prior.mean, smoothing=20.0)
+    areas = vertex_areas(prior.mean, faces)
+    for search, count in ((matching.broad, prior.broad), (matching.fine, len(prior.modes))):
+        tree = _tree(target, search)
+        modes = np.ascontiguousarray(prior.modes[:count].transpose(1, 2, 0))
+        for _ in range(search.steps):
+            near, weight = _matched(shape, faces, target, tree, search)
+            information = weight * areas / 100.0 / search.plane_mm**2
+            shape = _step(prior.mean, modes, index, target, near, information, matching.mark_mm)
     return shape
+
+
+def _step(
+    mean: Float[np.ndarray, "V 3"],
+    modes: Float32[np.ndarray, "V 3 K"],
+    index: Int[np.ndarray, " L"],
+    target: Target,
+    near: Int[np.ndarray, " V"],
+    information: Float[np.ndarray, " V"],
+    mark_mm: float,
+) -> Float[np.ndarray, "V 3"]:
+    """The posterior mean for vertices on the planes of their matches. Single precision: the prior keeps it tame."""
+    planes, count = target.normals[near], modes.shape[2]
+    along = sum(planes[:, axis, None].astype(np.float32) * modes[:, axis] for axis in range(3))
+    lever = np.concatenate([planes, np.cross(mean, planes)], 1)
+    turns = np.concatenate([-cross_matrix(point) for point in mean[index]])
+    mark_lever = np.concatenate([np.tile(np.eye(3), (len(index), 1)), turns], 1)
+    root = np.sqrt(np.concatenate([information, np.full(3 * len(index), mark_mm**-2)]))[:, None]
+    offsets = np.concatenate([_dots(target.vertices[near] - mean, planes), (target.marks - mean[index]).ravel()])
+    rows = np.block([[along, lever], [modes[index].reshape(-1, count), mark_lever]])
+    weighted = (rows * root).astype(np.float32)
+    system = (weighted.T @ weighted).astype(float)
+    system[range(count), range(count)] += 1.0
+    solution = np.linalg.solve(system, weighted.T.astype(float) @ (offsets * root[:, 0]))
+    z, shift, turn = np.split(solution, [count, count + 3])
+    return mean + modes @ z + shift + np.cross(turn, mean)
 
 
 def refined(
     start: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
-    index: Int[np.ndarray, " L"],
     target: Target,
-    tree: KDTree,
-    matching: Matching,
+    search: Search,
+    stiffnesses: Sequence[float],
+    marks: Mapping[int, Float[np.ndarray, " 3"]] = MappingProxyType({}),
+    mark_weight: float = 0.0,
 ) -> Float[np.ndarray, "V 3"]:
     """Non-rigid closest-point refinement of a warped reference onto a target.
 
     Each step solves (W + k L^T L) u = W d for the displacements u from ``start`` (all three axes share the matrix; L is
-    the graph Laplacian, so affine-like motions stay cheap), with d the pull towards the match: all of it along the
-    normal, a share of it in the tangent plane. Matches are nearest in position and normal together.
+    the graph Laplacian, so affine-like motions stay cheap), with d the pull towards the match along its normal: in the
+    tangent plane a vertex stays. Matches are nearest in position and normal together. ``marks`` are places of vertices.
     """
-    bending = _bending(faces, start)
+    bending, tree = _bending(faces, start), _tree(target, search)
+    fixed = np.array(list(marks), int)
     shape = start
-    for stiffness in matching.stiffness:
-        near, weight = _matched(shape, faces, target, tree, matching)
-        pull = target.vertices[near] - shape
-        along = np.einsum("nx,nx->n", pull, target.normals[near])[:, None] * target.normals[near]
-        wanted = shape - start + along + matching.slide * (pull - along)
-        wanted[index], weight[index] = target.marks - start[index], matching.mark_weight
+    for stiffness in stiffnesses:
+        near, weight = _matched(shape, faces, target, tree, search)
+        normals = target.normals[near]
+        wanted = shape - start + _dots(target.vertices[near] - shape, normals)[:, None] * normals
+        if marks:
+            wanted[fixed], weight[fixed] = np.array(list(marks.values())) - start[fixed], mark_weight
         system = sparse.csc_array(sparse.diags_array(weight + 1e-4) + stiffness * bending)
         solver = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         shape = start + solver.solve(weight[:, None] * wanted)
@@ -266,14 +304,18 @@ def refined(
 
 
 def _matched(
-    shape: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], target: Target, tree: KDTree, matching: Matching
+    shape: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], target: Target, tree: KDTree, search: Search
 ) -> tuple[Int[np.ndarray, " V"], Float[np.ndarray, " V"]]:
     """Nearest scan points, and weight 1 where the match is near and faces the same way."""
     normals = vertex_normals(shape, faces)
-    near = np.asarray(tree.query(np.concatenate([shape, normals * matching.normal_mm], 1), workers=1)[1])
+    near = np.asarray(tree.query(np.concatenate([shape, normals * search.normal_mm], 1), workers=1)[1])
     distance = np.linalg.norm(target.vertices[near] - shape, axis=1)
-    facing = np.einsum("nx,nx->n", normals, target.normals[near])
-    return near, np.where((distance < matching.reach_mm) & (facing > 0.7), 1.0, 0.0)
+    facing = _dots(normals, target.normals[near])
+    return near, np.where((distance < search.reach_mm) & (facing > 0.7), 1.0, 0.0)
+
+
+def _dots(a: Float[np.ndarray, "N 3"], b: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
+    return np.einsum("nx,nx->n", a, b)
 
 
 def _bending(faces: Int[np.ndarray, "F 3"], vertices: Float[np.ndarray, "V 3"]) -> sparse.csr_array:

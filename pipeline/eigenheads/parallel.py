@@ -12,7 +12,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 FEW = 12  # with fewer items the processes' start (two seconds) costs more than they save
-_CHUNK = 4  # what a task carries besides its item (a prior of 35 MB) travels once a chunk
+_CHUNK = 4  # what a task carries besides its item (a prior of 40 MB) travels once a chunk
 
 
 @dataclass(frozen=True, slots=True, eq=False)

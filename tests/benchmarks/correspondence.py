@@ -5,7 +5,7 @@
 somewhere on its own true head; the same place of the mesh on another true head is where it must be there.
 
 Three rows, because the refinement's prior is a head model and the scanned heads come from one: ``paper`` uses no
-prior; ``held_out`` a prior built from 100 other subjects of the database; ``in_span`` the shipped model, which has
+prior; ``held_out`` a prior built from all other subjects of the database; ``in_span`` the shipped model, which has
 seen these very subjects, and so flatters.
 """
 
@@ -23,10 +23,10 @@ from pipeline.eigenheads.pca import principal_components
 from pipeline.eigenheads.scanner import Scanner, scan_head
 
 
-def without(subjects: list[int], count: int = 100) -> HeadModel:
-    """The default model rebuilt from ``count`` of its subjects, none of the given ones among them."""
+def without(subjects: list[int]) -> HeadModel:
+    """The default model rebuilt from all of its subjects but the given ones."""
     parts, _ = read_parts(model_path("default"))
-    others = [k for k in range(len(parts.scores)) if k not in subjects][:count]
+    others = [k for k in range(len(parts.scores)) if k not in subjects]
     heads = parts.mean + np.tensordot(parts.scores[others], parts.modes, 1)
     c = principal_components(heads.astype(float))
     return assemble(replace(parts, mean=c.mean, modes=c.modes, sigma=c.sigma, scores=c.scores), "held out")

@@ -10,8 +10,8 @@ from scipy.spatial.distance import cdist
 
 from pipeline.eigenheads import prior
 from pipeline.eigenheads.closest import SurfaceIndex
-from pipeline.eigenheads.correspondence import Correspondence, Matching, _resampled, correspond, nearest_mean
-from pipeline.eigenheads.landmarks import NAMES, stacked
+from pipeline.eigenheads.correspondence import Correspondence, Matching, _resampled, correspond, nearest_mean, prepared
+from pipeline.eigenheads.landmarks import NAMES, mirrored, stacked
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.parallel import FEW, workers
 from pipeline.eigenheads.scanner import Scanner, scan_head
@@ -106,24 +106,66 @@ def _motion(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def test_localising_multiplies_the_covariance_by_a_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against the product written out; Nystroem leaves out eigenvalues below a thousandth of the largest."""
+    """Against the product written out; a sketch as wide as the space leaves out nothing but rounding."""
     rng = np.random.default_rng(3)
     places, modes = rng.uniform(-80, 80, (50, 3)), rng.normal(0, 2, (4, 50, 3))
     monkeypatch.setattr(prior, "KEPT", 150)
-    found = prior.localised(places, modes).reshape(-1, 150)
+    monkeypatch.setattr(prior, "_BLOCK", 16)
+    found = prior.localised(places, modes.astype(np.float32)).reshape(-1, 150)
     plain = modes.reshape(4, -1)
     window = np.repeat(np.repeat(np.exp(-(cdist(places, places) ** 2) / (2 * prior.LENGTH_MM**2)), 3, 0), 3, 1)
     wanted = window * (plain.T @ plain)
-    assert np.abs(found.T @ found - wanted).max() < 0.02 * np.abs(wanted).max()
+    assert np.abs(found.T @ found - wanted).max() < 1e-3 * np.abs(wanted).max()
 
 
 def test_the_mixture_keeps_each_vertex_variance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a mesh without two sides, so that nothing is mirrored."""
     rng = np.random.default_rng(4)
     places, modes = rng.uniform(-80, 80, (40, 3)), rng.normal(0, 2, (5, 40, 3))
     monkeypatch.setattr(prior, "KEPT", 120)
-    mixed = prior.mixed_modes(places, modes)
-    np.testing.assert_allclose((mixed**2).sum(0), (modes**2).sum(0), rtol=0.03)
+    mixed = prior.registration_prior(places, modes, rng.permutation(40)[:39].reshape(13, 3).astype(np.int32))
+    assert mixed.broad == 5
+    np.testing.assert_allclose((mixed.modes.astype(float) ** 2).sum(0), (modes**2).sum(0), rtol=1e-3)
     assert pytest.approx(1) == prior.GLOBAL**2 + prior.LOCAL**2
+
+
+def test_the_prior_takes_a_head_for_as_likely_as_its_mirror_image(
+    model: HeadModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Landmarks' names say what lies opposite. The covariance of any two places is that of their mirror images."""
+    monkeypatch.setattr(prior, "KEPT", 0)  # the localised part is a product of two symmetric ones
+    faces, mean = model.levels["cage"].faces, model.mean.astype(float)
+    opposite = prior.mirror_images(mean, faces)
+    assert opposite is not None
+    np.testing.assert_array_equal(opposite[opposite], np.arange(len(mean)))
+    for name in NAMES:
+        assert opposite[model.landmarks[name]] == model.landmarks[mirrored(name)]
+    found = prior.registration_prior(mean, model.modes, faces)
+    some = np.random.default_rng(0).choice(len(mean), 60, replace=False)
+    here = found.modes[:, some].reshape(found.broad, -1).astype(float)
+    there = (found.modes[:, opposite[some]] * [-1, 1, 1]).reshape(found.broad, -1).astype(float)
+    np.testing.assert_allclose(there.T @ there, here.T @ here, atol=1e-4)
+    np.testing.assert_allclose(found.mean[opposite] * [-1, 1, 1], found.mean, atol=1e-9)
+
+
+def test_smoothing_a_scan_takes_noise_and_keeps_size(model: HeadModel) -> None:
+    """White noise on a triangular grid falls as its spectrum says; a plain smoothing would move the skin inwards."""
+    a, b = np.meshgrid(*[2 * np.pi * np.arange(64) / 64] * 2)
+    roughness = 1 - (1 + 2 * np.cos(a) + 2 * np.cos(b) + 2 * np.cos(a + b)) / 7
+    share = np.sqrt((((1 - 0.5 * roughness) * (1 + 0.53 * roughness)) ** 8).mean())
+    faces, head = model.levels["full"].faces, model.vertices(np.zeros(0))
+    scanner = Scanner(noise_mm=0.3, landmark_noise_mm=0, turn_rad=0, shift_mm=0, ear_holes=False, holes=0)
+    scan = scan_head("s", head, faces, model.landmarks, scanner, np.random.default_rng(0))
+    smooth = prepared(scan, np.eye(3), np.zeros(3)).vertices
+    brow = np.linalg.norm(scan.vertices - scan.landmarks["glabella"], axis=1) < 30
+    skull = (scan.vertices[:, 1] > scan.landmarks["glabella"][1] + 40) & (scan.vertices[:, 2] < 0)
+    for where in (brow, skull):
+        some = np.flatnonzero(where)[::5]
+        near = SurfaceIndex(head, faces).closest(smooth[some])
+        off = np.einsum("nx,nx->n", smooth[some] - near.points, near.normals)
+        assert off.std() < 1.1 * share * 0.3
+        assert abs(off.mean()) < 0.02
+    assert share < 0.6
 
 
 def test_processes_give_what_one_gives_in_order_and_say_how_far_they_are() -> None:
