@@ -16,7 +16,7 @@ sticks out. It shrinks step by step, which carries the fit over clutter from a s
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import cv2
@@ -24,12 +24,13 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int
-from numba import njit, prange
+from numba import njit
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.rim import Rim, Topology, Views, find_rim, make_topology, pack_views, project_with_slopes
 from pipeline.fitting.surface import SurfaceObservations, surface_cost, surface_equations
+from pipeline.fitting.threads import in_threads
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import Silhouette
 from rig.camera import Camera
@@ -102,6 +103,7 @@ class Problem:
     floor_px: float = 0.0  # no robust scale below this: three standard deviations of the model's misfit
     clutter: tuple[Bool[np.ndarray, "_ _"], ...] | None = None  # per view, in cells: where the input is hair or clothes
     surface: SurfaceObservations | None = None  # what photographs say between the rims
+    hair: Mapping[str, Bool[np.ndarray, " v"]] = field(default_factory=dict)  # by level: whose outline is hair's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,10 +209,15 @@ def with_misfit(problem: Problem, state: State, stage: Stage) -> Problem:
 
 def held_inside(problem: Problem, rim: Rim, level: str) -> Rim:
     """The rim where cranium, ears and neck only count as far as they stick out of the input."""
-    region = problem.model.levels[level].face_region
-    face = region[rim.corner].all(axis=1)
+    face = face_of(problem, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
     return replace(rim, length=np.where(face, rim.length, share * rim.length))
+
+
+def face_of(problem: Problem, level: str) -> Bool[np.ndarray, " v"]:
+    """The face region, less what is known to lie under hair."""
+    region = problem.model.levels[level].face_region
+    return region & ~problem.hair[level] if level in problem.hair else region
 
 
 def find_clutter(problem: Problem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
@@ -523,7 +530,7 @@ def normal_equations(
 def speaking(rim: Rim) -> Rim:
     """The samples that have any weight."""
     kept = rim.length > 0
-    return rim if kept.all() else Rim(*(getattr(rim, field)[kept] for field in Rim.__dataclass_fields__))
+    return rim if kept.all() else Rim(*(getattr(rim, name)[kept] for name in Rim.__dataclass_fields__))
 
 
 def rim_rows(problem: Problem, state: State, rim: Rim, stage: Stage) -> Float[np.ndarray, "s q"]:
@@ -531,19 +538,26 @@ def rim_rows(problem: Problem, state: State, rim: Rim, stage: Stage) -> Float[np
     pose, views = state.world_from_head, moved_views(problem, state)
     operator, modes = problem.bases[stage.level]
     rows = np.empty((len(rim.view), stage.modes + POSE + PER_CAMERA))
-    _fill_rows(
-        operator.indptr, operator.indices, operator.data, modes, stage.modes, pose.scale * pose.rotation,
-        pose.translation, views.rotation, views.translation, rim.view, rim.corner, rim.blend, rim.point, rim.gradient,
-        rows,
-    )  # fmt: skip
+    # One type for every level, or the loop is compiled once for each.
+    start, member = operator.indptr.astype(np.int64), operator.indices.astype(np.int64)
+    blend, point, gradient = (np.ascontiguousarray(part) for part in (rim.blend, rim.point, rim.gradient))
+    turn = pose.scale * pose.rotation
+
+    def fill(first: int, last: int) -> None:
+        _fill_rows(
+            first, last, start, member, operator.data, modes, stage.modes, turn, pose.translation, views.rotation,
+            views.translation, rim.view, rim.corner, blend, point, gradient, rows,
+        )  # fmt: skip
+
+    in_threads(len(rows), fill)
     return rows
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def _fill_rows(indptr, indices, data, modes, count, turn, place, rotation, translation, view, corner, blend, point,
-               gradient, out):  # fmt: skip
+@njit(cache=True, nogil=True, fastmath=True)
+def _fill_rows(first, last, indptr, indices, data, modes, count, turn, place, rotation, translation, view, corner,
+               blend, point, gradient, out):  # fmt: skip
     """Modes: the sum over the cage of (gradient . mode), through the level's operator and the edge's blend."""
-    for s in prange(len(view)):
+    for s in range(first, last):
         gx, gy, gz = gradient[s]
         hx = gx * turn[0, 0] + gy * turn[1, 0] + gz * turn[2, 0]
         hy = gx * turn[0, 1] + gy * turn[1, 1] + gz * turn[2, 1]

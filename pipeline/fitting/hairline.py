@@ -47,9 +47,9 @@ def under_hair(model: HeadModel, patches: Patches, sights: list[Sight]) -> Bool[
     """The patches that show hair, or are about to."""
     rest = np.zeros(len(patches.centre), bool)
     vertices = model.vertices(np.zeros(0))
-    outside = KDTree(vertices[~model.levels["full"].face_region])
     downward = patches.normals(vertex_normals(vertices, model.levels["full"].faces))[:, 1] < DOWNWARD
-    bare = (outside.query(patches.points(vertices))[0] > MIDDLE_MM) | downward
+    inward = depth_in_face(model)
+    bare = (patches.mixed(inward) > MIDDLE_MM) | downward
     hair = np.concatenate([_strange(sight) for sight in sights]) if sights else np.zeros((0, 3), np.uint8)
     skin = [s.image[tuple(_rounded(s.pixels[s.seen & bare]).T[::-1])] for s in sights]
     if len(hair) < LEAST_PIXELS or not sum(len(colours) for colours in skin):
@@ -63,7 +63,14 @@ def under_hair(model: HeadModel, patches: Patches, sights: list[Sight]) -> Bool[
     share = patch_mean(patches, votes / np.maximum(views, 1), views > 0)
     share[patch_mean(patches, downward.astype(float), np.ones(len(bare), bool)) > 0.5] = 0.0
     centres = vertices[patches.centre]
-    return spread_from_border(centres, share > HAIR_SHARE, outside.query(centres)[0] < BORDER_MM)
+    return spread_from_border(centres, share > HAIR_SHARE, inward[patches.centre] < BORDER_MM)
+
+
+def depth_in_face(model: HeadModel) -> Float[np.ndarray, " v"]:
+    """Distance (mm) of every vertex of the full level to what is not face; taken on the cage, where it is as smooth."""
+    points, cage = model.mean.astype(float), model.levels["cage"]
+    distance, _ = KDTree(points[~cage.face_region]).query(points)
+    return model.levels["full"].operator @ distance
 
 
 def histogram(colours: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "b b b"]:
@@ -81,10 +88,8 @@ def patch_mean(
     patches: Patches, values: Float[np.ndarray, " s"], known: Bool[np.ndarray, " s"]
 ) -> Float[np.ndarray, " c"]:
     """Mean over each patch's known samples; 0 where none is known."""
-    owner = np.repeat(np.arange(len(patches.centre)), np.diff(patches.start))
-    weights = patches.agreement * known[patches.member]
-    total = np.bincount(owner, weights, len(patches.centre))
-    return np.bincount(owner, weights * values[patches.member], len(patches.centre)) / np.maximum(total, 1e-9)
+    total = patches.sums(patches.agreement, np.stack([values * known, known], axis=1).astype(float))
+    return total[:, 0] / np.maximum(total[:, 1], 1e-9)
 
 
 def spread_from_border(

@@ -8,6 +8,7 @@ are shared by the patches that overlap, so that every image is read once per sam
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sparse
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import KDTree
 
@@ -30,9 +31,18 @@ class Patches:
     def points(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
         return _mixed(vertices, self.corners, self.shares)
 
+    def mixed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " s"]:
+        """What the vertices have, at the samples."""
+        return np.einsum("sk,sk->s", self.shares, values[self.corners])
+
     def normals(self, vertex_normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
         mixed = _mixed(vertex_normals, self.corners, self.shares)
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+
+    def sums(self, weights: Float[np.ndarray, " e"], values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "c n"]:
+        """Weighted sums over the samples of each patch."""
+        shape = (len(self.centre), len(self.corners))
+        return sparse.csr_array((weights, self.member, self.start), shape=shape) @ values
 
     def weights(self, size_mm: float) -> Float[np.ndarray, " e"]:
         """A Gaussian window of that standard deviation."""

@@ -13,10 +13,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.eigenheads.kernel import with_fine_kernel
+from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.consistency import Round, hair_patches, look, observe
 from pipeline.fitting.contour import Problem, Solved, Stage, State, run_stage, widened
 from pipeline.fitting.patches import Patches, make_patches
@@ -30,6 +31,7 @@ RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its wid
 LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is the full level's anyway
 VIEWS_LEAST = 3
 NEIGHBOURS, NEAR_MM = 24, 4.0  # patches about a vertex: two windows
+HAIR_REACH_MM = 4.0  # patches are 3 mm apart
 LOST_MM = 2.5  # off by at least that where nothing matches: what two photographs still recognise
 MISFIT_FACTOR = 1.1  # chosen so that 95 % intervals hold 90 to 98 % of two scans and two draws, by two populations
 
@@ -50,24 +52,33 @@ def refine_with_photographs(
     model = with_fine_kernel(problem.model, length_mm=settings.fine_length_mm, amplitude_mm=settings.fine_amplitude_mm)
     problem = widened(problem, model, (LEVEL,))
     patches = patches_for(problem, settings)
+    basis = model.basis("full", len(model.modes), patches.centre)
     stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
     state, evaluations, reason, share = solved.state, solved.evaluations, solved.stopped_because, 0.0
-    silent, lost = None, np.zeros(0, int)
+    lost = np.zeros(0, int)
     for each in ROUNDS:
         looks = look(problem, state, patches, photographs.speaks, settings)
-        if silent is None:
-            silent = hair_patches(problem, state, patches, photographs, looks)
-        surface, lost = observe(problem, state, photographs, patches, looks, silent, each, settings)
+        hair = hair_patches(problem, state, patches, photographs, looks)
+        surface, lost = observe(problem, state, photographs, patches, looks, hair, basis, each, settings)
         share = len(surface.vertex) / max(len(patches.centre), 1)
         if share < settings.least_share:
             why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"
             return solved, Detail("kernel", why)
-        problem = replace(problem, surface=surface)
+        problem = replace(problem, surface=surface, hair={LEVEL: near_hair(model, patches.centre[hair])})
         state, used, reason = run_stage(problem, state, stage, lambda fraction: None)
         evaluations += used
     why = f"{share:.0%} of the face look alike in two or more of {speaking} photographs"
     misfit = unfollowed(problem, state, lost)
     return Solved(problem, state, stage, evaluations, reason, misfit), Detail("photo", why)
+
+
+def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
+    """The vertices of the rim's level about vertices of the full level that lie under hair: their outline is hair's. A
+    fit to contours alone has bulged into it wherever its edge hung together with the face's."""
+    mean = model.vertices(np.zeros(0))
+    if not len(hair):
+        return np.zeros(model.levels[LEVEL].count, bool)
+    return KDTree(mean[hair]).query(mean[model.levels[LEVEL].rows])[0] < HAIR_REACH_MM
 
 
 def unfollowed(problem: Problem, state: State, lost: Int[np.ndarray, " u"]) -> Float[np.ndarray, " v0"]:

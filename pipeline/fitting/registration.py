@@ -11,158 +11,169 @@ Eliminating u leaves how the place that the patch reports leans on the cameras, 
 alone: shifts that no surface explains. A camera of 0.2 px error shows in thousands of patches.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
-from numba import njit, prange
+from jaxtyping import Bool, Float, Float32, Int
+from numba import njit
 
-from pipeline.fitting.rim import _project, _projection_jacobian
-from pipeline.fitting.sweep import chosen_views
-
-VIEWS_MOST = 8  # of one patch
-
-
-@njit(cache=True, fastmath=True)
-def _read(image, start, width, height, x, y):
-    x, y = min(max(x, 0.0), width - 1.001), min(max(y, 0.0), height - 1.001)
-    column, row = int(x), int(y)
-    fx, fy = x - column, y - row
-    i = start + row * width + column
-    top = image[i] + fx * (image[i + 1] - image[i])
-    bottom = image[i + width] + fx * (image[i + width + 1] - image[i + width])
-    return top + fy * (bottom - top)
+from pipeline.fitting.patches import Patches
+from pipeline.fitting.sweep import read
+from pipeline.fitting.threads import in_threads
+from rig.camera import Camera
 
 
-@njit(cache=True, fastmath=True)
-def _fill(members, weights, facing, points, normals, shift, rotation, translation, lens, width, height, start, image,
-          noise, shade, slope_x, slope_y):  # fmt: skip
-    """Centred grey values of unit norm and their slopes by a shift in the image, of one view of one patch."""
-    seen = mean = mean_x = mean_y = 0.0
-    place = np.empty(3)
-    for i in range(len(members)):
-        s = members[i]
-        shade[i] = slope_x[i] = slope_y[i] = 0.0
-        if facing[s] <= 0:
-            continue
-        for c in range(3):
-            place[c] = points[s, c] + shift * normals[s, c]
-        x, y = _project(place, rotation, translation, lens)
-        shade[i] = _read(image, start, width, height, x, y)
-        slope_x[i] = 0.5 * (
-            _read(image, start, width, height, x + 1.0, y) - _read(image, start, width, height, x - 1.0, y)
-        )
-        slope_y[i] = 0.5 * (
-            _read(image, start, width, height, x, y + 1.0) - _read(image, start, width, height, x, y - 1.0)
-        )
-        seen += weights[i]
-        mean += weights[i] * shade[i]
-        mean_x += weights[i] * slope_x[i]
-        mean_y += weights[i] * slope_y[i]
-    energy = along_x = along_y = 0.0
-    for i in range(len(members)):
-        if facing[members[i]] > 0:
-            shade[i] -= mean / seen
-            slope_x[i] -= mean_x / seen
-            slope_y[i] -= mean_y / seen
-            energy += weights[i] * shade[i] * shade[i]
-            along_x += weights[i] * shade[i] * slope_x[i]
-            along_y += weights[i] * shade[i] * slope_y[i]
-    norm = np.sqrt(energy + seen * noise * noise)
-    for i in range(len(members)):
-        slope_x[i] = (slope_x[i] - along_x / (norm * norm) * shade[i]) / norm
-        slope_y[i] = (slope_y[i] - along_y / (norm * norm) * shade[i]) / norm
-        shade[i] /= norm
+@dataclass(frozen=True, slots=True, eq=False)
+class Leaning:
+    """Of n patches: how the place that each reports leans on the cameras, and what they say of the cameras alone."""
+
+    by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
+    stiff: Float[np.ndarray, "n a a"]  # of the image shifts of its views, by the patch's own information
+    slope: Float[np.ndarray, "n a"]
+    slides: Float[np.ndarray, "n a c"]  # d(image shifts) / d(cameras)
+
+    def cameras(self, information: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
+        """Matrix and gradient (towards the minimum) in the cameras."""
+        slides = self.slides.reshape(-1, self.slides.shape[2])
+        pulled = (self.stiff * information[:, None, None]) @ self.slides
+        return slides.T @ pulled.reshape(slides.shape), -(self.slope * information[:, None]).ravel() @ slides
 
 
-@njit(cache=True, fastmath=True)
-def _equations(weights, value, shades, slopes):
-    """H (2n, 2n) and the gradient (2n,) of one patch."""
-    views, count = len(value), len(weights)
-    total = value.sum()
-    matrix, gradient = np.zeros((2 * views, 2 * views)), np.zeros(2 * views)
-    mean = np.zeros(count)
-    for k in range(views):
-        for i in range(count):
-            mean[i] += value[k] / total * shades[k, i]
-    for a in range(2 * views):
-        k = a // 2
-        for i in range(count):
-            gradient[a] += value[k] * weights[i] * slopes[a, i] * (shades[k, i] - mean[i])
-        for b in range(a + 1):
-            m = b // 2
-            product = 0.0
+def lean(
+    view: Int[np.ndarray, "n v"],
+    value: Float[np.ndarray, "n v"],
+    grams: tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]],
+    places: Float[np.ndarray, "n 3"],
+    axes: Float[np.ndarray, "n 3"],
+    cameras: tuple[Camera, ...],
+) -> Leaning:
+    """Of patches whose surface lies at ``places`` and moves along ``axes``; ``grams``: of ``gram_matrices``."""
+    slopes, mixed = grams
+    axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes
+    total = np.maximum(value.sum(axis=1), 1e-12)[:, None]
+    same = np.repeat(np.repeat(np.eye(value.shape[1], dtype=bool), 2, axis=0), 2, axis=1)
+    across_views = axis_value[:, :, None] * axis_value[:, None, :] / total[:, :, None]
+    matrix = slopes * (axis_value[:, :, None] * same - across_views)
+    own_shade = np.take_along_axis(mixed, (np.arange(axis_value.shape[1]) // 2)[None, :, None], axis=2)[:, :, 0]
+    gradient = axis_value * (own_shade - np.einsum("nav,nv->na", mixed, value / total))
+    ahead, slides = image_motion(view, places, axes, cameras)
+    # The surface moves freely: u = - (ahead . (H delta + gradient)) / (ahead . H ahead).
+    across = np.einsum("nab,nb->na", matrix, ahead)
+    own = np.einsum("na,na->n", ahead, across)
+    own = np.where(own > 1e-12, own, np.inf)[:, None]
+    down = np.einsum("na,na->n", ahead, gradient)[:, None]
+    return Leaning(
+        by_camera=np.einsum("na,nac->nc", -across / own, slides),
+        stiff=(matrix - across[:, :, None] * across[:, None, :] / own[:, :, None]) / own[:, :, None],
+        slope=(gradient - across * down / own) / own,
+        slides=slides,
+    )
+
+
+def image_motion(
+    view: Int[np.ndarray, "n v"],
+    places: Float[np.ndarray, "n 3"],
+    axes: Float[np.ndarray, "n 3"],
+    cameras: tuple[Camera, ...],
+) -> tuple[Float[np.ndarray, "n a"], Float[np.ndarray, "n a c"]]:
+    """Per image axis of each patch's views: motion (px) by a mm along the axis, and by the cameras' corrections."""
+    ahead = np.zeros((*view.shape, 2))
+    slides = np.zeros((*view.shape, 2, len(cameras), 6))
+    for k, camera in enumerate(cameras):
+        patch, column = np.nonzero(view == k)
+        _, slope = camera.project_with_jacobian(places[patch])
+        ahead[patch, column] = np.einsum("nac,nc->na", slope, axes[patch])
+        # By the point in the camera's frame, where the correction (a left perturbation, as everywhere) acts.
+        inner = slope @ camera.camera_from_world.rotation.T
+        arm = camera.camera_from_world.apply(places[patch])[:, None]
+        slides[patch, column, :, k] = np.concatenate([np.cross(arm, inner), inner], axis=2)
+    count, axes_count = len(view), 2 * view.shape[1]
+    return ahead.reshape(count, axes_count), slides.reshape(count, axes_count, 6 * len(cameras))
+
+
+def gram_matrices(
+    patches: Patches,
+    chosen: Int[np.ndarray, " n"],
+    weights: Float[np.ndarray, " e"],
+    view: Int[np.ndarray, "n v"],
+    shifts: Float[np.ndarray, " n"],
+    pixel: Float[np.ndarray, "k s 2"],
+    along: Float[np.ndarray, "k s 2"],
+    seen: Bool[np.ndarray, "k s"],
+    size: Int[np.ndarray, "k 2"],
+    offset: Int[np.ndarray, " k"],
+    image: Float32[np.ndarray, " i"],
+    noise: Float[np.ndarray, " k"],
+) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
+    """<g, g> of the slopes of a patch's views, two axes each, and <g, f> of slopes and grey values, with the surface
+    moved by ``shifts`` (mm along the normals)."""
+    count, views = view.shape
+    slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))
+    start, member = patches.start, patches.member
+    in_threads(
+        count,
+        lambda a, b: _grams(
+            a, b, chosen, start, member, weights, view, shifts, pixel, along, seen, size, offset, image, noise,
+            slopes, mixed,
+        ),
+    )  # fmt: skip
+    return slopes, mixed
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _grams(first, last, chosen, start, member, weight, view, shifts, pixel, along, seen, size, offset, image, noise,
+           slopes, mixed):  # fmt: skip
+    for q in range(first, last):
+        begin, count, views = start[chosen[q]], start[chosen[q] + 1] - start[chosen[q]], 0
+        while views < view.shape[1] and view[q, views] >= 0:
+            views += 1
+        shades, turns = np.empty((views, count)), np.empty((2 * views, count))
+        for j in range(views):
+            k = view[q, j]
+            from_, width, height = offset[k], size[k, 0], size[k, 1]
+            total = mean = mean_x = mean_y = 0.0
             for i in range(count):
-                product += weights[i] * slopes[a, i] * slopes[b, i]
-            matrix[a, b] = product * ((value[k] if k == m else 0.0) - value[k] * value[m] / total)
-            matrix[b, a] = matrix[a, b]
-    return matrix, gradient
-
-
-@njit(cache=True, parallel=True, fastmath=True)
-def register(patches, start, member, weight, facing, points, normals, centres, axes, shifts, rotation, translation,
-             lens, size, offset, image, noise, least_share, most):  # fmt: skip
-    """Of each of ``patches`` at its ``shifts`` (mm): its views (-1 where fewer), pull (2n: d(place)/d(image shifts)),
-    stiffness (2n, 2n) and gradient (2n) of the image shifts once the surface has moved freely, by its own H_uu."""
-    count = len(patches)
-    views = np.full((count, VIEWS_MOST), -1, np.int64)
-    pull = np.zeros((count, 2 * VIEWS_MOST))
-    stiff, slope = np.zeros((count, 2 * VIEWS_MOST, 2 * VIEWS_MOST)), np.zeros((count, 2 * VIEWS_MOST))
-    for q in prange(count):
-        p = patches[q]
-        members, weights = member[start[p] : start[p + 1]], weight[start[p] : start[p + 1]]
-        order, cosine = chosen_views(members, weights, facing, least_share, min(most, VIEWS_MOST))
-        n = len(order)
-        shades, slopes = np.empty((n, len(members))), np.empty((2 * n, len(members)))
-        value, ahead = np.empty(n), np.empty(2 * n)
-        place = centres[q] + shifts[q] * axes[q]
-        for j in range(n):
-            k = order[j]
-            views[q, j], value[j] = k, cosine[k]
-            _fill(
-                members, weights, facing[k], points, normals, shifts[q], rotation[k], translation[k], lens[k],
-                size[k, 0], size[k, 1], offset[k], image, noise[k], shades[j], slopes[2 * j], slopes[2 * j + 1],
-            )  # fmt: skip
-            jacobian = _projection_jacobian(place, rotation[k], translation[k], lens[k])
-            ahead[2 * j] = (jacobian[0] * axes[q]).sum()
-            ahead[2 * j + 1] = (jacobian[1] * axes[q]).sum()
-        matrix, gradient = _equations(weights, value, shades, slopes)
-        across = matrix @ ahead
-        own = (ahead * across).sum()
-        if own <= 1e-12:
-            views[q] = -1
-            continue
-        down = (ahead * gradient).sum()
-        for a in range(2 * n):
-            pull[q, a] = -across[a] / own
-            slope[q, a] = (gradient[a] - across[a] * down / own) / own
-            for b in range(2 * n):
-                stiff[q, a, b] = (matrix[a, b] - across[a] * across[b] / own) / own
-    return views, pull, stiff, slope
-
-
-@njit(cache=True)
-def gather(views, pull, stiff, slope, information, places, rotation, translation, lens):
-    """by_camera (n, 6K), camera_matrix (6K, 6K) and camera_gradient (6K,) of ``surface.SurfaceObservations``."""
-    count, cameras = len(views), len(rotation)
-    rows, matrix, gradient = np.zeros((count, 6 * cameras)), np.zeros((6 * cameras, 6 * cameras)), np.zeros(6 * cameras)
-    for q in range(count):
-        n = 0
-        while n < views.shape[1] and views[q, n] >= 0:
-            n += 1
-        slides = np.zeros((2 * n, 6))  # d(pixel) / d(camera): left perturbation, as everywhere
-        for j in range(n):
-            k = views[q, j]
-            # P R^T is the derivative by the point in the camera's frame, where the perturbation acts.
-            inner = _projection_jacobian(places[q], rotation[k], translation[k], lens[k]) @ rotation[k].T
-            x, y, z = rotation[k] @ places[q] + translation[k]
-            for a in range(2):
-                gx, gy, gz = inner[a]
-                slides[2 * j + a] = np.array([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx, gx, gy, gz])
-        for a in range(2 * n):
-            first = 6 * views[q, a // 2]
-            rows[q, first : first + 6] += pull[q, a] * slides[a]
-            gradient[first : first + 6] -= information[q] * slope[q, a] * slides[a]
-            for b in range(2 * n):
-                second = 6 * views[q, b // 2]
-                for i in range(6):
-                    for j in range(6):
-                        matrix[first + i, second + j] += information[q] * stiff[q, a, b] * slides[a, i] * slides[b, j]
-    return rows, matrix, gradient
+                s, w = member[begin + i], weight[begin + i]
+                shades[j, i] = turns[2 * j, i] = turns[2 * j + 1, i] = 0.0
+                if not seen[k, s]:
+                    continue
+                x = pixel[k, s, 0] + shifts[q] * along[k, s, 0]
+                y = pixel[k, s, 1] + shifts[q] * along[k, s, 1]
+                shades[j, i] = read(image, from_, width, height, x, y)
+                turns[2 * j, i] = 0.5 * (
+                    read(image, from_, width, height, x + 1.0, y) - read(image, from_, width, height, x - 1.0, y)
+                )
+                turns[2 * j + 1, i] = 0.5 * (
+                    read(image, from_, width, height, x, y + 1.0) - read(image, from_, width, height, x, y - 1.0)
+                )
+                total += w
+                mean += w * shades[j, i]
+                mean_x += w * turns[2 * j, i]
+                mean_y += w * turns[2 * j + 1, i]
+            energy = along_x = along_y = 0.0
+            for i in range(count):
+                if seen[k, member[begin + i]]:
+                    w = weight[begin + i]
+                    shades[j, i] -= mean / total
+                    turns[2 * j, i] -= mean_x / total
+                    turns[2 * j + 1, i] -= mean_y / total
+                    energy += w * shades[j, i] * shades[j, i]
+                    along_x += w * shades[j, i] * turns[2 * j, i]
+                    along_y += w * shades[j, i] * turns[2 * j + 1, i]
+            square = energy + total * noise[k] * noise[k]
+            norm = np.sqrt(square)
+            for i in range(count):  # the slope of what has unit norm
+                turns[2 * j, i] = (turns[2 * j, i] - along_x / square * shades[j, i]) / norm
+                turns[2 * j + 1, i] = (turns[2 * j + 1, i] - along_y / square * shades[j, i]) / norm
+                shades[j, i] /= norm
+        for a in range(2 * views):
+            for b in range(a + 1):
+                product = 0.0
+                for i in range(count):
+                    product += weight[begin + i] * turns[a, i] * turns[b, i]
+                slopes[q, a, b] = slopes[q, b, a] = product
+            for b in range(views):
+                product = 0.0
+                for i in range(count):
+                    product += weight[begin + i] * turns[a, i] * shades[b, i]
+                mixed[q, a, b] = product

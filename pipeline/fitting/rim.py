@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
-from numba import njit, prange
+from numba import njit
 
+from pipeline.fitting.threads import in_threads
 from rig.layout import Rig
 
 SAMPLES_MOST = 6000  # rim samples of one view; a full head has about 1,000
@@ -116,20 +117,45 @@ def find_rim(
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
     normals, planes = _normals_and_planes(vertices, topology.faces)
-    found = [
-        _find_all(
-            vertices, normals, planes, topology.faces, topology.edges, faces, views.rotation[some],
-            views.translation[some], views.lens[some], views.size[some], views.distance, views.offset[some],
-            np.array(STEPS_OUT_PX),
-        )
-        for some in (slice(k, k + VIEWS_A_WORD) for k in range(0, len(views.names), VIEWS_A_WORD))
-    ]  # fmt: skip
-    view = np.concatenate([word * VIEWS_A_WORD + view for word, (view, _, _) in enumerate(found)])
-    corner, values = (np.concatenate([part[i] for part in found]) for i in (1, 2))
+    words = [slice(k, k + VIEWS_A_WORD) for k in range(0, len(views.names), VIEWS_A_WORD)]
+    found = [part for some in words for part in _outlines(topology, vertices, normals, planes, faces, views, some)]
+    view = np.repeat(np.arange(len(found), dtype=np.int32), [len(corner) for corner, _ in found])
+    corner, values = (np.concatenate([part[i] for part in found]) for i in (0, 1))
     return Rim(
         view, corner, values[:, 0], values[:, 1:4], values[:, 4:7], values[:, 7:9], values[:, 9:11], values[:, 11],
         values[:, 12],
     )  # fmt: skip
+
+
+def _outlines(
+    topology: Topology,
+    vertices: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    planes: Float[np.ndarray, "4 f"],
+    speaking: Int32[np.ndarray, " s"],
+    views: Views,
+    some: slice,
+) -> list[tuple[Int32[np.ndarray, "n 2"], Float[np.ndarray, "n 13"]]]:
+    """Of each view, at most VIEWS_A_WORD: corners, and the columns of ``Rim`` from the blend on.
+
+    Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.
+    """
+    rotation, translation = views.rotation[some], views.translation[some]
+    centres = -np.einsum("kji,kj->ki", rotation, translation)
+    swept = _swept(vertices, normals, planes, topology.faces, topology.edges, speaking, centres)
+    counts = np.zeros(len(rotation), np.int64)
+    corners = np.empty((len(rotation), SAMPLES_MOST, 2), np.int32)
+    floats = np.empty((len(rotation), SAMPLES_MOST, 14))
+
+    def see(first: int, last: int) -> None:
+        _see(
+            first, last, vertices, normals, topology.faces, topology.edges, *swept, rotation, translation,
+            views.lens[some], views.size[some], views.distance, views.offset[some], np.array(STEPS_OUT_PX), counts,
+            corners, floats,
+        )  # fmt: skip
+
+    in_threads(len(rotation), see)
+    return [(corners[k, :count], floats[k, :count, :13]) for k, count in enumerate(counts.tolist())]
 
 
 def project_with_slopes(
@@ -476,35 +502,22 @@ def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, cr
     return kept
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def _find_all(vertices, normals, planes, faces, edges, speaking, rotation, translation, lens, size, distance, offset,
-              steps):  # fmt: skip
-    """Samples of all views, at most VIEWS_A_WORD: view, corners, and the columns of ``Rim`` from the blend on.
-
-    Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.
-    """
-    views = len(rotation)
-    centres = np.empty((views, 3))
-    for k in range(views):
-        centres[k] = -(rotation[k].T @ translation[k])
+@njit(cache=True, nogil=True, fastmath=True)
+def _swept(vertices, normals, planes, faces, edges, speaking, centres):
+    """What all views ask of faces, edges and vertices: a bit of a word for each view."""
     facing = _facing(planes, centres)
     folds, fold_words = _folds(edges, facing)
     turned = _turned(vertices, normals, centres)
     crossed, crossed_words = _crossed(faces, speaking, turned)
-    counts = np.zeros(views + 1, np.int64)
-    corners = np.empty((views, SAMPLES_MOST, 2), np.int32)
-    floats = np.empty((views, SAMPLES_MOST, 14))
-    for k in prange(views):
-        counts[k + 1] = _view(
+    return facing, folds, fold_words, turned, crossed, crossed_words
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _see(first, last, vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
+         rotation, translation, lens, size, distance, offset, steps, counts, corners, floats):  # fmt: skip
+    for k in range(first, last):
+        counts[k] = _view(
             vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
             np.uint64(1) << np.uint64(k), rotation[k], translation[k], lens[k], size[k, 0], size[k, 1], distance,
             offset[k], steps, corners[k], floats[k],
         )  # fmt: skip
-    ends = np.cumsum(counts)
-    view = np.empty(ends[-1], np.int32)
-    all_corners, all_floats = np.empty((ends[-1], 2), np.int32), np.empty((ends[-1], 13))
-    for k in range(views):
-        view[ends[k] : ends[k + 1]] = k
-        all_corners[ends[k] : ends[k + 1]] = corners[k, : counts[k + 1]]
-        all_floats[ends[k] : ends[k + 1]] = floats[k, : counts[k + 1], :13]
-    return view, all_corners, all_floats

@@ -81,8 +81,9 @@ def surface_equations(
     """The term's part of J^T W J and J^T W r over (coefficients, pose, cameras where they are solved for)."""
     residual, points = surface_residual(seen, coefficients, world_from_head, camera_shift)
     rows = surface_rows(seen, len(coefficients), world_from_head, points, cameras=cameras)
-    weighted = rows * surface_weights(seen, residual).astype(np.float32)[:, None]
-    matrix, gradient = (weighted.T @ rows).astype(float), weighted.T.astype(float) @ residual
+    root = np.sqrt(surface_weights(seen, residual))
+    rows *= root.astype(np.float32)[:, None]
+    matrix, gradient = (rows.T @ rows).astype(float), (root * residual) @ rows  # A^T A: half the work of A^T B
     if cameras:
         tail = slice(len(gradient) - seen.by_camera.shape[1], None)
         matrix[tail, tail] += seen.camera_matrix

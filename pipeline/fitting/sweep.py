@@ -1,164 +1,127 @@
-"""The compiled inner loops of photo-consistency: who sees a sample, and how alike its views are along the normal."""
+"""The compiled inner loops of photo-consistency: what the views show along the normals, and how alike they look.
+
+Plain loops over arrays; threads share them out.
+"""
 
 import numpy as np
-from numba import njit, prange
+from jaxtyping import Bool, Float, Float32, Int
+from numba import njit
 
-from pipeline.fitting.rim import _project, _projection_jacobian  # the same lens model, compiled once
+from pipeline.fitting.patches import Patches
+from pipeline.fitting.threads import in_threads
 
-LEAST_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
-EDGE_PX = 4  # nothing is read nearer to the image's edge
-WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
-SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring a surface within the window
 LEAST_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
 
 
-@njit(cache=True, nogil=True)
-def project_all(points, rotation, translation, lens):
-    """Pixels (n, 2) and camera depths (n,) of world points."""
-    pixels, depths = np.empty((len(points), 2)), np.empty(len(points))
-    for i in range(len(points)):
-        pixels[i, 0], pixels[i, 1] = _project(points[i], rotation, translation, lens)
-        depths[i] = translation[2]
-        for c in range(3):
-            depths[i] += rotation[2, c] * points[i, c]
-    return pixels, depths
+def choose_views(
+    patches: Patches, weights: Float[np.ndarray, " e"], facing: Float32[np.ndarray, "k s"], least_seen: float, most: int
+) -> tuple[Int[np.ndarray, "c n"], Float[np.ndarray, "c n"]]:
+    """The views that see a patch whole and most frontally, at most ``most``, and the squared cosine of each; -1 and 0
+    where there are fewer."""
+    total = patches.sums(weights, np.ones((facing.shape[1], 1)))
+    seen = patches.sums(weights, (facing > 0).T.astype(float))
+    cosine = patches.sums(weights, facing.T.astype(float)) / np.maximum(seen, 1e-9)
+    value = np.where(seen > least_seen * total, cosine**2, 0.0)
+    view = np.argsort(-value, axis=1, kind="stable")[:, :most]
+    value = np.take_along_axis(value, view, axis=1)
+    speaks = value > LEAST_VIEW
+    return np.where(speaks, view, -1), np.where(speaks, value, 0.0)
 
 
-@njit(cache=True, nogil=True)
-def facing_of(points, normals, rotation, translation, lens, depth, distance, hidden_mm, margin_px):
-    """Cosine between normal and line of sight for every sample that a camera sees; 0 where it does not.
-
-    ``depth`` is the z-buffer of the head, ``distance`` the silhouette's signed distance.
-    """
-    out = np.zeros(len(points), np.float32)
-    height, width = depth.shape
-    centre = -(rotation.T @ translation)
-    for i in range(len(points)):
-        reach = cosine = 0.0
-        for c in range(3):
-            towards = centre[c] - points[i, c]
-            cosine += towards * normals[i, c]
-            reach += towards * towards
-        cosine /= np.sqrt(reach)
-        if cosine < LEAST_FACING:
-            continue
-        x, y = _project(points[i], rotation, translation, lens)
-        if not (EDGE_PX <= x < width - EDGE_PX - 1 and EDGE_PX <= y < height - EDGE_PX - 1):
-            continue
-        column, row = int(x + 0.5), int(y + 0.5)
-        if distance[row, column] > -margin_px:
-            continue
-        z = translation[2]
-        for c in range(3):
-            z += rotation[2, c] * points[i, c]
-        nearest = np.inf
-        for j in range(row - WINDOW_PX, row + WINDOW_PX + 1):
-            for k in range(column - WINDOW_PX, column + WINDOW_PX + 1):
-                nearest = min(nearest, depth[j, k])
-        slope = min(np.sqrt(1.0 - min(1.0, cosine * cosine)) / cosine, 4.0)
-        if z <= nearest + hidden_mm + SLOPE_SLACK * slope * z / lens[0]:
-            out[i] = cosine
+def sweep(
+    pixel: Float[np.ndarray, "k s 2"],
+    along: Float[np.ndarray, "k s 2"],
+    seen: Bool[np.ndarray, "k s"],
+    size: Int[np.ndarray, "k 2"],
+    offset: Int[np.ndarray, " k"],
+    image: Float32[np.ndarray, " n"],
+    steps: Float[np.ndarray, " d"],
+) -> Float32[np.ndarray, "s k d"]:
+    """Grey values of every sample moved along its normal by ``steps`` (mm), as each camera shows it. ``pixel``: where
+    it sees the sample, ``along``: how that moves (px / mm)."""
+    out = np.zeros((pixel.shape[1], len(pixel), len(steps)), np.float32)
+    in_threads(len(out), lambda a, b: _sweep(a, b, pixel, along, seen, size, offset, image, steps, out))
     return out
 
 
-@njit(cache=True, parallel=True, fastmath=True)
-def sweep(points, normals, facing, rotation, translation, lens, size, offset, image, steps):
-    """Grey values (S, K, D) of every sample moved along its normal by ``steps`` (mm), as each camera shows it."""
-    samples, views, count = len(points), len(rotation), len(steps)
-    out = np.zeros((samples, views, count), np.float32)
-    for s in prange(samples):
-        for k in range(views):
-            if facing[k, s] <= 0:
+def correlate(
+    patches: Patches,
+    weights: Float[np.ndarray, " e"],
+    view: Int[np.ndarray, "c n"],
+    value: Float[np.ndarray, "c n"],
+    seen: Bool[np.ndarray, "k s"],
+    grey: Float32[np.ndarray, "s k d"],
+    noise: Float[np.ndarray, " k"],
+) -> Float32[np.ndarray, "c d"]:
+    """Mean normalised cross-correlation over the pairs of the chosen views of each patch; 0 where there is no pair.
+
+    Gain and offset of a view drop out of it. ``noise`` is the standard deviation of grey values: it stands in the norm,
+    so that a patch without texture is like nothing, however alike its noise may look.
+    """
+    score = np.zeros((len(patches.centre), grey.shape[2]), np.float32)
+    start, member = patches.start, patches.member
+    in_threads(len(score), lambda a, b: _correlate(a, b, start, member, weights, view, value, seen, grey, noise, score))
+    return score
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def read(image, start, width, height, x, y):
+    """The image that begins at ``start`` of the row of images, bilinear, held inside."""
+    x, y = min(max(x, 0.0), width - 1.001), min(max(y, 0.0), height - 1.001)
+    column, row = int(x), int(y)
+    fx, fy = np.float32(x - column), np.float32(y - row)
+    i = start + row * width + column
+    top = image[i] + fx * (image[i + 1] - image[i])
+    bottom = image[i + width] + fx * (image[i + width + 1] - image[i + width])
+    return top + fy * (bottom - top)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _sweep(first, last, pixel, along, seen, size, offset, image, steps, out):
+    for s in range(first, last):
+        for k in range(len(pixel)):
+            if not seen[k, s]:
                 continue
-            u, v = _project(points[s], rotation[k], translation[k], lens[k])
-            slope = _projection_jacobian(points[s], rotation[k], translation[k], lens[k])
-            du = dv = 0.0
-            for c in range(3):
-                du += slope[0, c] * normals[s, c]
-                dv += slope[1, c] * normals[s, c]
-            width, height = size[k, 0], size[k, 1]
-            for d in range(count):
-                x = min(max(u + du * steps[d], 0.0), width - 1.001)
-                y = min(max(v + dv * steps[d], 0.0), height - 1.001)
-                column, row = int(x), int(y)
-                fx, fy = np.float32(x - column), np.float32(y - row)
-                i = offset[k] + row * width + column
-                top = image[i] + fx * (image[i + 1] - image[i])
-                bottom = image[i + width] + fx * (image[i + width + 1] - image[i + width])
-                out[s, k, d] = top + fy * (bottom - top)
-    return out
+            for d in range(len(steps)):
+                x = pixel[k, s, 0] + along[k, s, 0] * steps[d]
+                y = pixel[k, s, 1] + along[k, s, 1] * steps[d]
+                out[s, k, d] = read(image, offset[k], size[k, 0], size[k, 1], x, y)
 
 
-@njit(cache=True, fastmath=True)
-def chosen_views(members, weights, facing, least_share, most):
-    """The views that see a patch whole and most frontally, at most ``most``, and the squared cosine of each."""
-    views = len(facing)
-    value = np.zeros(views)
-    total = weights.sum()
-    for k in range(views):
-        seen = cosine = 0.0
-        for i in range(len(members)):
-            f = facing[k, members[i]]
-            if f > 0:
-                seen += weights[i]
-                cosine += weights[i] * f
-        if seen > least_share * total:
-            value[k] = (cosine / seen) ** 2
-    order = np.argsort(-value)[:most]
-    count = 0
-    for k in order:
-        if value[k] > LEAST_VIEW:
-            count += 1
-    return order[:count], value
-
-
-@njit(cache=True, parallel=True, fastmath=True)
-def correlate(start, member, weight, facing, grey, noise, least_share, most):
-    """Mean normalised cross-correlation (C, D) over the pairs of the chosen views of each patch, and their number.
-
-    Gain and offset of a view drop out of it. ``noise`` (K,) is the standard deviation of grey values: it stands in the
-    norm, so that a patch without texture is like nothing, however alike its noise may look.
-    """
-    patches, steps = len(start) - 1, grey.shape[2]
-    score, used = np.zeros((patches, steps), np.float32), np.zeros(patches, np.int32)
-    for p in prange(patches):
-        members, weights = member[start[p] : start[p + 1]], weight[start[p] : start[p + 1]]
-        order, value = chosen_views(members, weights, facing, least_share, most)
-        used[p] = len(order)
-        if len(order) < 2:
+@njit(cache=True, nogil=True, fastmath=True)
+def _correlate(first, last, start, member, weight, view, value, seen, grey, noise, score):
+    for p in range(first, last):
+        begin, count, views = start[p], start[p + 1] - start[p], 0
+        while views < view.shape[1] and view[p, views] >= 0:
+            views += 1
+        if views < 2:
             continue
-        shades = np.empty((len(order), len(members)), np.float32)
-        norms = np.empty(len(order))
-        for d in range(steps):
-            for q in range(len(order)):
-                norms[q] = _centred(members, weights, facing[order[q]], grey, order[q], d, noise[order[q]], shades[q])
-            total = shared = 0.0
-            for q in range(len(order)):
+        shades, norms = np.empty((views, count), np.float32), np.empty(views)
+        for d in range(grey.shape[2]):
+            for q in range(views):
+                k = view[p, q]
+                mean = total = energy = 0.0
+                for i in range(count):
+                    s, w = member[begin + i], weight[begin + i]
+                    shades[q, i] = grey[s, k, d]
+                    if seen[k, s]:
+                        mean += w * grey[s, k, d]
+                        total += w
+                mean /= total
+                for i in range(count):
+                    shade = np.float32(0.0)
+                    if seen[k, member[begin + i]]:
+                        shade = shades[q, i] - np.float32(mean)
+                    shades[q, i] = shade
+                    energy += weight[begin + i] * shade * shade
+                norms[q] = np.sqrt(energy + total * noise[k] * noise[k])
+            together = shared = 0.0
+            for q in range(views):
                 for r in range(q):
                     product = np.float32(0.0)
-                    for i in range(len(members)):
-                        product += np.float32(weights[i]) * shades[q, i] * shades[r, i]
-                    pair = value[order[q]] * value[order[r]]
-                    total += pair * product / (norms[q] * norms[r])
+                    for i in range(count):
+                        product += np.float32(weight[begin + i]) * shades[q, i] * shades[r, i]
+                    pair = value[p, q] * value[p, r]
+                    together += pair * product / (norms[q] * norms[r])
                     shared += pair
-            score[p, d] = total / shared
-    return score, used
-
-
-@njit(cache=True, fastmath=True)
-def _centred(members, weights, facing, grey, view, step, noise, out):
-    """Fills ``out`` with grey values less their weighted mean (0 where unseen); returns their norm, noise included."""
-    mean = seen = 0.0
-    for i in range(len(members)):
-        if facing[members[i]] > 0:
-            mean += weights[i] * grey[members[i], view, step]
-            seen += weights[i]
-    mean /= seen
-    energy = 0.0
-    for i in range(len(members)):
-        out[i] = np.float32(0.0)
-        if facing[members[i]] > 0:
-            shade = grey[members[i], view, step] - mean
-            out[i] = np.float32(shade)
-            energy += weights[i] * shade * shade
-    return np.sqrt(energy + seen * noise * noise)
+            score[p, d] = together / shared

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.consistency import look, pixels_per_mm
+from pipeline.fitting.consistency import facing_of, look, pixels_per_mm
 from pipeline.fitting.contour import Stage, State, apply_step
 from pipeline.fitting.hairline import spread_from_border
-from pipeline.fitting.patches import spread_samples
+from pipeline.fitting.patches import Patches, spread_samples
 from pipeline.fitting.photo import patches_for, refine_with_photographs
 from pipeline.fitting.photographs import noise_level
 from pipeline.fitting.surface import SurfaceObservations, surface_cost, surface_equations, surface_residual
-from pipeline.fitting.sweep import correlate, facing_of
+from pipeline.fitting.sweep import choose_views, correlate
 from pipeline.settings import PhotoSettings
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.layout import Rig
@@ -117,16 +117,13 @@ def test_what_is_hidden_is_not_seen(bump: Scene) -> None:
     looks = look(start.problem, start.state, patches, np.ones(len(bump.rig), bool), SETTINGS)
     k, camera = 3, bump.rig["cam03"]
     towards = camera.centre_world - looks.points
-    cosine = (looks.outward * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    outward = patches.normals(looks.normals)
+    cosine = (outward * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
     np.testing.assert_allclose(looks.facing[k][looks.facing[k] > 0], cosine[looks.facing[k] > 0], atol=1e-6)
     assert not looks.facing[k][cosine <= 0].any()
     assert (looks.facing[k][cosine > 0.4] > 0).all()
     plate = np.where(np.arange(640) < 320, 900.0, np.inf)[None].repeat(480, axis=0).astype(np.float32)
-    views = looks.views
-    seen = facing_of(
-        looks.points, looks.outward, views.rotation[k], views.translation[k], views.lens[k], plate,
-        np.full((480, 640), -50.0, np.float32), 1.5, 2.0,
-    )  # fmt: skip
+    seen = facing_of(looks.points, outward, camera, plate, np.full((480, 640), -50.0, np.float32), SETTINGS)
     left = camera.project(looks.points)[:, 0] < 315
     assert not seen[left].any()
     assert seen[~left].any()
@@ -137,17 +134,21 @@ def test_correlation_of_planted_signals() -> None:
     not; the noise level in the norm makes a flat patch mute."""
     rng = np.random.default_rng(1)
     signal, noise = rng.standard_normal(400), rng.standard_normal((400, 2))
-    start, member, weight = np.array([0, 400]), np.arange(400), np.ones(400)
-    facing = np.ones((2, 400), np.float32)
+    patch = Patches(
+        np.zeros((400, 3), np.int32), np.zeros((400, 3)), np.zeros(1, int), np.array([0, 400]), np.arange(400),
+        np.zeros(400), np.ones(400),
+    )  # fmt: skip
+    weights, facing = np.ones(400), np.ones((2, 400), np.float32)
     grey = np.zeros((400, 2, 3), np.float32)
     grey[:, 0] = (10 * signal)[:, None]
     grey[:, 1, 1] = 7 * signal + 50
     grey[:, 1, 0], grey[:, 1, 2] = 10 * noise.T
-    score, used = correlate(start, member, weight, facing, grey, np.zeros(2), 0.85, 5)
-    assert used[0] == 2
+    view, value = choose_views(patch, weights, facing, 0.85, 5)
+    assert view.tolist() == [[0, 1]]
+    score = correlate(patch, weights, view, value, facing > 0, grey, np.zeros(2))
     assert score[0, 1] == pytest.approx(1.0, abs=1e-5)
     assert np.abs(score[0, [0, 2]]).max() < 4 / np.sqrt(400)
-    muted, _ = correlate(start, member, weight, facing, grey, np.full(2, 1000.0), 0.85, 5)
+    muted = correlate(patch, weights, view, value, facing > 0, grey, np.full(2, 1000.0))
     assert muted.max() < 1e-3
 
 
@@ -215,6 +216,5 @@ def test_hair_hangs_together_with_the_border() -> None:
 
 
 def test_pixels_per_mm_is_the_pinhole_s(bump: Scene) -> None:
-    problem = bump.start().problem
     expected = [camera.intrinsics.fx / 1200.0 for camera in bump.rig]
-    np.testing.assert_allclose(pixels_per_mm(problem.views, np.zeros(3)), expected, rtol=1e-9)
+    np.testing.assert_allclose(pixels_per_mm(tuple(bump.rig), np.zeros(3)), expected, rtol=1e-9)
