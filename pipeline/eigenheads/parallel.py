@@ -1,5 +1,6 @@
 """The same work on many scans, in several processes (threads gain nothing: SuperLU and numpy hold the interpreter)."""
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 FEW = 12  # with fewer items the processes' start (two seconds) costs more than they save
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
 _CHUNK = 4  # what a task carries besides its item (a prior of 40 MB) travels once a chunk
 
 
@@ -41,5 +43,19 @@ def workers(count: int, items: int) -> Iterator[Workers]:
         yield Workers(None)
         return
     # fresh interpreters: a fork would copy the locks of whatever threads (BLAS, numba) are at work here
-    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
+    with _single_threaded_children(), ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
         yield Workers(pool)
+
+
+@contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Processes started in here do their linear algebra in one thread: there is one of them for each core."""
+    before = os.environ.get(_BLAS_THREADS)
+    os.environ[_BLAS_THREADS] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_BLAS_THREADS]
+        else:
+            os.environ[_BLAS_THREADS] = before

@@ -7,6 +7,7 @@ landmarks.py; case, blanks and hyphens do not matter.
 
 import json
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from jaxtyping import Float, Int
 
 from pipeline.eigenheads.landmarks import NAMES
 from rig.errors import InputError
+from rig.mesh import Mesh
 from rig.mesh_files import read_mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb")
@@ -33,34 +35,51 @@ class Scan:
 
 
 def find_scans(folder: Path) -> list[Path]:
-    """Mesh files of a folder, by name. Raises InputError where there is none."""
+    """Mesh files of a folder, by name. Raises InputError where there is none, or a head would count twice."""
     found = sorted(p for p in folder.glob("*") if p.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
     if not found:
         raise InputError(str(folder), ["holds no .ply, .obj or .glb scans"])
+    stems = Counter(path.stem for path in found)
+    twice = [f"holds more than one scan called {name}: keep one" for name, count in stems.items() if count > 1]
+    if twice:
+        raise InputError(str(folder), twice)
     return found
 
 
 def read_scan(path: Path) -> Scan:
     """A scan with its landmarks. Raises InputError."""
-    mesh = read_mesh(path)
+    vertices, faces = welded(read_mesh(path))
     beside = [path.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES]
     given = next((p for p in beside if p.is_file()), None)
     if given is None:
         raise InputError(path.name, [f"has no landmarks beside it ({', '.join(p.name for p in beside)})"])
-    return Scan(path.stem, mesh.vertices, mesh.faces, read_landmarks(given))
+    return Scan(path.stem, vertices, faces, read_landmarks(given))
+
+
+def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """Each place once, and only places that triangles use: files repeat vertices along texture seams, or for each
+    triangle, and a surface torn there has no neighbours to tell noise by."""
+    _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
+    corners = index.ravel()[mesh.faces]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
+    used, faces = np.unique(corners, return_inverse=True)
+    return mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32)
 
 
 def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
     """Landmarks by our names; other points of the file are left out. Raises InputError."""
     readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
     try:
-        named = readers[path.suffix.lower()](path.read_text(encoding="utf-8"))
+        named = readers[path.suffix.lower()](path.read_text(encoding="utf-8-sig"))
         points = {plain_name(name): np.array(point, float) for name, point in named.items()}
     except (ValueError, KeyError, TypeError, AttributeError, ElementTree.ParseError) as fault:
         raise InputError(
             path.name, [f"is no landmark file that can be read ({type(fault).__name__}: {fault})"]
         ) from None
     known = {name: point for name, point in points.items() if name in NAMES}
+    if not known:
+        told = ", ".join(sorted(points)[:8]) or "nothing"
+        raise InputError(path.name, [f"names none of the 26 landmarks ({', '.join(NAMES[:3])}, ...) but {told}"])
     bad = [name for name, point in known.items() if point.shape != (3,) or not np.isfinite(point).all()]
     if bad:
         raise InputError(path.name, [f"{name} is no point of three finite numbers" for name in bad])

@@ -118,6 +118,8 @@ def test_landmark_files_in_every_form(tmp_path: Path) -> None:
         got = read_landmarks(tmp_path / name)
         assert set(got) == {"pronasale"}, name
         np.testing.assert_allclose(got["pronasale"], point)
+    (tmp_path / "f.json").write_text('\ufeff{"PRONASALE": [1.5, -2, 80.25]}', encoding="utf-8")  # as Windows saves it
+    np.testing.assert_allclose(read_landmarks(tmp_path / "f.json")["pronasale"], point)
     assert plain_name(" Exocanthion-Left ") == "exocanthion_left"
 
 
@@ -125,8 +127,15 @@ def test_unreadable_landmarks_and_empty_folders_are_named(tmp_path: Path) -> Non
     (tmp_path / "bad.json").write_text('{"points": {"pronasale": [1, 2]}}')
     with pytest.raises(InputError, match="pronasale"):
         read_landmarks(tmp_path / "bad.json")
+    (tmp_path / "foreign.json").write_text('{"points": {"nose_tip": [1, 2, 3]}}')
+    with pytest.raises(InputError, match=r"names none of the 26 landmarks .* but nose_tip"):
+        read_landmarks(tmp_path / "foreign.json")
     (tmp_path / "broken.pp").write_text("<PickedPoints>")
     with pytest.raises(InputError, match=r"broken\.pp"):
         read_landmarks(tmp_path / "broken.pp")
     with pytest.raises(InputError, match=r"no \.ply"):
+        find_scans(tmp_path)
+    for name in ("twice.ply", "twice.obj", "once.glb"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match="more than one scan called twice"):
         find_scans(tmp_path)

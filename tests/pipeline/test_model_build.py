@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial import KDTree
 
 from pipeline.eigenheads.build import build_model
 from pipeline.eigenheads.closest import SurfaceIndex
@@ -14,7 +16,7 @@ from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.pca import rigid_fit
 from pipeline.eigenheads.scan_checks import BadScan, check, outward_share
 from pipeline.eigenheads.scanner import Scanner, scan_head
-from pipeline.eigenheads.scans import Scan, write_landmarks
+from pipeline.eigenheads.scans import Scan, read_scan, write_landmarks
 from rig.errors import InputError
 from rig.mesh import Mesh
 from rig.mesh_files import obj_bytes
@@ -144,6 +146,64 @@ def test_the_shipped_population_passes(model: HeadModel) -> None:
 def write_scan(folder: Path, scan: Scan) -> None:
     (folder / f"{scan.name}.obj").write_bytes(obj_bytes(Mesh(scan.vertices, scan.faces, None)))
     write_landmarks(folder / f"{scan.name}.json", scan.landmarks)
+
+
+def ascii_ply(scan: Scan) -> bytes:
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(scan.vertices)}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz")
+    head += f"element face {len(scan.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    lines = [" ".join(map(str, point)) for point in scan.vertices.tolist()]
+    lines += [f"3 {a} {b} {c}" for a, b, c in scan.faces.tolist()]
+    return (head + "\n".join(lines) + "\n").encode()
+
+
+def seamed_obj(scan: Scan) -> bytes:
+    """Two materials, and texture coordinates of its own for each corner: every vertex lies on a seam."""
+    lines = ["mtllib none.mtl", *(f"v {x} {y} {z}" for x, y, z in scan.vertices.tolist())]
+    lines += [f"vt {k % 97 / 97:.4f} {k % 89 / 89:.4f}" for k in range(3 * len(scan.faces))]
+    for k, face in enumerate((scan.faces + 1).tolist()):
+        if k in (0, len(scan.faces) // 2):
+            lines.append(f"usemtl part{k}")
+        lines.append("f " + " ".join(f"{v}/{3 * k + corner + 1}" for corner, v in enumerate(face)))
+    return "\n".join(lines).encode()
+
+
+def placed_glb(scan: Scan) -> bytes:
+    """The mesh half as large and aside, and a node that puts it right."""
+    scene = trimesh.Scene()
+    node = np.diag([2.0, 2.0, 2.0, 1.0]) + np.array([[0, 0, 0, 5.0], [0] * 4, [0] * 4, [0] * 4])
+    inner = trimesh.Trimesh((scan.vertices - [5.0, 0, 0]) / 2, scan.faces, process=False)
+    scene.add_geometry(inner, transform=node)
+    data = scene.export(file_type="glb")
+    assert isinstance(data, bytes)
+    return data
+
+
+def soup_ply(scan: Scan) -> bytes:
+    """Three vertices for every triangle."""
+    corners = scan.vertices[scan.faces].reshape(-1, 3)
+    triangles = np.arange(len(corners)).reshape(-1, 3)
+    data = trimesh.Trimesh(corners, triangles, process=False).export(file_type="ply")
+    assert isinstance(data, bytes)
+    return data
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [("a.ply", ascii_ply), ("b.obj", seamed_obj), ("c.glb", placed_glb), ("d.ply", soup_ply)],
+    ids=["ascii", "seams", "node", "soup"],
+)
+def test_files_as_other_programs_write_them_come_out_alike(
+    tmp_path: Path, sound: Scan, name: str, written: Callable[[Scan], bytes]
+) -> None:
+    """One connected surface of the same triangles, whatever the file repeats (single precision: 0.01 mm)."""
+    (tmp_path / name).write_bytes(written(sound))
+    write_landmarks((tmp_path / name).with_suffix(".json"), sound.landmarks)
+    scan = read_scan(tmp_path / name)
+    assert len(scan.vertices) == len(np.unique(sound.faces))
+    assert len(scan.faces) == len(sound.faces)
+    mine, theirs = (v[f].mean(1) for v, f in ((scan.vertices, scan.faces), (sound.vertices, sound.faces)))
+    assert KDTree(theirs).query(mine)[0].max() < 0.01
 
 
 def test_bad_scans_stop_the_build_and_all_are_named(tmp_path: Path, sound: Scan) -> None:
