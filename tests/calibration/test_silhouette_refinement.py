@@ -1,5 +1,7 @@
 """Planted camera errors, and silhouettes of heads with hair and shirts drawn with the true cameras."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from calibration.gauge import align_world, image_distance, moved
 from calibration.rims import Heads, rim_equations
 from calibration.silhouette_refinement import TooFewCaptures, _equations, _minimise, _zoomed, refine
 from pipeline.eigenheads.model import load_model, with_modes
+from rig.geometry import RigidTransform
 from rig.layout import Rig
 from rig.studio.layout import default_layout
 from tests.benchmarks.silhouette_refinement import MODES, heads_of
@@ -51,6 +54,17 @@ def test_derivatives_are_those_of_moved_cameras(one_capture, focal):
         assert (
             np.abs(slope - rows[:, size * camera + parameter]).max() < 0.01 * scale + 1e-6 * np.abs(misses).max() / by
         )
+
+
+@pytest.mark.gl
+def test_no_residual_shows_a_rigs_scale(one_capture):
+    """Which is why what cameras are off in scale stays: the equations of a rig twice as large are the same."""
+    rig, capture = one_capture
+    tangencies = find_frontier(capture, rig)[:20]
+    poses = [RigidTransform(c.camera_from_world.rotation, 2.0 * c.camera_from_world.translation) for c in rig]
+    larger = Rig(tuple(replace(c, camera_from_world=pose) for c, pose in zip(rig, poses, strict=True)))
+    _, misses = _equations(tangencies, rig, focal=False)
+    np.testing.assert_allclose(_equations(tangencies, larger, focal=False)[1], misses, atol=1e-9)
 
 
 def test_too_few_captures_are_refused():
