@@ -209,8 +209,8 @@ def save_model(path: Path, parts: ModelParts) -> None:
     }
     arrays = {
         "meta": np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8),
-        "mean": _rounded(parts.mean),
-        "modes": _rounded(parts.modes),
+        "mean": rounded(parts.mean),
+        "modes": rounded(parts.modes),
         "sigma": np.asarray(parts.sigma, np.float32),
         "faces": np.asarray(parts.faces, np.int32),
         "face_region": np.packbits(parts.face_region),
@@ -225,7 +225,8 @@ def save_model(path: Path, parts: ModelParts) -> None:
     part.replace(path)
 
 
-def _rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
+def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
+    """As a model file keeps lengths."""
     return (np.round(np.asarray(values, float) * 4096) / 4096).astype(np.float32)
 
 

@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.eigenheads.pca import Components
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.pca import Components, principal_components
 
 
 def compactness(sigma: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
@@ -64,6 +65,27 @@ def specificity(
         drawn = (mean + np.tensordot(rng.standard_normal(len(modes)), modes, 1))[region].astype(np.float32)
         total += np.linalg.norm(known - drawn, axis=2).mean(1).min() / draws
     return float(total)
+
+
+def of_draws(
+    model: HeadModel, *, heads: int = 138, used: int = 60, draws: int = 200, seed: int = 0
+) -> dict[str, float]:
+    """Generalisation and specificity (mm) where a model's own Gaussian is the population: ``heads`` draws of it.
+
+    For models whose subjects are not published, and beside them for others: a Gaussian has no outliers and fills all
+    its modes, so these are not the figures of real subjects.
+    """
+    rng = np.random.default_rng(seed)
+    flat = model.modes.reshape(len(model.modes), -1)
+    drawn = model.mean + (rng.standard_normal((heads, len(flat))) @ flat).reshape(heads, *model.mean.shape)
+    region = model.levels["cage"].face_region
+    components = principal_components(drawn[:, region])
+    everywhere = np.ones(int(region.sum()), bool)
+    modes = components.modes[:used]
+    return {
+        "generalisation_mm": generalisation(components, everywhere, [used])[used],
+        "specificity_mm": specificity(components.mean, modes, drawn[:, region], everywhere, draws=draws, seed=seed),
+    }
 
 
 def components_of(mean: np.ndarray, modes: np.ndarray, scores: np.ndarray) -> Components:

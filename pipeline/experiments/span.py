@@ -18,6 +18,7 @@ from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.pca import rigid_fit
 from pipeline.eigenheads.surface import vertex_areas
 from pipeline.eigenheads.surface_fit import SurfaceFit, fit_surface
+from pipeline.eigenheads.worth import of_draws
 from rig.errors import InputError
 from rig.geometry import RigidTransform
 from rig.mesh_files import read_mesh
@@ -48,7 +49,8 @@ def run(
     """``{"figures": {...}, "rows": [...]}``: floors of each model on each truth, for each count of modes (0: all).
 
     ``figures`` is flat: ``<model>_<modes>_<truth>_{median,mean}_mm`` and ``_largest_sigma`` for each single truth, and
-    ``<model>_<modes>_draws_...`` as means over the truths whose names start with ``draw:``.
+    ``<model>_<modes>_draws_...`` as means over the truths whose names start with ``draw:``. Beside them
+    ``<model>_own_draws_{generalisation,specificity}_mm``: a low floor alone is no merit.
     """
     rows = []
     jobs = [(name, truth, count) for name in models for truth in truths for count in counts]
@@ -56,7 +58,10 @@ def run(
         rows.append(floor(name, models[name], truth, count))
         if report:
             report("fitting", (k + 1) / len(jobs))
-    return {"figures": _figures(rows), "rows": rows}
+    worths = {
+        f"{name}_own_draws_{key}": round(value, 4) for name in models for key, value in of_draws(models[name]).items()
+    }
+    return {"figures": _figures(rows) | worths, "rows": rows}
 
 
 def floor(name: str, model: HeadModel, truth: Truth, count: int = 0) -> dict:

@@ -45,7 +45,8 @@ def model_import(
         parts = import_model(source, name=name, report=report)
         path = models_folder() / f"{parts.name}.npz"
         save_model(path, parts)
-    answer({"name": parts.name, "file": str(path)}, json_out, [f"{parts.name}  {path}"])
+    document = {"name": parts.name, "file": str(path), "draws_mm": parts.figures.get("draws_mm")}
+    answer(document, json_out, [f"{parts.name}  {path}"])
 
 
 @model_app.command("build", epilog="Example: eigenhead model build scans --out model.npz")

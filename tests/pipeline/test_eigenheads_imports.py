@@ -129,6 +129,7 @@ def test_ict_compact_copy_reproduces_the_original(tmp_path: Path) -> None:
     save_model(tmp_path / "ict.npz", import_model(path))
     model, original = load_model(tmp_path / "ict.npz"), np.load(path)
     assert len(model.modes) == 100
+    assert 0 < model.figures["draws_mm"] < 0.05
     flat = model.modes.reshape(100, -1).astype(float)
     modes, rng = original["modes"].astype(float), np.random.default_rng(11)
     shift = model.vertices(np.zeros(0))[0] - original["mean"][0]
