@@ -45,7 +45,7 @@ def overlay(
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> ImageRgb:
-    """Eq. (4) at a panel's size, over a pale image: sky blue where only the input is, vermilion where only the model."""
+    """Eq. (4) at a panel's size, over a pale image: sky blue where only the input is, vermilion only the model."""
     size = _fitted_size(image)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     observed, model = (
