@@ -16,7 +16,7 @@ from pipeline.settings import TextureSettings
 from pipeline.silhouette import Silhouette
 from pipeline.texture import Texture, blend, usable_views
 from pipeline.unwrap import Atlas, Layout
-from pipeline.visibility import see_points
+from pipeline.visibility import see_points, sharpened
 from pipeline.zbuffer import camera_depths, interpolate, rasterise
 from rig.capture import Capture
 from rig.layout import Rig
@@ -42,6 +42,7 @@ def paint_atlas(
     """The image of a head that ``coloured`` holds the vertex colours and camera gains of."""
     views = usable_views(capture, silhouettes, rig)
     size = _size(layout, mesh_world, views)
+    images = {name: sharpened(capture.images[name], silhouettes[name].mask, settings) for name in views.names}
     gains = np.array([coloured.gains.get(name, (1.0, 1.0, 1.0)) for name in views.names])
     offsets = np.array([coloured.offsets.get(name, (0.0, 0.0, 0.0)) for name in views.names])
     texels = size * layout.uv - 0.5
@@ -58,7 +59,7 @@ def paint_atlas(
             points, across = values[:, :3].astype(float), values[:, 3:6].astype(float)
             sights = [
                 see_points(
-                    camera, capture.images[camera.name], silhouettes[camera.name], depths[camera.name], points, across,
+                    camera, images[camera.name], silhouettes[camera.name], depths[camera.name], points, across,
                     settings,
                 )
                 for camera in views

@@ -5,9 +5,10 @@ Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour a ve
 lies before it; its weight is the dot product of normal and viewing direction; its colour the weighted mean.
 
 The default departs from it, because real cameras differ and real edges are blurred: margins at contours and occluding
-edges (``pipeline.visibility``), gain and offset of each camera (``pipeline.colour_balance``), sharper weights so that
-detail is not averaged away, a mean in linear light that gives little to what is brighter than the other views say (a
-highlight moves with the camera), and a smooth fill where no camera looks.
+edges (``pipeline.visibility``), photographs sharpened where there is detail, gain and offset of each camera
+(``pipeline.colour_balance``), sharper weights so that detail is not averaged away, a mean in linear light that gives
+little to what is brighter than the other views say (a highlight moves with the camera), and a smooth fill where no
+camera looks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +24,7 @@ from pipeline.fill import fill_unknown
 from pipeline.reconstruction import ReportWarning
 from pipeline.settings import TextureSettings
 from pipeline.silhouette import Silhouette
-from pipeline.visibility import Sight, see_points
+from pipeline.visibility import Sight, see_points, sharpened
 from pipeline.zbuffer import camera_depths
 from rig.camera import Camera
 from rig.capture import Capture
@@ -70,7 +71,8 @@ def texture(
 
     def look(camera: Camera) -> Sight:
         name = camera.name
-        given = capture.images[name], silhouettes[name], depths[name]
+        image = sharpened(capture.images[name], silhouettes[name].mask, settings)
+        given = image, silhouettes[name], depths[name]
         return see_points(camera, *given, mesh_world.vertices, normals, settings)
 
     with ThreadPoolExecutor(max_workers=2) as pool:  # the compiled kernels release the interpreter lock

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import scipy.sparse
@@ -12,6 +13,7 @@ from pipeline.fill import fill_unknown
 from pipeline.settings import TextureSettings
 from pipeline.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.texture import Texture, texture
+from pipeline.visibility import sharpened
 from pipeline.zbuffer import depth_map, depth_maps
 from rig.capture import Capture
 from rig.mesh import Mesh
@@ -151,6 +153,20 @@ def test_a_strongly_different_exposure_is_named() -> None:
     warnings = colour(shoot(gains)).warnings
     assert [w.code for w in warnings] == ["camera_gain"]
     assert "cam02" in warnings[0].message
+
+
+def test_sharpening_takes_back_blur_where_there_is_detail_and_lifts_no_noise() -> None:
+    rng = np.random.default_rng(5)
+    truth = np.full((240, 320, 3), 120.0)
+    truth[:, :160][:, ::16] = truth[:, 1:160][:, ::16] = 40.0  # two dark pixels in sixteen, like lashes
+    blurred = cv2.GaussianBlur(truth, (0, 0), 0.7) + rng.normal(0, 3, truth.shape)
+    image = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
+    found = sharpened(image, np.ones((240, 320), bool), TextureSettings()).astype(float)
+    lines, flat = np.s_[10:-10, 10:150], np.s_[10:-10, 180:-10]
+    before, after = (np.abs(picture[lines] - truth[lines]).mean() for picture in (image, found))
+    assert after < 0.8 * before
+    # Twice the median of the noise's own power is held back, so that only its largest bursts are lifted.
+    assert found[flat].std() < 1.1 * image[flat].std()
 
 
 def test_balance_finds_planted_gains_and_offsets() -> None:
