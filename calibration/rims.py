@@ -14,7 +14,9 @@ import scipy.linalg
 from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.contour import PER_CAMERA, evaluate, normal_equations, solve_contour
+from pipeline.fitting.contour import solve_contour
+from pipeline.fitting.equations import evaluate, normal_equations
+from pipeline.fitting.problem import PER_CAMERA
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import Silhouette
 from rig.geometry import Similarity

@@ -31,7 +31,7 @@ from calibration.frontier import find_frontier
 from calibration.gauge import align_world, gauge_projection, image_distance, moved
 from calibration.rims import Heads, rim_equations
 from pipeline.drift import Tangency, find_tangencies
-from pipeline.fitting.contour import camera_information
+from pipeline.fitting.problem import camera_information
 from pipeline.silhouette import Silhouette
 from rig.camera import Camera
 from rig.errors import EigenheadError

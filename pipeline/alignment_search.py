@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.contour import Problem, Stage, State, evaluate, make_problem, run_stage, start_state
+from pipeline.fitting.contour import run_stage
+from pipeline.fitting.equations import evaluate
+from pipeline.fitting.problem import Problem, Stage, State, make_problem, start_state
 from pipeline.settings import Settings
 from pipeline.silhouette import Silhouette
 from rig.errors import EigenheadError

@@ -17,9 +17,8 @@ import numpy as np
 from pipeline import alignment_search
 from pipeline.alignment_search import search_alignment
 from pipeline.eigenheads.model import HeadModel, with_modes
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, worn_silhouettes
-from pipeline.fitting import contour, rim
 from pipeline.fitting.contour import fit_contour
 from pipeline.settings import Settings
 from rig.errors import EigenheadError
@@ -38,7 +37,7 @@ def alignment(
     folder: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Share of right alignments, their errors, and the seconds of the search."""
-    records = Records(folder, "alignment", key_of(model.sha256, Settings(), contour, rim, alignment_search))
+    records = Records(folder, "alignment", key_of(model.sha256, Settings(), *CONTOUR, alignment_search))
     span, rows = with_modes(model, 60), []
     for seed in range(subjects):
         report(f"draw {seed}", seed / subjects)

@@ -12,9 +12,8 @@ import numpy as np
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
-from pipeline.fitting import contour, rim
 from pipeline.fitting.contour import fit_contour
 from pipeline.settings import FittingSettings
 from rig.layout import Rig
@@ -31,7 +30,7 @@ def convergence(
     folder: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Share of the draws that arrive, and the errors, of both kinds."""
-    records = Records(folder, "convergence", key_of(model.sha256, FittingSettings(), contour, rim))
+    records = Records(folder, "convergence", key_of(model.sha256, FittingSettings(), *CONTOUR))
     span, rig = with_modes(model, 60), exact(default_layout())
     jobs: list[tuple[str, Planted]] = []
     for kind, most in KINDS.items():

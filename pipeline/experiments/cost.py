@@ -15,9 +15,9 @@ import numpy as np
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, mean_error_mm, random_subjects, worn_silhouettes
-from pipeline.fitting import contour, objective, rim, schedule, simplex
+from pipeline.fitting import objective, schedule, simplex
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.schedule import fit_simplex
@@ -35,7 +35,7 @@ SIMPLEX: dict[str, dict[str, Any]] = {
     "simplex_eq5": {"speaking": "all", "weighted": True},
     "simplex_eq5_face": {"speaking": "face", "weighted": True},
 }
-CONTOUR = {
+FORGIVING = {
     "contour_unforgiving": replace(FittingSettings(), robust_px=UNFORGIVING_PX),
     "contour": FittingSettings(),
 }
@@ -46,7 +46,7 @@ def cost(
     folder: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Errors by solver and cost, and of the mean head."""
-    sources = (contour, rim, objective, schedule, simplex)
+    sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "cost", key_of(model.sha256, FittingSettings(), STYLE, *sources))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
@@ -54,7 +54,7 @@ def cost(
         silhouettes = worn_silhouettes(span, subject, rig, renderer, STYLE, np.random.default_rng([44, i]))
         mean_head = Fit("", np.zeros(60), subject.world_from_head, 0, "")
         row: Row = {"name": subject.name, "mean_head": mean_error_mm(span, mean_head, subject)}
-        for name in (*CONTOUR, *SIMPLEX):
+        for name in (*FORGIVING, *SIMPLEX):
             report(f"{subject.name} {name}", i / subjects)
             kept = records.row(
                 f"{subject.name} {name}",
@@ -73,8 +73,8 @@ def cost(
 def _error(
     name: str, model: HeadModel, subject: Planted, silhouettes: dict[str, Silhouette], rig: Rig, renderer: Renderer
 ) -> float:
-    if name in CONTOUR:
-        return mean_error_mm(model, fit_contour(model, subject.start, silhouettes, rig, CONTOUR[name]), subject)
+    if name in FORGIVING:
+        return mean_error_mm(model, fit_contour(model, subject.start, silhouettes, rig, FORGIVING[name]), subject)
     fit = fit_simplex(
         model, subject.world_from_head, silhouettes, rig, FittingSettings(), renderer=renderer,
         report=lambda stage, fraction: None, **SIMPLEX[name],

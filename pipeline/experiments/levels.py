@@ -14,9 +14,9 @@ import numpy as np
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
-from pipeline.fitting import contour, objective, rim, schedule, simplex
+from pipeline.fitting import objective, schedule, simplex
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.schedule import HierarchyLevel, fit_simplex
 from pipeline.settings import FittingSettings
@@ -41,7 +41,7 @@ def levels(
     folder: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Seconds, evaluations and errors by hierarchy."""
-    sources = (contour, rim, objective, schedule, simplex)
+    sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "levels", key_of(model.sha256, FittingSettings(), *sources))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []

@@ -18,18 +18,11 @@ from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_errors, random_subjects
-from pipeline.fitting.contour import (
-    PER_CAMERA,
-    POSE,
-    State,
-    evaluate,
-    fit_contour,
-    make_problem,
-    normal_equations,
-    schedule,
-)
+from pipeline.fitting.contour import fit_contour, schedule
+from pipeline.fitting.equations import evaluate, normal_equations
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
+from pipeline.fitting.problem import PER_CAMERA, POSE, State, make_problem
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import Silhouette
 from rig.layout import Rig

@@ -34,9 +34,9 @@ from scipy.optimize import minimize
 from pipeline.eigenheads.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown, soft_rasteriser
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, subjects_of_section_5_2
-from pipeline.fitting import contour, objective, rim
+from pipeline.fitting import objective
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.objective import SilhouetteObjective
@@ -218,7 +218,7 @@ def ours(task: Task) -> Row:
 
 _FREE = (objective,)
 SOLVERS: dict[str, tuple[Callable[[Task], Row], tuple[Any, ...]]] = {
-    "contour": (ours, (contour, rim)),
+    "contour": (ours, CONTOUR),
     "hull": (hull, ()),
     "soft": (soft, (soft_rasteriser,)),
     "simplex": (derivative_free(lambda f, x, level: nelder_mead(f, x, adaptive=False)), _FREE),

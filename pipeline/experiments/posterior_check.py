@@ -20,21 +20,11 @@ from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments.limit import CORRELATION_PX, UNROBUST_PX, settings_for, with_noise
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_rows, random_subjects
-from pipeline.fitting import contour, rim
-from pipeline.fitting.contour import (
-    PER_CAMERA,
-    POSE,
-    Problem,
-    Stage,
-    State,
-    apply_step,
-    evaluate,
-    make_problem,
-    normal_equations,
-    run_stage,
-)
+from pipeline.fitting.contour import run_stage
+from pipeline.fitting.equations import apply_step, evaluate, normal_equations
+from pipeline.fitting.problem import PER_CAMERA, POSE, Problem, Stage, State, make_problem
 from rig.layout import Rig
 from rig.render.renderer import Renderer
 from rig.studio.layout import default_layout
@@ -57,7 +47,7 @@ def posterior_check(
     folder: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Chain over Laplace: standard deviations of coefficients and pose, and of the face's points along the axes."""
-    records = Records(folder, "posterior", key_of(model.sha256, contour, rim, STEPS, BETA))
+    records = Records(folder, "posterior", key_of(model.sha256, *CONTOUR, STEPS, BETA))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
     for i, subject in enumerate(random_subjects(subjects, seed=22)):

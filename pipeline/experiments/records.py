@@ -8,9 +8,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pipeline.fitting import clutter, contour, equations, misfit, problem, rim
 from rig.files import write_atomically
 
 Row = dict[str, Any]
+
+CONTOUR = (contour, problem, equations, clutter, misfit, rim)  # for keys: what rows of the contour solver depend on
 
 
 class Records:

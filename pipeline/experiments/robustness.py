@@ -29,7 +29,7 @@ from jaxtyping import Bool
 from pipeline import agreement, drift
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import limit, markdown
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import (
     Planted,
     binary_silhouettes,
@@ -42,7 +42,6 @@ from pipeline.experiments.subjects import (
     stated,
     worn_silhouettes,
 )
-from pipeline.fitting import contour, rim
 from pipeline.fitting.contour import fit_contour
 from pipeline.reconstruct import without_moved_cameras
 from pipeline.segmentation import segment
@@ -67,7 +66,7 @@ def robustness(
     folder: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Errors by condition, their ratios to the base and to the bound, and how often faults are found."""
-    records = Records(folder, "robustness", key_of(model.sha256, Settings(), contour, rim, limit, agreement, drift))
+    records = Records(folder, "robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
     span = with_modes(model, 60)
     rows = []
     planted = random_subjects(subjects, seed=66)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.contour import camera_information
 from pipeline.fitting.fit import Fit
+from pipeline.fitting.problem import camera_information
 from pipeline.silhouette import Silhouette, silhouette_from_mask
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.layout import Rig

@@ -16,9 +16,9 @@ from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown, pictures
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, subjects_of_section_5_2
-from pipeline.fitting import contour, objective, rim, schedule, simplex
+from pipeline.fitting import objective, schedule, simplex
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.schedule import fit_simplex
@@ -177,7 +177,7 @@ def _rows(
 ) -> list[Row]:
     """One row a subject; the solvers' rows are kept apart, so that a change of one does not cost the other's."""
     key = (model.sha256, FittingSettings())
-    ours = Records(folder, name, key_of(*key, contour, rim))
+    ours = Records(folder, name, key_of(*key, *CONTOUR))
     theirs = Records(folder, f"{name}-simplex", key_of(*key, objective, schedule, simplex))
     everyone, rig = subjects_of_section_5_2(model, 100), exact(rig)
     chosen = [everyone[i] for i in _evenly(len(everyone), subjects)]

@@ -18,19 +18,11 @@ from jaxtyping import Float
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
 from pipeline.experiments.limit import UNROBUST_PX, settings_for
-from pipeline.experiments.records import Records, Row, key_of
+from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, face_rows, mean_error_mm, random_subjects, worn_silhouettes
-from pipeline.fitting import contour, rim
-from pipeline.fitting.contour import (
-    PER_CAMERA,
-    POSE,
-    Stage,
-    State,
-    evaluate,
-    fit_contour,
-    make_problem,
-    normal_equations,
-)
+from pipeline.fitting.contour import fit_contour
+from pipeline.fitting.equations import evaluate, normal_equations
+from pipeline.fitting.problem import PER_CAMERA, POSE, Stage, State, make_problem
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import Silhouette
 from rig.layout import Rig
@@ -54,7 +46,7 @@ def views(
 ) -> dict[str, Any]:  # fmt: skip
     """The planned directions, and limit and error of every arrangement over ``subjects`` heads not planned on."""
     span = with_modes(model, 60)
-    records = Records(folder, "views", key_of(model.sha256, contour, rim, CANDIDATES_DEG, STYLE))
+    records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
     heads = random_subjects(CHOSEN_ON + subjects, seed=33)
     candidates = rig_from_directions(CANDIDATES_DEG)
     told = [_told(span, head, candidates, report, i / len(heads)) for i, head in enumerate(heads[:CHOSEN_ON])]

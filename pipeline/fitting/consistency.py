@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.fitting.contour import Problem, State, moved_views
 from pipeline.fitting.hairline import Sight, under_hair
 from pipeline.fitting.patches import Patches
 from pipeline.fitting.photographs import LEAST_BLUR_PX, Photographs, blurred, distance_of
+from pipeline.fitting.problem import Problem, State, moved_views
 from pipeline.fitting.registration import gram_matrices, lean
 from pipeline.fitting.surface import SurfaceObservations
 from pipeline.fitting.sweep import choose_views, correlate, sweep

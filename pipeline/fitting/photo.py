@@ -19,9 +19,10 @@ from scipy.spatial import KDTree
 from pipeline.eigenheads.kernel import with_fine_kernel
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.consistency import Round, hair_patches, look, observe
-from pipeline.fitting.contour import Problem, Solved, Stage, State, run_stage, widened
+from pipeline.fitting.contour import Solved, run_stage
 from pipeline.fitting.patches import Patches, make_patches
 from pipeline.fitting.photographs import load_photographs
+from pipeline.fitting.problem import Problem, Stage, State, widened
 from pipeline.fitting.surface import surface_residual
 from pipeline.reconstruction import Detail
 from pipeline.settings import PhotoSettings

@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from calibration.gauge import align_world, image_distance, moved
 from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.fitting.contour import camera_information
+from pipeline.fitting.problem import camera_information
 from pipeline.silhouette import Silhouette, silhouette_from_mask
 from rig.geometry import Similarity
 from rig.layout import Rig

@@ -8,7 +8,8 @@ import numpy as np
 
 from pipeline.eigenheads.kernel import with_kernel
 from pipeline.eigenheads.model import HeadModel, ModelParts, assemble
-from pipeline.fitting.contour import Solved, Stage, State, make_problem
+from pipeline.fitting.contour import Solved
+from pipeline.fitting.problem import Stage, State, make_problem
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import Silhouette, silhouette_from_mask
 from pipeline.zbuffer import camera_depths, interpolate, rasterise

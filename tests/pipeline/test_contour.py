@@ -9,19 +9,10 @@ from pipeline.eigenheads.kernel import SCALES, covariance, with_kernel
 from pipeline.eigenheads.model import HeadModel, load_model, with_modes
 from pipeline.experiments.robustness import OVER_EARS, spoiled
 from pipeline.experiments.subjects import binary_silhouettes, exact, mean_error_mm, random_subjects, worn_silhouettes
-from pipeline.fitting.contour import (
-    PER_CAMERA,
-    POSE,
-    State,
-    apply_step,
-    evaluate,
-    fit_contour,
-    make_problem,
-    rim_rows,
-    schedule,
-    widened,
-)
+from pipeline.fitting.contour import fit_contour, schedule
+from pipeline.fitting.equations import apply_step, evaluate, rim_rows
 from pipeline.fitting.posterior import vertex_deviation_mm
+from pipeline.fitting.problem import PER_CAMERA, POSE, State, make_problem, widened
 from pipeline.settings import FittingSettings
 from pipeline.silhouette import silhouette_from_mask
 from rig.geometry import Similarity, rotation_from_vector

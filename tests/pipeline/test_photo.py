@@ -7,11 +7,12 @@ import pytest
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.consistency import facing_of, look, pixels_per_mm
-from pipeline.fitting.contour import Stage, State, apply_step
+from pipeline.fitting.equations import apply_step
 from pipeline.fitting.hairline import spread_from_border
 from pipeline.fitting.patches import Patches, spread_samples
 from pipeline.fitting.photo import patches_for, refine_with_photographs
 from pipeline.fitting.photographs import noise_level
+from pipeline.fitting.problem import Stage, State
 from pipeline.fitting.surface import SurfaceObservations, surface_cost, surface_equations, surface_residual
 from pipeline.fitting.sweep import choose_views, correlate
 from pipeline.settings import PhotoSettings

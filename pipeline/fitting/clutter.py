@@ -1,0 +1,51 @@
+"""Hair, shoulders and clothes only ever add area to a silhouette: which stretches of a rim may not speak for that."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from pipeline.fitting.problem import Problem
+from pipeline.fitting.rim import Rim
+
+CLUTTER_PX, CLUTTER_SIGMAS = 3.0, 3.0  # the input lies outside the model by more: hair, ears, collar
+OUTSIDE_SHARE = 0.3  # weight of a rim outside the face that sticks out: a model's neck is less sure than its face
+CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found: its border slides with the fit
+
+
+def held_inside(problem: Problem, rim: Rim, level: str) -> Rim:
+    """The rim where cranium, ears and neck only count as far as they stick out of the input."""
+    face = face_of(problem, level)[rim.corner].all(axis=1)
+    share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
+    return replace(rim, length=np.where(face, rim.length, share * rim.length))
+
+
+def face_of(problem: Problem, level: str) -> Bool[np.ndarray, " v"]:
+    """The face region, less what is known to lie under hair."""
+    region = problem.model.levels[level].face_region
+    return region & ~problem.hair[level] if level in problem.hair else region
+
+
+def find_clutter(problem: Problem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
+    """Cells of every view where the input lies outside the model by more than the threshold, and around them."""
+    maps = []
+    for k, (width, height) in enumerate(problem.views.size):
+        cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), np.uint8)
+        strange = (rim.view == k) & (rim.residual < -threshold_px)
+        at = (rim.pixel[strange] / CELL_PX).astype(int)
+        cells[at[:, 1], at[:, 0]] = 1
+        maps.append(cv2.dilate(cells, np.ones((2 * CLUTTER_CELLS + 1,) * 2, np.uint8)) > 0)
+    return tuple(maps)
+
+
+def without_clutter(problem: Problem, rim: Rim) -> Rim:
+    """The rim with no weight where the input is clutter."""
+    if problem.clutter is None:
+        return rim
+    cell = (rim.pixel / CELL_PX).astype(int)
+    length = rim.length.copy()
+    for k, cells in enumerate(problem.clutter):
+        here = np.flatnonzero(rim.view == k)
+        length[here[cells[cell[here, 1], cell[here, 0]]]] = 0.0
+    return replace(rim, length=length)

@@ -1,0 +1,186 @@
+"""What the contour solver works on: its state, the stages of its schedule, and all that stays fixed during a fit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Float32, Int
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.rim import Topology, Views, make_topology, pack_views
+from pipeline.fitting.surface import SurfaceObservations
+from pipeline.settings import FittingSettings
+from pipeline.silhouette import Silhouette
+from rig.camera import Camera
+from rig.geometry import Similarity, rotation_from_vector
+from rig.layout import Rig
+
+POSE = 7  # rotation, translation, log scale
+PER_CAMERA = 6  # rotation, translation
+FIRST_NOISE_PX, FIRST_CORRELATION_PX = 1.0, 6.0  # before the residuals have been seen: a model that does not quite fit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Where the solver stands."""
+
+    coefficients: Float[np.ndarray, " m"]
+    world_from_head: Similarity
+    camera_shift: Float[np.ndarray, "k 6"]  # left perturbation of each camera_from_world
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One level of the coarse-to-fine schedule."""
+
+    level: str
+    modes: int
+    cameras: bool  # are the cameras solved for as well?
+    scales_px: tuple[float, ...]  # robust scale, step by step
+    whole_head: bool  # may rims outside the face region speak?
+    contained: bool  # may they at least speak where they stick out of the input, as no hair explains?
+    steps: int  # Levenberg-Marquardt steps at most, at each scale
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """Feature points, packed: landmark vertex (row of the full level), view, pixel, and what the model says of the
+    landmark (head frame, mm)."""
+
+    vertex: Int[np.ndarray, " n"]
+    view: Int[np.ndarray, " n"]
+    pixel: Float[np.ndarray, "n 2"]
+    mean: Float[np.ndarray, "n 3"]
+    basis: Float32[np.ndarray, "m n 3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Everything that stays fixed during a fit."""
+
+    model: HeadModel
+    rig: Rig
+    views: Views
+    bases: Mapping[str, tuple[sparse.csr_array, Float32[np.ndarray, "v 3 m"]]]  # by level: operator, modes by vertex
+    topologies: Mapping[str, Topology]
+    camera_information: Float[np.ndarray, "k 6 6"]  # inverse prior covariance
+    features: Observed | None
+    settings: FittingSettings
+    unit: float  # l sigma^2 (px^3): what a px^2 of residual along a px of outline is divided by
+    floor_px: float = 0.0  # no robust scale below this: three standard deviations of the model's misfit
+    clutter: tuple[Bool[np.ndarray, "_ _"], ...] | None = None  # per view, in cells: where the input is hair or clothes
+    surface: SurfaceObservations | None = None  # what photographs say between the rims
+    hair: Mapping[str, Bool[np.ndarray, " v"]] = field(default_factory=dict)  # by level: whose outline is hair's
+
+
+def make_problem(
+    model: HeadModel,
+    world_from_head: Similarity,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    settings: FittingSettings,
+    features: Mapping[str, Mapping[str, np.ndarray]],
+    levels: tuple[str, ...] = ("p95", "full"),
+) -> Problem:
+    """Packs what stays fixed. Raises ValueError if no silhouette is usable."""
+    usable = {name: s.distance for name, s in silhouettes.items() if s.quality.usable and name in rig}
+    views = pack_views(rig, usable)
+    rig = rig.subset(views.names)
+    topologies = {name: level_topology(model, name) for name in levels}
+    depths = [camera.camera_from_world.apply(world_from_head.translation)[2] for camera in rig]
+    information = [camera_information(c, z, settings.calibration_px) for c, z in zip(rig, depths, strict=True)]
+    return Problem(
+        model=model,
+        rig=rig,
+        views=views,
+        bases={name: level_basis(model, name) for name in levels},
+        topologies=topologies,
+        camera_information=np.stack(information),
+        features=pack_features(model, views.names, features),
+        settings=settings,
+        unit=(settings.contour_noise_px or FIRST_NOISE_PX) ** 2
+        * (settings.contour_correlation_px or FIRST_CORRELATION_PX),
+    )
+
+
+def level_basis(model: HeadModel, name: str) -> tuple[sparse.csr_array, Float32[np.ndarray, "v 3 m"]]:
+    """Modes contiguous by vertex, and what takes them to the level: for a decimated level its own rows (2 MB), for the
+    full one the cage's, through the level's operator (the full level's own rows would be 40 to 170 MB)."""
+    level = model.levels[name]
+    if level.count < len(model.mean):
+        own = model.basis(name, len(model.modes)).transpose(1, 2, 0)
+        return sparse.csr_array(sparse.identity(level.count, format="csr")), np.ascontiguousarray(own)
+    return level.operator, np.ascontiguousarray(model.modes.transpose(1, 2, 0))
+
+
+def level_topology(model: HeadModel, name: str) -> Topology:
+    """A level's edges and regions. The neck below the chin never speaks: heads turn on it, collars hide it, and its cut
+    is no contour of anybody."""
+    level = model.levels[name]
+    mean = model.vertices(np.zeros(0), name)
+    chin = model.vertices(np.zeros(0))[model.landmarks["gnathion"], 1]
+    return make_topology(level.faces, level.face_region, mean[:, 1] > chin)
+
+
+def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Float[np.ndarray, "6 6"]:
+    """Inverse prior covariance of a camera's correction: its calibration's own, or ``error_px`` in the image.
+
+    A correction of the default prior moves a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS, half of it (in
+    variance) by rotation and half by translation, which a head cannot tell apart.
+    """
+    if camera.covariance is not None:
+        return np.linalg.inv(camera.covariance + 1e-12 * np.eye(6))
+    focal, radius = camera.intrinsics.fx, 100.0
+    shift = error_px / np.sqrt(2.0)
+    tilt, roll = shift / focal, error_px * depth_mm / (focal * radius)
+    slide, range_mm = shift * depth_mm / focal, error_px * depth_mm**2 / (focal * radius)
+    return np.diag(1.0 / np.array([tilt, tilt, roll, slide, slide, range_mm]) ** 2)
+
+
+def pack_features(
+    model: HeadModel, names: tuple[str, ...], features: Mapping[str, Mapping[str, np.ndarray]]
+) -> Observed | None:
+    found = [
+        (model.landmarks[landmark], names.index(camera), pixel)
+        for landmark, views in sorted(features.items())
+        if landmark in model.landmarks
+        for camera, pixel in sorted(views.items())
+        if camera in names
+    ]
+    if not found:
+        return None
+    vertex, view, pixel = (np.array(column) for column in zip(*found, strict=True))
+    return Observed(vertex, view, pixel.astype(float), *landmark_basis(model, vertex))
+
+
+def landmark_basis(
+    model: HeadModel, vertex: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
+    """Mean and all modes at vertices of the full level."""
+    mean = np.asarray(model.levels["full"].operator[vertex] @ model.mean, float)
+    return mean, model.basis("full", len(model.modes), vertex)
+
+
+def widened(problem: Problem, model: HeadModel, levels: tuple[str, ...]) -> Problem:
+    """The same problem with a model of the same mesh that has more modes, solved on ``levels``."""
+    features = problem.features
+    if features is not None:
+        mean, basis = landmark_basis(model, features.vertex)
+        features = replace(features, mean=mean, basis=basis)
+    bases = {name: level_basis(model, name) for name in levels}
+    return replace(problem, model=model, bases=bases, features=features)
+
+
+def start_state(problem: Problem, world_from_head: Similarity) -> State:
+    return State(np.zeros(0), world_from_head, np.zeros((len(problem.views.names), PER_CAMERA)))
+
+
+def moved_views(problem: Problem, state: State) -> Views:
+    """The views with the cameras where the state has them."""
+    if not state.camera_shift.any():
+        return problem.views
+    turn = rotation_from_vector(state.camera_shift[:, :3])
+    rotation = turn @ problem.views.rotation
+    translation = (turn @ problem.views.translation[:, :, None])[:, :, 0] + state.camera_shift[:, 3:]
+    return replace(problem.views, rotation=rotation, translation=translation)
