@@ -1,7 +1,7 @@
 """The 26 landmarks of section 3.2, by their anthropometric names, and the seven of section 4.2 among them.
 
 Right and left are the subject's. The definitions follow Farkas, *Anthropometry of the Head and Face* (1994);
-docs/models.md has a picture.
+docs/models.md lists them for people who mark scans.
 """
 
 from collections.abc import Iterable, Mapping
