@@ -4,8 +4,9 @@ Enters: silhouettes, the rig, which camera the subject faces. Leaves: world_from
 
 The subject's crown and the middle of its head come from the visual hull, up and front from the cameras; nothing leans
 on the axes of the world frame. From there the contour solver is started at several turns of the head with pose and a
-few modes on the coarsest mesh, the best few go on with a finer one, and the lowest robust cost wins. A start 10 mm off
-ends in a local minimum under hair (docs/results.md), so the robust scale begins at 40 px.
+few modes on the coarsest mesh, the best few go on with a finer one, and the one that all eigenheads explain best wins:
+under thick hair 15 modes cannot tell the right pose from one that is 50 degrees off. A start 10 mm off ends in a local
+minimum under hair (docs/results.md), so the robust scale begins at 40 px.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,6 +33,8 @@ YAWS_DEG, PITCHES_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-15.0, 0.0, 15.0)
 FINALISTS = 4
 COARSE = Stage("p99", 6, False, (40.0, 20.0, 10.0), False, True, 4)
 FINE = Stage("p95", 15, False, (20.0, 10.0, 6.0), False, True, 4)
+DEEP = Stage("p95", 60, True, (6.0, 4.0), False, True, 4)
+SEEN_SHARE = 0.6  # of the cameras that see the best seen point; above the frame of most, nothing carves the hull
 JUDGED_PX = 6.0  # robust scale at which finalists are compared
 REFERENCE_PX = 3000.0  # outline length that costs are scaled to, so that hiding the rim wins nothing
 
@@ -69,7 +72,9 @@ def search_alignment(
     judged = []
     for i, state in enumerate(finalists):
         report("alignment", 0.7 + 0.3 * i / len(finalists))
-        judged.append(_descended(problem, state, FINE))
+        _, fine = _descended(problem, state, FINE)
+        cost, _ = _descended(problem, fine, replace(DEEP, modes=min(DEEP.modes, len(model.modes))))
+        judged.append((cost, fine))
     return min(judged, key=lambda pair: pair[0])[1].world_from_head
 
 
@@ -104,7 +109,7 @@ def head_origin(
         at = np.rint(pixels[framed]).astype(int)
         inside[framed] &= silhouette.distance[at[:, 1], at[:, 0]] < 0
         seen += framed
-    hull = grid[inside & (seen >= max(2, len(rig) // 3))]
+    hull = grid[inside & (seen >= max(2.0, SEEN_SHARE * seen.max()))]
     if len(hull) < 10:
         raise NoSubject
     mean = model.vertices(np.zeros(0), "p95")
