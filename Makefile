@@ -15,7 +15,7 @@ test: setup  ## the fast tests
 	$(BIN)/pytest -n 2 --dist loadfile
 
 test-slow: setup  ## the tests that take more than a few seconds each
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -m slow -n 2 --dist loadfile
 
 check: setup ## ruff, pyright, import-linter
 	$(BIN)/ruff check .

@@ -84,7 +84,10 @@ class Foreign:
 
 
 def import_model(path: Path, *, name: str | None = None, report: Report | None = None) -> ModelParts:
-    """Read a foreign model and make it one of ours (or a model file of ours, renamed). Raises CannotImport."""
+    """Read a foreign model and make it one of ours (or a model file of ours, renamed). Of a folder that holds one model
+    file, that file. Raises CannotImport."""
+    files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
+    path = files[0] if len(files) == 1 else path
     if path.is_dir():
         foreign = read_ict_repository(path, report=report)
     elif path.suffix.lower() in (".h5", ".hdf5"):

@@ -9,7 +9,8 @@ the feature points. Ours starts 2 degrees and 4 mm off and has to find pose and 
 - ``simplex_adaptive``: the same with the parameters of Gao and Han 2012.
 - ``cma``: CMA-ES with a diagonal covariance (Hansen's ``cma``); the full one needs more than 3,500 evaluations in 60
   dimensions to learn anything.
-- ``bobyqa``: Py-BOBYQA, quadratic models through 121 points.
+- ``bobyqa``: Py-BOBYQA, quadratic models through 121 points; 1,000 evaluations a level at most, since in 60 dimensions
+  its own algebra takes longer than they do.
 - ``soft``: a soft rasteriser with Adam (soft_rasteriser.py).
 - ``hull``: the visual hull. It has no vertices to compare, so its error is the distance of the true face to it.
 
@@ -51,6 +52,7 @@ from rig.studio.layout import default_layout
 MODES = 60
 CHECKED_EVERY = 10  # moves of scipy's simplex after which its spread is looked at
 CMA_SIGMAS = (0.6, 0.3)  # first step of each level, in standard deviations
+BOBYQA_LIMIT = 1000  # evaluations a level
 BOBYQA_RADII = ((1.0, 0.05), (0.5, 0.02))  # first and last trust region of each level
 
 
@@ -190,7 +192,7 @@ def bobyqa(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Flo
 
     first, last = BOBYQA_RADII[level]
     found = pybobyqa.solve(
-        function, start, rhobeg=first, rhoend=last, maxfun=LIMIT, objfun_has_noise=True, do_logging=False
+        function, start, rhobeg=first, rhoend=last, maxfun=BOBYQA_LIMIT, objfun_has_noise=True, do_logging=False
     )
     return np.asarray(found.x)
 

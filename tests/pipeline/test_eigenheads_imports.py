@@ -54,6 +54,7 @@ def test_plain_npz_keeps_its_vertices_and_its_gaussian(tmp_path: Path, small: di
     np.savez(tmp_path / "small.npz", allow_pickle=False, **small)
     parts = import_model(tmp_path / "small.npz", name="tiny")
     assert parts.name == "tiny"
+    assert import_model(tmp_path).mean.shape == parts.mean.shape  # a folder that holds one file is that file
     assert parts.subjects == {"total": 7, "male": 4, "female": 3}
     assert parts.licence == "CC0-1.0"
     gram = parts.modes.reshape(6, -1) @ parts.modes.reshape(6, -1).T
