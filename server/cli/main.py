@@ -1,0 +1,41 @@
+"""The command ``eigenhead``. Everything heavy is imported inside the commands, so that --help answers at once."""
+
+import os
+import sys
+
+import typer
+
+from rig.errors import EigenheadError
+from server.cli import cameras, heads, models, rig, service
+from server.cli.answers import fail
+
+app = typer.Typer(
+    name="eigenhead",
+    help="One shot of a calibrated camera rig in, a textured 3D head with its uncertainty out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # importing rich's markdown alone takes half a second
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for room in (service, heads, cameras):
+    app.add_typer(room.app)
+for group, name in ((service.keys_app, "keys"), (rig.rig_app, "rig"), (models.model_app, "model")):
+    app.add_typer(group, name=name)
+
+
+def main() -> None:
+    """Entry point: 0 done, 1 failed with one clear line on stderr, 2 wrong usage."""
+    try:
+        app()
+    except EigenheadError as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        if os.environ.get("EIGENHEAD_DEBUG"):
+            raise
+        fail(f"{type(error).__name__}: {error} (EIGENHEAD_DEBUG=1 shows where)")
