@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numba import njit
 
+from pipeline.lens import distorted, packed_lens
 from pipeline.silhouette import Silhouette
 from rig.camera import Camera
 from rig.errors import EigenheadError
@@ -153,11 +154,9 @@ def _mark(known: np.ndarray, active: np.ndarray) -> None:
 
 
 def camera_parameters(camera: Camera) -> Float[np.ndarray, " 22"]:
-    """Rotation, translation, fx fy cx cy, k1 k2 p1 p2 k3 and the squared turning radius, for compiled projections."""
-    k, pose = camera.intrinsics, camera.camera_from_world
-    d = k.distortion
-    lens = [k.fx, k.fy, k.cx, k.cy, d.k1, d.k2, d.p1, d.p2, d.k3, d.turning_radius() ** 2]
-    return np.concatenate([pose.rotation.ravel(), pose.translation, lens])
+    """Rotation, translation and ``packed_lens``, for compiled projections."""
+    pose = camera.camera_from_world
+    return np.concatenate([pose.rotation.ravel(), pose.translation, packed_lens(camera)])
 
 
 @njit(cache=True, nogil=True)
@@ -173,6 +172,7 @@ def _add_view(
 ) -> None:
     """Raises ``field`` to this view's distance (mm) at the points of the active blocks, and counts the view there."""
     height, width = distance.shape
+    lens = p[12:]
     blocks = active.shape[0]
     for block in range(blocks * blocks * blocks):
         bi, bj, bk = block // (blocks * blocks), (block // blocks) % blocks, block % blocks
@@ -191,12 +191,7 @@ def _add_view(
                         continue
                     u = (p[0] * x + p[1] * y + p[2] * z + p[9]) / cz
                     v = (p[3] * x + p[4] * y + p[5] * z + p[10]) / cz
-                    r2 = u * u + v * v
-                    if r2 > p[21]:
-                        continue
-                    radial = 1 + r2 * (p[16] + r2 * (p[17] + r2 * p[20]))
-                    column = p[12] * (u * radial + 2 * p[18] * u * v + p[19] * (r2 + 2 * u * u)) + p[14]
-                    row = p[13] * (v * radial + p[18] * (r2 + 2 * v * v) + 2 * p[19] * u * v) + p[15]
+                    column, row = distorted(u, v, lens)
                     if not (column >= 0 and row >= 0 and column < width - 1 and row < height - 1):
                         continue
                     c, r = int(column), int(row)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int8
 from numba import njit
 
+from pipeline.lens import distorted
 from pipeline.visual_hull import camera_parameters, mask_extent
 from rig.layout import Rig
 
@@ -80,12 +81,7 @@ def _least_dissent(
                     continue
                 u = (p[0] * x + p[1] * y + p[2] * z + p[9]) / cz
                 v = (p[3] * x + p[4] * y + p[5] * z + p[10]) / cz
-                r2 = u * u + v * v
-                if r2 > p[21]:
-                    continue
-                radial = 1 + r2 * (p[16] + r2 * (p[17] + r2 * p[20]))
-                column = p[12] * (u * radial + 2 * p[18] * u * v + p[19] * (r2 + 2 * u * u)) + p[14]
-                row = p[13] * (v * radial + p[18] * (r2 + 2 * v * v) + 2 * p[19] * u * v) + p[15]
+                column, row = distorted(u, v, p[12:])
                 i, j = int((row + 0.5) / scales[k]), int((column + 0.5) / scales[k])
                 if row < 0 or column < 0 or i >= distances.shape[1] or j >= distances.shape[2]:
                     continue

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32
 from numba import njit
 
 from pipeline.fitting.threads import in_threads
+from pipeline.lens import NOWHERE, distorted, packed_lens
 from rig.layout import Rig
 
 SAMPLES_MOST = 6000  # rim samples of one view; a full head has about 1,000
@@ -44,7 +45,7 @@ class Views:
     names: tuple[str, ...]
     rotation: Float[np.ndarray, "k 3 3"]
     translation: Float[np.ndarray, "k 3"]
-    lens: Float[np.ndarray, "k 10"]  # fx fy cx cy k1 k2 p1 p2 k3 turning radius
+    lens: Float[np.ndarray, "k 10"]  # packed_lens of each
     size: Int32[np.ndarray, "k 2"]  # width, height
     distance: Float32[np.ndarray, " pixels"]  # all views, one after the other, row by row
     offset: Int[np.ndarray, " k"]
@@ -94,16 +95,12 @@ def make_topology(
 def pack_views(rig: Rig, distances: dict[str, Float32[np.ndarray, "h w"]]) -> Views:
     """The cameras of ``rig`` that have a signed distance."""
     cameras = [camera for camera in rig if camera.name in distances]
-    lens = []
-    for camera in cameras:
-        k, d = camera.intrinsics, camera.intrinsics.distortion
-        lens.append([k.fx, k.fy, k.cx, k.cy, *d.opencv(), min(d.turning_radius(), 1e6)])
     maps = [np.ascontiguousarray(distances[camera.name], np.float32) for camera in cameras]
     return Views(
         names=tuple(camera.name for camera in cameras),
         rotation=np.stack([camera.camera_from_world.rotation for camera in cameras]),
         translation=np.stack([camera.camera_from_world.translation for camera in cameras]),
-        lens=np.array(lens),
+        lens=np.stack([packed_lens(camera) for camera in cameras]),
         size=np.array([m.shape[::-1] for m in maps], np.int32),
         distance=np.concatenate([m.ravel() for m in maps]),
         offset=np.cumsum([0] + [m.size for m in maps])[:-1].astype(np.int64),
@@ -204,15 +201,8 @@ def _project(point, rotation, translation, lens):
     y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
     z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
     if z <= 1.0:
-        return 1e9, 1e9
-    x, y = x / z, y / z
-    r2 = x * x + y * y
-    if r2 > lens[9] * lens[9]:
-        return 1e9, 1e9
-    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
-    u = x * radial + 2.0 * lens[6] * x * y + lens[7] * (r2 + 2.0 * x * x)
-    v = y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y
-    return lens[0] * u + lens[2], lens[1] * v + lens[3]
+        return NOWHERE, NOWHERE
+    return distorted(x / z, y / z, lens)
 
 
 @njit(cache=True, fastmath=True)
