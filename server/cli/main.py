@@ -26,6 +26,9 @@ for group, name in ((service.keys_app, "keys"), (rig.rig_app, "rig"), (models.mo
 
 def main() -> None:
     """Entry point: 0 done, 1 failed with one clear line on stderr, 2 wrong usage."""
+    # Before NumPy is loaded, here and in workers: on small systems BLAS threads spin longer than they work, and beside
+    # another busy process a fit took five times the processor time.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()
     except EigenheadError as error:
