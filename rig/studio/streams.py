@@ -40,6 +40,8 @@ class _Camera:
     film: Film | None = None
     shown: bytes = b""
     frames: int = 0  # sent so far
+    ticks: int = 0  # of them live ones
+    releases: int = 0  # and triggered ones
     frozen: bool = False
     hung: bool = False
     held: bool = False  # armed: no live view until the input is raised
@@ -164,7 +166,8 @@ class StreamServer:
     def _tick(self, camera: _Camera) -> None:
         camera.tick = self._loop.call_later(self._period_s, self._tick, camera)
         if not camera.held and camera.film is not None:
-            self._emit(camera, camera.film.live)
+            camera.ticks += 1
+            self._emit(camera, camera.film.live[camera.ticks % len(camera.film.live)])
 
     def _expose(self, camera: _Camera) -> None:
         camera.held = False
@@ -174,14 +177,15 @@ class StreamServer:
         if camera.drop_next:
             camera.drop_next = False
         elif camera.film is not None:
-            self._emit(camera, camera.film.released)
+            camera.releases += 1  # counted apart: two in a row are never the same picture, however many frames passed
+            self._emit(camera, camera.film.released[camera.releases % len(camera.film.released)])
 
-    def _emit(self, camera: _Camera, takes: tuple[bytes, ...]) -> None:
+    def _emit(self, camera: _Camera, take: bytes) -> None:
         if camera.hung:
             return
         camera.frames += 1
         if not camera.frozen or not camera.shown:
-            camera.shown = takes[camera.frames % len(takes)]
+            camera.shown = take
         event, camera.shown_event = camera.shown_event, asyncio.Event()
         event.set()
 
