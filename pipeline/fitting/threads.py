@@ -1,12 +1,15 @@
 """Threads over slices of compiled loops.
 
 Numba's own ``parallel`` compiles five times as long, and its OpenMP threads spin while they wait: where another process
-held one of two cores, a fit took 22 s instead of one. These sleep.
+held one of two cores, a fit took 22 s instead of one. These sleep, and they stay: starting them anew for every loop was
+a third of a fit.
 """
 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,12 +17,33 @@ SLICES = 8  # of a loop: enough that threads end together
 
 
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:
-    """``work(first, last)`` over slices of ``range(count)``; for compiled loops that let go of the interpreter."""
+    """``work(first, last)`` over slices of ``range(count)``; for compiled loops that let go of the interpreter.
+
+    The caller takes slices like everyone else. A helper that has not begun when they are gone (all busy, or left behind
+    by a fork) is called off, so that nobody waits for it.
+    """
     cores = len(os.sched_getaffinity(0))
     if cores == 1:
         work(0, count)
         return
     ends = np.linspace(0, count, min(SLICES, count) + 1).astype(int).tolist()
-    with ThreadPoolExecutor(cores) as pool:
-        for done in [pool.submit(work, *ends[i : i + 2]) for i in range(len(ends) - 1)]:
-            done.result()
+    slices = list(pairwise(ends))[::-1]
+
+    def take() -> None:
+        while slices:
+            try:
+                first, last = slices.pop()
+            except IndexError:  # another was quicker
+                return
+            work(first, last)
+
+    helpers = [_pool(cores - 1).submit(take) for _ in range(cores - 1)]
+    take()
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="slices")
