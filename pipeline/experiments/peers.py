@@ -12,6 +12,8 @@ the feature points. Ours starts 2 degrees and 4 mm off and has to find pose and 
 - ``bobyqa``: Py-BOBYQA, quadratic models through 121 points; 1,000 evaluations a level at most, since in 60 dimensions
   its own algebra takes longer than they do.
 - ``soft``: a soft rasteriser with Adam (soft_rasteriser.py).
+- ``contour_all`` and ``soft_all``: with every mode of the model instead of 60, which only those that know derivatives
+  can search. The database's subjects are then in the span, as the paper's were in its database.
 - ``hull``: the visual hull. It has no vertices to compare, so its error is the distance of the true face to it.
 
 The error is the mean over the face region's vertices, world frame, no realignment. Seconds are those of the search from
@@ -25,6 +27,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -197,10 +200,10 @@ def bobyqa(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Flo
     return np.asarray(found.x)
 
 
-def soft(task: Task) -> Row:
-    pose = task.subject.world_from_head
+def soft(task: Task, *, whole: bool = False) -> Row:
+    pose, model = task.subject.world_from_head, task.whole if whole else task.model
     coefficients, steps = soft_rasteriser.fit_soft(
-        task.model, pose, task.silhouettes, task.rig, renderer=task.renderer, modes=MODES
+        model, pose, task.silhouettes, task.rig, renderer=task.renderer, modes=len(model.modes)
     )
     return error_row(task, Fit("soft", coefficients, pose, steps, ""))
 
@@ -213,22 +216,25 @@ def hull(task: Task) -> Row:
     return {"error_mm": float(distances.mean()), "evaluations": 1}
 
 
-def ours(task: Task) -> Row:
-    fit = fit_contour(task.model, task.subject.start, task.silhouettes, task.rig, FittingSettings())
+def ours(task: Task, *, whole: bool = False) -> Row:
+    model = task.whole if whole else task.model
+    fit = fit_contour(model, task.subject.start, task.silhouettes, task.rig, FittingSettings())
     return error_row(task, fit)
 
 
 _FREE = (objective,)
 SOLVERS: dict[str, tuple[Callable[[Task], Row], tuple[Any, ...]]] = {
     "contour": (ours, CONTOUR),
+    "contour_all": (partial(ours, whole=True), CONTOUR),
     "hull": (hull, ()),
     "soft": (soft, (soft_rasteriser,)),
+    "soft_all": (partial(soft, whole=True), (soft_rasteriser,)),
     "simplex": (derivative_free(lambda f, x, level: nelder_mead(f, x, adaptive=False)), _FREE),
     "simplex_adaptive": (derivative_free(lambda f, x, level: nelder_mead(f, x, adaptive=True)), _FREE),
     "cma": (derivative_free(diagonal_cma), _FREE),
     "bobyqa": (derivative_free(bobyqa), _FREE),
 }
-WARMED = ("contour", "hull", "soft")
+WARMED = ("contour", "contour_all", "hull", "soft", "soft_all")
 
 
 def figures(rows: list[Row]) -> dict[str, float]:

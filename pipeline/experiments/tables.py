@@ -32,6 +32,11 @@ from rig.studio.layout import arrangement, default_layout
 
 Report = Callable[[str, float], None]
 STATISTICS = {"min": np.min, "max": np.max, "mean": np.mean, "median": np.median, "std": np.std}
+METHODS = {  # as rows name them: as tables do
+    "contour": "contour",
+    "contour_all": "contour, all modes",  # in whose span the database's subjects are, as the paper's were
+    "simplex": "simplex",
+}
 ARRANGEMENTS = ("a", "b", "c", "d")
 PAIRS = (("xor", "l2"), ("xor", "hausdorff"), ("l2", "hausdorff"))
 PAPER = {  # min, max, mean, median, std; other database, other units
@@ -54,9 +59,9 @@ def table1(
     folder: Path | None = None,
 ) -> dict[str, Any]:
     """Tables 1 and 2, and pictures like figures 4 and 5. ``simplex_subjects``: how many the simplex fits too."""
-    rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder)
+    rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder, all_too=True)
     figures: dict[str, float] = {"subjects": len(rows), "simplex_subjects": sum("simplex" in row for row in rows)}
-    for method in ("contour", "simplex"):
+    for method in METHODS:
         done = [row[method] for row in rows if method in row]
         for quantity in ("xor", "l2", "hausdorff", "mean_error_mm") if done else ():
             values = np.array([row[quantity] for row in done])
@@ -93,7 +98,7 @@ def table2(
     folder: Path | None = None,
 ) -> dict[str, Any]:
     """Table 2 alone, from table 1's rows."""
-    rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder)
+    rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder, all_too=True)
     figures = _correlations(rows)
     return {"figures": {"subjects": len(rows)} | figures, "rows": rows, "markdown": _table2_markdown(figures)}
 
@@ -133,7 +138,7 @@ def correlation(rows: list[Row], one: str, two: str) -> float | None:
 def _correlations(rows: list[Row]) -> dict[str, float]:
     """Of each solver's results, and (``xor_l2_correlation`` ...) over starts and results of both: within the results of
     a solver that is nearly exact there is nothing left to correlate."""
-    of = {f"{method}_": [row[method] for row in rows if method in row] for method in ("contour", "simplex")}
+    of = {f"{method}_": [row[method] for row in rows if method in row] for method in METHODS}
     of[""] = [row[kind] for row in rows for kind in ("start", "contour", "simplex") if kind in row]
     found = {f"{kind}{a}_{b}_correlation": correlation(done, a, b) for kind, done in of.items() for a, b in PAIRS}
     return {name: value for name, value in found.items() if value is not None}
@@ -142,23 +147,23 @@ def _correlations(rows: list[Row]) -> dict[str, float]:
 def _table1_markdown(found: Mapping[str, float]) -> str:
     rows: list[list[markdown.Cell]] = []
     for quantity, title in (("xor", "XOR, px"), ("l2", "L2, mm"), ("hausdorff", "Hausdorff, mm")):
-        for method in ("contour", "simplex"):
+        for method, words in METHODS.items():
             if f"{method}_{quantity}_min" in found:
-                rows.append([f"{title}, {method}", *(found[f"{method}_{quantity}_{name}"] for name in STATISTICS)])
+                rows.append([f"{title}, {words}", *(found[f"{method}_{quantity}_{name}"] for name in STATISTICS)])
         paper = next(name for name in PAPER if name.startswith(title.split(",")[0]))
         rows.append([paper, *PAPER[paper]])
-    for method in ("contour", "simplex"):
+    for method, words in METHODS.items():
         if f"{method}_mean_error_mm" in found:
             spread = {name: found.get(f"{method}_mean_error_mm_{name}") for name in STATISTICS}
             spread["mean"] = found[f"{method}_mean_error_mm"]
-            rows.append([f"mean error of the face, mm, {method}", *spread.values()])
+            rows.append([f"mean error of the face, mm, {words}", *spread.values()])
     return markdown.table(("", *STATISTICS), rows)
 
 
 def _table2_markdown(found: Mapping[str, float]) -> str:
     names = ["_".join(pair) + "_correlation" for pair in PAIRS]
     rows: list[list[markdown.Cell]] = [
-        [method, *(found.get(f"{method}_{name}") for name in names)] for method in ("contour", "simplex")
+        [words, *(found.get(f"{method}_{name}") for name in names)] for method, words in METHODS.items()
     ]
     rows.append(["starts and results of both", *(found.get(name) for name in names)])
     rows.append(["paper", *PAPER_CORRELATIONS])
@@ -174,10 +179,14 @@ def _rows(
     renderer: Renderer,
     report: Report,
     folder: Path | None,
+    *,
+    all_too: bool = False,
 ) -> list[Row]:
-    """One row a subject; the solvers' rows are kept apart, so that a change of one does not cost the other's."""
+    """One row a subject; the solvers' rows are kept apart, so that a change of one does not cost the other's.
+    ``all_too``: the contour solver with every mode of the model as well."""
     key = (model.sha256, FittingSettings())
     ours = Records(folder, name, key_of(*key, *CONTOUR))
+    wide = Records(folder, f"{name}-all", key_of(*key, *CONTOUR))
     theirs = Records(folder, f"{name}-simplex", key_of(*key, objective, schedule, simplex))
     everyone, rig = subjects_of_section_5_2(model, 100), exact(rig)
     chosen = [everyone[i] for i in _evenly(len(everyone), subjects)]
@@ -186,6 +195,8 @@ def _rows(
     for i, subject in enumerate(chosen):
         report(f"{name} {subject.name}", i / len(chosen))
         row = ours.row(subject.name, partial(_contour_row, model, subject, rig, renderer))
+        if all_too:
+            row = row | {"contour_all": wide.row(subject.name, partial(_all_row, model, subject, rig, renderer))}
         if subject.name in slow:
             row = row | {"simplex": theirs.row(subject.name, partial(_simplex_row, model, subject, rig, renderer))}
         rows.append(row)
@@ -209,6 +220,12 @@ def _contour_row(model: HeadModel, subject: Planted, rig: Rig, renderer: Rendere
         "contour": scores(model, fit, subject, rig, renderer),
         "floor_mm": scores(model, best, subject, rig, renderer)["mean_error_mm"],
     }
+
+
+def _all_row(model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer) -> Row:
+    silhouettes = binary_silhouettes(model, subject, rig, renderer)
+    fit = fit_contour(model, subject.start, silhouettes, rig, FittingSettings())
+    return scores(model, fit, subject, rig, renderer)
 
 
 def _simplex_row(model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer) -> Row:
