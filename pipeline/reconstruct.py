@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -154,9 +155,13 @@ def without_moved_cameras(
 
 def basis(model: HeadModel, settings: Settings) -> HeadModel:
     """The modes that the settings ask for: the eigenheads in use, and the kernel's where the detail goes beyond."""
-    if settings.detail == "span" or settings.method == "simplex":
-        return with_modes(model, min(settings.fitting.modes, len(model.modes)))
-    return with_kernel(model, min(settings.fitting.modes, len(model.modes)))
+    span = settings.detail == "span" or settings.method == "simplex"
+    return _basis(model, min(settings.fitting.modes, len(model.modes)), kernel=not span)
+
+
+@lru_cache(maxsize=2)  # models are few, jobs are many, and others keep what they make of the same model
+def _basis(model: HeadModel, modes: int, *, kernel: bool) -> HeadModel:
+    return with_kernel(model, modes) if kernel else with_modes(model, modes)
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:

@@ -186,7 +186,7 @@ def observe(
     metric = metric_rig(looks.cameras, state.world_from_head.translation, settings.rig_scale_spread)
     observations = SurfaceObservations(
         vertex=rows,
-        basis=basis[:, kept],
+        basis=basis.take(kept, axis=1),  # basis[:, kept] is laid out by vertex, and copied whenever it is used
         mean=problem.model.levels["full"].operator[rows] @ problem.model.mean.astype(float),
         normal=normal,
         seen_at=stood,

@@ -44,7 +44,7 @@ class Evaluation:
 def evaluate(problem: Problem, state: State, stage: Stage, scale_px: float, reference: float | None) -> Evaluation:
     """The robust cost. ``reference``: outline length (px) that the rim's part is scaled to, so that a fit gains nothing
     by hiding its rim."""
-    vertices = state.world_from_head.apply(problem.model.vertices(state.coefficients, stage.level))
+    vertices = state.world_from_head.apply(problem.bases[stage.level].vertices(state.coefficients))
     topology = problem.topologies[stage.level]
     rim = find_rim(topology, vertices, moved_views(problem, state), whole_head=stage.whole_head or stage.contained)
     rim = without_clutter(problem, rim)
@@ -123,7 +123,8 @@ def speaking(rim: Rim) -> Rim:
 def rim_rows(problem: Problem, state: State, rim: Rim, stage: Stage) -> Float[np.ndarray, "s q"]:
     """d(residual) / d(coefficients, pose, the correction of the sample's own camera)."""
     pose, views = state.world_from_head, moved_views(problem, state)
-    operator, modes = problem.bases[stage.level]
+    basis = problem.bases[stage.level]
+    operator = basis.operator
     rows = np.empty((len(rim.view), stage.modes + POSE + PER_CAMERA))
     # One type for every level, or the loop is compiled once for each.
     start, member = operator.indptr.astype(np.int64), operator.indices.astype(np.int64)
@@ -132,7 +133,7 @@ def rim_rows(problem: Problem, state: State, rim: Rim, stage: Stage) -> Float[np
 
     def fill(first: int, last: int) -> None:
         _fill_rows(
-            first, last, start, member, operator.data, modes, stage.modes, turn, pose.translation, views.rotation,
+            first, last, start, member, operator.data, basis.modes, stage.modes, turn, pose.translation, views.rotation,
             views.translation, rim.view, rim.corner, blend, point, gradient, rows,
         )  # fmt: skip
 

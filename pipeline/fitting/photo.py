@@ -11,9 +11,10 @@ the kernels carry on smoothly.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.eigenheads.kernel import with_fine_kernel
@@ -50,10 +51,8 @@ def refine_with_photographs(
     if speaking < VIEWS_LEAST:
         why = f"{speaking} of {len(problem.views.names)} views have a photograph with texture, {VIEWS_LEAST} are needed"
         return solved, Detail("kernel", why)
-    model = with_fine_kernel(problem.model, length_mm=settings.fine_length_mm, amplitude_mm=settings.fine_amplitude_mm)
+    model, patches, basis = finer(problem.model, settings)
     problem = widened(problem, model, (LEVEL,))
-    patches = patches_for(problem, settings)
-    basis = model.basis("full", len(model.modes), patches.centre)
     stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
     state, evaluations, reason, share = solved.state, solved.evaluations, solved.stopped_because, 0.0
     lost = np.zeros(0, int)
@@ -71,6 +70,15 @@ def refine_with_photographs(
     why = f"{share:.0%} of the face look alike in two or more of {speaking} photographs"
     misfit = unfollowed(problem, state, lost)
     return Solved(problem, state, stage, evaluations, reason, misfit), Detail("photo", why)
+
+
+@lru_cache(maxsize=1)  # 150 MB; studios work with one model
+def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
+    """The model with the fine kernel, its patches, and its modes at their centres."""
+    fine = with_fine_kernel(model, length_mm=settings.fine_length_mm, amplitude_mm=settings.fine_amplitude_mm)
+    radius = RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS)
+    patches = make_patches(model, sample_mm=settings.sample_mm, centre_mm=settings.centre_mm, radius_mm=radius)
+    return fine, patches, fine.basis("full", len(fine.modes), patches.centre)
 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
@@ -96,8 +104,3 @@ def unfollowed(problem: Problem, state: State, lost: Int[np.ndarray, " u"]) -> F
     distance, near = KDTree(full[np.concatenate([seen.vertex, lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
     weight = np.exp(-0.5 * (distance / NEAR_MM) ** 2)
     return MISFIT_FACTOR * np.sqrt((weight * square[near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 0.1))
-
-
-def patches_for(problem: Problem, settings: PhotoSettings) -> Patches:
-    radius = RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS)
-    return make_patches(problem.model, sample_mm=settings.sample_mm, centre_mm=settings.centre_mm, radius_mm=radius)

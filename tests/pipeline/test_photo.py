@@ -10,7 +10,7 @@ from pipeline.fitting.consistency import facing_of, look, pixels_per_mm
 from pipeline.fitting.equations import apply_step
 from pipeline.fitting.hairline import spread_from_border
 from pipeline.fitting.patches import Patches, spread_samples
-from pipeline.fitting.photo import patches_for, refine_with_photographs
+from pipeline.fitting.photo import finer, refine_with_photographs
 from pipeline.fitting.photographs import noise_level
 from pipeline.fitting.problem import Stage, State
 from pipeline.fitting.surface import SurfaceObservations, surface_cost, surface_equations, surface_residual
@@ -114,7 +114,7 @@ def test_a_camera_that_was_moved_does_not_move_the_surface(model: HeadModel) -> 
 def test_what_is_hidden_is_not_seen(bump: Scene) -> None:
     """Samples behind a plate that covers the left half of the picture, or on the far side, do not face the camera."""
     start = bump.start()
-    patches = patches_for(start.problem, SETTINGS)
+    _, patches, _ = finer(start.problem.model, SETTINGS)
     looks = look(start.problem, start.state, patches, np.ones(len(bump.rig), bool), SETTINGS)
     k, camera = 3, bump.rig["cam03"]
     towards = camera.centre_world - looks.points
