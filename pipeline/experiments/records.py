@@ -8,12 +8,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.fitting import clutter, contour, equations, misfit, problem, rim
+from pipeline.fitting import clutter, contour, equations, misfit, problem, rim, rim_loops
 from rig.files import write_atomically
 
 Row = dict[str, Any]
 
-CONTOUR = (contour, problem, equations, clutter, misfit, rim)  # for keys: what rows of the contour solver depend on
+# What rows of the contour solver depend on, for keys.
+CONTOUR = (contour, problem, equations, clutter, misfit, rim, rim_loops)
 
 
 class Records:
