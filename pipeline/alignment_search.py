@@ -4,9 +4,9 @@ Enters: silhouettes, the rig, which camera the subject faces. Leaves: world_from
 
 The subject's crown and the middle of its head come from the visual hull, up and front from the cameras; nothing leans
 on the axes of the world frame. From there the contour solver is started at several turns of the head with pose and a
-few modes on the coarsest mesh, the best few go on with a finer one, and the one that all eigenheads explain best wins:
-under thick hair 15 modes cannot tell the right pose from one that is 50 degrees off. A start 10 mm off ends in a local
-minimum under hair (docs/results.md), so the robust scale begins at 40 px.
+few modes on the coarsest mesh, the best few go on with a finer one, and the one that all eigenheads explain most
+closely wins: under thick hair 15 modes cannot tell the right pose from one that is 50 degrees off. A start 10 mm off
+ends in a local minimum under hair (docs/results.md), so the robust scale begins at 40 px.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.consistency import pixels_per_mm
 from pipeline.fitting.contour import run_stage
 from pipeline.fitting.equations import evaluate
 from pipeline.fitting.problem import Problem, Stage, State, make_problem, start_state
@@ -33,9 +34,11 @@ YAWS_DEG, PITCHES_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-15.0, 0.0, 15.0)
 FINALISTS = 4
 COARSE = Stage("p99", 6, False, (40.0, 20.0, 10.0), False, True, 4)
 FINE = Stage("p95", 15, False, (20.0, 10.0, 6.0), False, True, 4)
-DEEP = Stage("p95", 60, True, (6.0, 4.0), False, True, 4)
+DEEP = Stage("p95", 60, True, (6.0, 4.0, 2.0), False, True, 4)
 SEEN_SHARE = 0.6  # of the cameras that see the best seen point; above the frame of most, nothing carves the hull
-JUDGED_PX = 6.0  # robust scale at which finalists are compared
+RANKED_PX = 6.0  # robust scale at which coarse fits are compared
+JUDGED_PX, JUDGED_MM = 2.0, 1.0  # and finalists, whichever is the larger: a right pose explains much of the outline
+# closely, a wrong one nearly all of it badly, which 6 px took for better in one of fifty draws
 REFERENCE_PX = 3000.0  # outline length that costs are scaled to, so that hiding the rim wins nothing
 
 
@@ -69,11 +72,12 @@ def search_alignment(
         report("alignment", 0.7 * i / len(starts))
         found.append(_descended(problem, start_state(problem, start), COARSE))
     finalists = [state for _, state in sorted(found, key=lambda pair: pair[0])[:FINALISTS]]
+    close = max(JUDGED_PX, JUDGED_MM * float(pixels_per_mm(tuple(problem.rig), origin).mean()))
     judged = []
     for i, state in enumerate(finalists):
         report("alignment", 0.7 + 0.3 * i / len(finalists))
         _, fine = _descended(problem, state, FINE)
-        cost, _ = _descended(problem, fine, replace(DEEP, modes=min(DEEP.modes, len(model.modes))))
+        cost, _ = _descended(problem, fine, replace(DEEP, modes=min(DEEP.modes, len(model.modes))), close)
         judged.append((cost, fine))
     return min(judged, key=lambda pair: pair[0])[1].world_from_head
 
@@ -132,6 +136,6 @@ def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
     return replace(start, rotation=start.rotation @ turn)
 
 
-def _descended(problem: Problem, state: State, stage: Stage) -> tuple[float, State]:
+def _descended(problem: Problem, state: State, stage: Stage, judged_px: float = RANKED_PX) -> tuple[float, State]:
     state, _, _ = run_stage(problem, state, stage, lambda fraction: None)
-    return evaluate(problem, state, stage, JUDGED_PX, REFERENCE_PX).cost, state
+    return evaluate(problem, state, stage, judged_px, REFERENCE_PX).cost, state
