@@ -9,6 +9,7 @@ there.
 """
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Float
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouette import Silhouette
 from pipeline.visual_hull import depth_of, hull_extent
+from rig.camera import Camera
 from rig.layout import Rig
 
 GRID = 32  # voxels a side: 12 mm on a subject of 400 mm
@@ -46,20 +48,18 @@ def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRI
     """Every camera's vote on every voxel of a coarse grid around the subject."""
     centre, edge = hull_extent(silhouettes, rig)
     voxels = voxel_grid(centre, edge, count)
-    pixels, radii, seen, empty, depths = [], [], [], [], []
-    for camera in rig:
+
+    def vote(camera: Camera) -> tuple:
         where = camera.project(voxels)
         k = camera.intrinsics
         radius = 0.87 * edge / count * k.fx / depth_of(camera, centre)  # half the diagonal of a voxel
         inside = np.logical_and(where >= 0, where <= (k.width - 1, k.height - 1)).all(axis=1)  # NaN is not
         at = np.rint(np.where(inside.reshape(-1, 1), where, 0.0)).astype(int)
         depth = np.where(inside, silhouettes[camera.name].distance[at[:, 1], at[:, 0]], -np.inf)
-        pixels.append(where)
-        radii.append(radius)
-        seen.append(inside)
-        empty.append(depth > radius)
-        depths.append(depth)
-    return Votes(*(np.array(values) for values in (pixels, radii, seen, empty, depths)))
+        return where, radius, inside, depth > radius, depth
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # NumPy releases the interpreter lock
+        return Votes(*(np.array(values) for values in zip(*pool.map(vote, rig), strict=True)))
 
 
 def judge_agreement(
@@ -72,9 +72,10 @@ def judge_agreement(
     believed = rig.subset(trusted)
     votes = cast_votes(silhouettes, believed)
     judged = dict(silhouettes)
-    for k, camera in enumerate(believed):
-        strange, missing = _shares(votes, k, silhouettes[camera.name].mask)
-        judged[camera.name] = _judged(silhouettes[camera.name], strange, missing, settings)
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        shares = pool.map(lambda k: _shares(votes, k, silhouettes[trusted[k]].mask), range(len(trusted)))
+        for name, (strange, missing) in zip(trusted, shares, strict=True):
+            judged[name] = _judged(silhouettes[name], strange, missing, settings)
     return judged
 
 

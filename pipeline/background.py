@@ -47,7 +47,7 @@ def estimate_background(
     size = (image_coarse.shape[1], image_coarse.shape[0])
     small = np.stack([cv2.resize(plate, size, interpolation=cv2.INTER_AREA) for plate in plates]).astype(np.float32)
     plate_coarse = small.mean(axis=0)
-    few = (slice(None, None, 2), slice(None, None, 2))  # a histogram needs no more
+    few = (slice(None, None, 2), slice(None, None, 2))  # a histogram and a median need no more
     gain = np.array(
         [_mode_of_ratio(image_coarse[few][:, :, c], plate_coarse[few][:, :, c]) for c in range(3)], np.float32
     )
@@ -63,7 +63,7 @@ def estimate_background(
     stack = np.stack(plates)
     noise = _noise_by_level(image, stack, field, plate_coarse, inliers)
     noise = _with_temporal_noise(noise, small)
-    middle = np.median(field[inliers], axis=0) if inliers.any() else gain
+    middle = np.median(field[few][inliers[few]], axis=0) if inliers[few].any() else gain
     return Background(stack, field, field * plate_coarse, noise, inliers, middle.astype(np.float32))
 
 
@@ -94,10 +94,10 @@ def _gain_field(
 ) -> Float32[np.ndarray, "h w 3"]:
     """Local least squares ``image = gain * plate`` in a Gaussian window, drawn to the whole image's gain where there
     is no background nearby."""
-    w = weight[:, :, None]
+    weighted = plate * cv2.merge([weight] * 3)
     size = (max(8, image.shape[1] // 4), max(8, image.shape[0] // 4))  # a smooth field needs no more
-    num = cv2.resize(w * plate * image, size, interpolation=cv2.INTER_AREA)
-    den = cv2.resize(w * plate * plate, size, interpolation=cv2.INTER_AREA)
+    num = cv2.resize(weighted * image, size, interpolation=cv2.INTER_AREA)
+    den = cv2.resize(weighted * plate, size, interpolation=cv2.INTER_AREA)
     whole = num.sum((0, 1)) / np.maximum(den.sum((0, 1)), 1e-6) if weight.any() else np.ones(3)
     ridge = 0.02 * den.mean((0, 1)) + 1e-3
     num, den = (cv2.GaussianBlur(a, (0, 0), max(1.0, sigma / 4), borderType=cv2.BORDER_REPLICATE) for a in (num, den))

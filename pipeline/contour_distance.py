@@ -10,27 +10,31 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numba import njit
 
+from pipeline.regions import box_around
+
 BAND_PX = 12
 
 
 def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> Float32[np.ndarray, "h w"]:
     """Signed distance (px) to the contour ``field == level``; negative where the field is above. +-inf without one."""
-    segments = _segments(field, level)
+    above = field > level
+    near = box_around(above, BAND_PX + 1)
+    segments = _segments(field[near], level)
     if not len(segments):
-        return np.where(field > level, -np.inf, np.inf).astype(np.float32)
-    above = (field > level).view(np.uint8)
-    whole = chamfer(above)
-    _refine(whole, field, level, segments, BAND_PX)
+        return np.where(above, -np.inf, np.inf).astype(np.float32)
+    whole = chamfer(above.view(np.uint8))
+    _refine(whole[near], field[near], level, segments, BAND_PX)
     return whole
 
 
 def chamfer(above: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Signed distance from a mask; a transform ends at pixel centres, half a pixel beyond the contour."""
-    inside = cv2.distanceTransform(above, cv2.DIST_L2, cv2.DIST_MASK_5)
-    outside = cv2.distanceTransform(1 - above, cv2.DIST_L2, cv2.DIST_MASK_5)
-    outside -= inside
-    outside += above - np.float32(0.5)
-    return outside
+    distance = cv2.distanceTransform(1 - above, cv2.DIST_L2, cv2.DIST_MASK_5)
+    distance -= np.float32(0.5)
+    box = box_around(above.view(bool), 1)
+    inside = cv2.distanceTransform(above[box], cv2.DIST_L2, cv2.DIST_MASK_5)
+    distance[box] += above[box] - inside
+    return distance
 
 
 @njit(cache=True, nogil=True)
@@ -77,7 +81,7 @@ def _segments(field: np.ndarray, level: float) -> np.ndarray:
     return out[:count]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _refine(whole: np.ndarray, field: np.ndarray, level: float, segments: np.ndarray, band: int) -> None:
     """Replaces the distances of the band in place: every contour piece is asked by all pixels within its reach."""
     height, width = field.shape
@@ -85,17 +89,16 @@ def _refine(whole: np.ndarray, field: np.ndarray, level: float, segments: np.nda
     for k in range(len(segments)):
         ax, ay = segments[k, 0], segments[k, 1]
         ex, ey = segments[k, 2] - ax, segments[k, 3] - ay
-        length = ex * ex + ey * ey
-        scale = np.float32(1.0) / length if length > 0 else np.float32(0.0)
+        scale = np.float32(1.0) / max(ex * ex + ey * ey, np.float32(1e-12))
         x0, y0 = int(segments[k, 4]), int(segments[k, 5])
         first, last = max(0, x0 - band + 1), min(width, x0 + band + 1)
         for y in range(max(0, y0 - band + 1), min(height, y0 + band + 1)):
-            dy = y - ay
+            row, dy = best[y], np.float32(y) - ay
             for x in range(first, last):
-                dx = x - ax
+                dx = np.float32(x) - ax
                 t = min(np.float32(1.0), max(np.float32(0.0), (dx * ex + dy * ey) * scale))
                 u, v = dx - t * ex, dy - t * ey
-                best[y, x] = min(best[y, x], u * u + v * v)
+                row[x] = min(row[x], u * u + v * v)
     for y in range(height):
         for x in range(width):
             if best[y, x] < band * band:

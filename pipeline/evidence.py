@@ -11,6 +11,7 @@ from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.rim import find_rim, make_topology, pack_views
 from pipeline.reconstruction import CameraFigures
+from pipeline.regions import box_around
 from pipeline.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
 from pipeline.zbuffer import depth_maps
 from rig.camera import Camera
@@ -67,8 +68,7 @@ def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) 
     everything = observed.copy()
     for model in models:
         everything |= model
-    left, top, width, height = cv2.boundingRect(everything.view(np.uint8))
-    box = slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
+    box = box_around(everything, 1)
     weights = boundary_weights(observed[box])
     return [boundary_weighted_xor(observed[box], model[box], weights) for model in models]
 

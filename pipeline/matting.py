@@ -21,7 +21,7 @@ from numba import njit
 
 from pipeline.background import Background
 from pipeline.coarse import Decision
-from pipeline.regions import dilated, eroded, spread
+from pipeline.regions import box_around, dilated, eroded, spread
 from pipeline.settings import SegmentationSettings
 from rig.mesh_files import linear_from_srgb
 
@@ -37,13 +37,15 @@ SHADE = (
 OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
 FAINT = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
 WIDE_PX = 2.5  # sigma of that window
+MARGIN_PX = 12  # around the band: beyond every window here and in what follows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matte:
-    """Alpha (about 0 to 1, smoothed), and how far the subject stands out along its contour."""
+    """Alpha (about 0 to 1, smoothed) in the box that holds the subject, and how far it stands out along its contour."""
 
-    alpha: Float32[np.ndarray, "h w"]
+    alpha: Float32[np.ndarray, "hb wb"]
+    box: tuple[slice, slice]  # rows and columns of the image; a margin without subject but at the image's own border
     contrast: Float32[np.ndarray, " c"]  # |F - B| in standard deviations, at every pixel of the contour
 
 
@@ -60,14 +62,26 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     asked |= dilated(decision.mixed, 1) & dilated(mask, band) & ~eroded(mask, DEPTH * band)
     asked &= clear | (dilated(mask, 1) & ~eroded(mask, 1))
     zone = np.where(asked, np.where(clear, 1, 3), 2 * mask).astype(np.uint8)
-    light = background.field * _light_outside(decision.coarse, background, mask)
-    sigma = background.noise @ np.full(3, 1 / 3, np.float32)
-    args = (LINEAR, image, background.plates, light, sigma, zone, probability.astype(np.float32))
-    alpha, _, _ = _alpha(*args, decision.paint, LEAN, SHADE, True)
+    cells = box_around(zone > 0, int(np.ceil(MARGIN_PX / decision.reduction)))
+    box = _pixels(cells, zone.shape, image.shape)
+    light = (background.field * _light_outside(decision.coarse, background, mask))[cells]
+    sigma = background.noise[cells] @ np.full(3, 1 / 3, np.float32)
+    own, paint = image[box], decision.paint[cells]
+    args = (LINEAR, own, background.plates[:, *box], light, sigma, zone[cells], probability[cells].astype(np.float32))
+    alpha, _, _ = _alpha(*args, paint, LEAN, SHADE, True)
     alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)
-    alpha, contrast, trust = _alpha(*args, _subject_inside(image, alpha, decision.paint), LEAN, SHADE, False)
+    alpha, contrast, trust = _alpha(*args, _subject_inside(own, alpha, paint), LEAN, SHADE, False)
     alpha = _smooth(alpha, trust, settings.alpha_blur_px)
-    return Matte(alpha, contrast[(np.abs(alpha - 0.5) < 0.25) & (contrast >= 0)])
+    return Matte(alpha, box, contrast[(np.abs(alpha - 0.5) < 0.25) & (contrast >= 0)])
+
+
+def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int, ...]) -> tuple[slice, slice]:
+    """The image's part that a part of the coarse level covers."""
+    rows, columns = (
+        slice(round(part.start * many / few), round(part.stop * many / few))
+        for part, few, many in zip(cells, coarse, fine, strict=False)
+    )
+    return rows, columns
 
 
 def _smooth(
@@ -101,13 +115,11 @@ def _subject_inside(
     half = (image.shape[1] // 2, image.shape[0] // 2)
     inner = eroded(alpha > 0.5, INSIDE_PX) & (alpha > SOLID)
     sure = cv2.resize(255 * inner.view(np.uint8), half, interpolation=cv2.INTER_AREA) == 255
-    total = np.zeros((half[1], half[0], 4), np.float32)
-    total[:, :, :3] = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
-    total[:, :, 3] = 1.0
-    total *= sure[:, :, None]
-    total = cv2.GaussianBlur(total, (0, 0), WINDOW_PX / 2)
-    total[:, :, :3] += 0.02 * cv2.resize(coarse, half, interpolation=cv2.INTER_LINEAR)
-    return total[:, :, :3] / (total[:, :, 3:] + 0.02)
+    colours = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
+    known = cv2.copyTo(cv2.cvtColor(colours, cv2.COLOR_RGB2RGBA), sure.view(np.uint8))  # 255 in the fourth channel
+    total = cv2.GaussianBlur(known.astype(np.float32), (0, 0), WINDOW_PX / 2)
+    found = cv2.cvtColor(total, cv2.COLOR_RGBA2RGB) + 0.02 * cv2.resize(coarse, half, interpolation=cv2.INTER_LINEAR)
+    return found / cv2.cvtColor(total[:, :, 3] / 255 + np.float32(0.02), cv2.COLOR_GRAY2RGB)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -132,7 +144,7 @@ def _decoded(table: np.ndarray, code: float) -> float:
     return table[low] + (code - low) * (table[low + 1] - table[low])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _alpha(
     table: np.ndarray,
     image: np.ndarray,
@@ -153,6 +165,7 @@ def _alpha(
     """
     height, width = image.shape[:2]
     ch, cw = zone.shape
+    columns = np.minimum(np.arange(width) * cw // width, cw - 1)
     alpha = np.empty((height, width), np.float32)
     contrast = np.full((height, width), -1.0, np.float32)
     trust = np.full((height, width), FAINT, np.float32)
@@ -161,7 +174,7 @@ def _alpha(
         ly, fly = _corner(y, height, ch)
         sy, fsy = _corner(y, height, subject.shape[0])
         for x in range(width):
-            zx = min(x * cw // width, cw - 1)
+            zx = columns[x]
             kind = zone[zy, zx]
             if kind == 0 or kind == 2:
                 alpha[y, x] = 0.0 if kind == 0 else 1.0
@@ -183,8 +196,8 @@ def _alpha(
                 b *= _between(light, ly, lx, c, fly, flx) / len(plates)
                 f = _between(subject, sy, sx, c, fsy, fsx)
                 code = min(int(0.5 * (f + b)), 255)
-                slope = (table[code + 1] - table[code]) * noise
-                b, f, i = _decoded(table, b) / slope, _decoded(table, f) / slope, table[image[y, x, c]] / slope
+                scale = 1 / ((table[code + 1] - table[code]) * noise)
+                b, f, i = scale * _decoded(table, b), scale * _decoded(table, f), scale * table[image[y, x, c]]
                 ff += f * f
                 fb += f * b
                 bb += b * b

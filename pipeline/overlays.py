@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.contour_distance import chamfer
+from pipeline.regions import box_around
 from pipeline.zbuffer import picture
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
@@ -124,12 +125,8 @@ def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"
     """The distance to a binary mask's contour without its stairs, which would make a thin line look broken; taken in
     the mask's own frame and a margin, infinite outside."""
     distance = np.full(mask.shape, np.inf, np.float32)
-    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    if width:
-        own = (
-            slice(max(top - MARGIN_PX, 0), top + height + MARGIN_PX),
-            slice(max(left - MARGIN_PX, 0), left + width + MARGIN_PX),
-        )
+    own = box_around(mask, MARGIN_PX)
+    if mask[own].size:
         distance[own] = cv2.GaussianBlur(chamfer(mask[own].view(np.uint8)), (0, 0), 1.0)
     return distance
 

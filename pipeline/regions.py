@@ -1,10 +1,19 @@
-"""Growing and shrinking masks, and carrying values out of them."""
+"""Boxes around masks, growing and shrinking them, and carrying values out of them."""
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 FAR = 0.01  # weight of a window four times as wide, which speaks where the near one holds no pixel
+
+
+def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
+    """Rows and columns of what is in the mask and a margin; of nothing where it is empty."""
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    if not width:
+        return slice(0, 0), slice(0, 0)
+    bottom, right = min(top + height + margin, mask.shape[0]), min(left + width + margin, mask.shape[1])
+    return slice(max(top - margin, 0), bottom), slice(max(left - margin, 0), right)
 
 
 def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
@@ -21,13 +30,17 @@ def spread(
 ) -> Float32[np.ndarray, "h w c"]:
     """Values carried to every pixel from where there is weight: a mean in a Gaussian window, and in a wider one where
     that is empty."""
-    stack = np.concatenate([values * weight[:, :, None], weight[:, :, None]], axis=2)
-    near = cv2.GaussianBlur(stack, (0, 0), sigma)
-    small = (max(4, values.shape[1] // 4), max(4, values.shape[0] // 4))
-    far = cv2.GaussianBlur(cv2.resize(stack, small, interpolation=cv2.INTER_AREA), (0, 0), max(sigma, 1.0) * 2)
-    near += FAR * cv2.resize(far, (values.shape[1], values.shape[0]), interpolation=cv2.INTER_LINEAR)
-    near += 1e-6 * stack.mean((0, 1))
-    return near[:, :, :-1] / np.maximum(near[:, :, -1:], 1e-9)
+    whole = _carried(weight, sigma)
+    return cv2.merge([_carried(plane * weight, sigma) / whole for plane in cv2.split(values)])
+
+
+def _carried(plane: Float32[np.ndarray, "h w"], sigma: float) -> Float32[np.ndarray, "h w"]:
+    near = cv2.GaussianBlur(plane, (0, 0), sigma)
+    small = (max(4, plane.shape[1] // 4), max(4, plane.shape[0] // 4))
+    far = cv2.GaussianBlur(cv2.resize(plane, small, interpolation=cv2.INTER_AREA), (0, 0), max(sigma, 1.0) * 2)
+    near += FAR * cv2.resize(far, (plane.shape[1], plane.shape[0]), interpolation=cv2.INTER_LINEAR)
+    near += 1e-6 * plane.mean() + 1e-9
+    return near
 
 
 def _disc(steps: int) -> UInt8[np.ndarray, "k k"]:

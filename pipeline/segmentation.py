@@ -90,7 +90,8 @@ def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings
 
 
 def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings) -> Silhouette:
-    alpha, holes = _without_specks(matte.alpha, settings)
+    alpha = np.zeros(decision.background.plates.shape[1:3], np.float32)
+    alpha[matte.box], holes = _without_specks(matte.alpha)
     distance = distance_to_level(alpha)
     weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
     contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
@@ -107,9 +108,7 @@ def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings
     return Silhouette(mask, distance, _quality(mask, (1, holes), contrast, weak, figures, settings))
 
 
-def _without_specks(
-    alpha: Float32[np.ndarray, "h w"], settings: SegmentationSettings
-) -> tuple[Float32[np.ndarray, "h w"], int]:
+def _without_specks(alpha: Float32[np.ndarray, "h w"]) -> tuple[Float32[np.ndarray, "h w"], int]:
     """Alpha of the subject's own component without holes of noise, and how many holes are left."""
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from numba import njit
 
+from pipeline.regions import box_around
 from pipeline.settings import TextureSettings
 from pipeline.silhouette import Silhouette
 from pipeline.zbuffer import camera_depths
@@ -69,9 +70,8 @@ def sharpened(
     An unsharp mask would lift noise with it, so that it is held back as a Wiener filter does: by the share of what it
     would lift, over some pixels, that is more than noise. Most of a head is smooth: the median over it is noise.
     """
-    left, top, width, height = cv2.boundingRect(inside.view(np.uint8))
-    box = slice(top, top + height), slice(left, left + width)
-    if not settings.sharpening or not width:
+    box = box_around(inside, 0)
+    if not settings.sharpening or not inside[box].size:
         return image
     own = image[box].astype(np.float32)
     detail = own - cv2.GaussianBlur(own, (0, 0), UNSHARP_PX)

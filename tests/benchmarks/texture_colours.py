@@ -37,7 +37,7 @@ from rig.studio.preset import PRESET
 from rig.studio.simulate import Scene, build_scene, shoot
 from rig.studio.subject import Subject
 
-SPREAD = 0.2
+SPREAD = 0.2  # of the exposures
 SHARES = (0.1, 0.5)  # of background in a vertex's colour
 BLENDS = ("default", "reference")
 RINGS = 3  # 6 mm: under the hair the truth is the dark skin there, and at its edge the photographs show the hair
@@ -75,10 +75,9 @@ def summary(name: str, values: list[float]) -> float:
 def measure(seed: int, model: HeadModel, settings: Settings, renderer: Renderer) -> dict[str, float]:
     """Figures of one capture."""
     scene = scene_of(seed, model, renderer)
-    rng = np.random.default_rng([seed, 1])
-    gains = np.exp(rng.normal(0, SPREAD, len(scene.views)))
+    apart = uneven_exposures(len(scene.views), np.random.default_rng([seed, 1]))
     found: dict[str, float] = {}
-    for name, exposures in (("even", np.ones(len(gains))), ("uneven", gains / np.exp(np.log(gains).mean()))):
+    for name, exposures in (("even", np.ones(len(apart))), ("uneven", apart)):
         lit = exposed(scene, exposures)
         capture = shoot(lit, np.random.default_rng([seed, 2]))
         result = reconstruct(capture, scene.rig, model, settings, renderer=renderer, report=lambda *_: None)
@@ -92,6 +91,13 @@ def measure(seed: int, model: HeadModel, settings: Settings, renderer: Renderer)
             for least in SHARES:
                 found[f"background_over_{least}"] = int(np.count_nonzero(share > least))
     return found
+
+
+def uneven_exposures(count: int, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
+    """Drawn, then scaled, so that they differ from their mean by ``SPREAD`` (RMS of logarithms) in every capture."""
+    logs = rng.normal(size=count)
+    logs -= logs.mean()
+    return np.exp(np.log(1 + SPREAD) / logs.std() * logs)
 
 
 def scene_of(seed: int, model: HeadModel, renderer: Renderer) -> Scene:
