@@ -188,9 +188,10 @@ def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
 
 def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], quality: int = 95) -> None:
     """Writes RGB or grey pixels as the format of the suffix."""
-    pixels = image[:, :, ::-1] if image.ndim == 3 else image  # cv2 wants BGR
+    image = np.ascontiguousarray(image)
+    pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if path.suffix == ".jpg" else PNG_OPTIONS
-    done, data = cv2.imencode(path.suffix, np.ascontiguousarray(pixels), options)
+    done, data = cv2.imencode(path.suffix, pixels, options)
     assert done
     write_atomically(path, data.tobytes())
 
