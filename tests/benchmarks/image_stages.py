@@ -1,4 +1,4 @@
-"""Seconds of a job's stages, from image files to result files, warm: medians and least of several rounds.
+"""Seconds of a job's stages, from image files to result files, warm: medians and least of several rounds; peak memory.
 
 python -m tests.benchmarks.image_stages --json
 
@@ -9,6 +9,7 @@ job needs, is the visual hull of the silhouettes. ``total`` is from opening the 
 
 import argparse
 import json
+import resource
 import sys
 import tempfile
 import time
@@ -54,13 +55,14 @@ def main() -> None:
     stages = ["read", *(name for name in rounds[0] if name not in own), "write", "total", "cpu", "hull"]
     median = {name: round(float(np.median([row[name] for row in rounds])), 3) for name in stages}
     least = {name: round(min(row[name] for row in rounds), 3) for name in stages}
+    found = {"rounds": arguments.rounds, "detail": arguments.detail, "median_s": median, "least_s": least}
+    found["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024  # kB on Linux
     if arguments.json:
-        json.dump(
-            {"rounds": arguments.rounds, "detail": arguments.detail, "median_s": median, "least_s": least}, sys.stdout
-        )
+        json.dump(found, sys.stdout)
         sys.stdout.write("\n")
     else:
         sys.stdout.write("".join(f"{name:<14} {median[name]:7.3f} s   least {least[name]:.3f}\n" for name in stages))
+        sys.stdout.write(f"peak memory    {found['peak_memory_mb']} MB\n")
 
 
 if __name__ == "__main__":
