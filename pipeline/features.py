@@ -15,15 +15,6 @@ from pipeline.triangulation import NoPoint, TriangulatedPoint, triangulate
 from rig.capture import Features
 from rig.layout import Rig
 
-SEVEN_POINTS = (
-    "exocanthion_right",
-    "exocanthion_left",
-    "pronasale",
-    "subnasale",
-    "cheilion_right",
-    "cheilion_left",
-    "gnathion",
-)
 CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point in 10,000 is lost without need
 
 

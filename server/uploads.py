@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -44,6 +44,15 @@ class Threads:
 
     async def check(self, function: Callable[..., T], *arguments: Any) -> T:
         return await anyio.to_thread.run_sync(function, *arguments, limiter=self._checks)
+
+
+def described_form(file: str, fields: Iterable[str], **described: str) -> dict[str, Any]:
+    """OpenAPI's word for a multipart body of one file, text ``fields``, and further ones with a description."""
+    texts: dict[str, dict[str, str]] = {name: {"type": "string"} for name in fields}
+    texts |= {name: {"type": "string", "description": text} for name, text in described.items()}
+    properties = {"file": {"type": "string", "format": "binary", "description": file}} | texts
+    schema = {"type": "object", "required": ["file"], "properties": properties}
+    return {"requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}}
 
 
 def check_length(request: Request, store: Store, settings: ServiceSettings) -> None:

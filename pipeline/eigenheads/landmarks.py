@@ -33,7 +33,7 @@ PAIRED = (
 )
 NAMES: tuple[str, ...] = MIDLINE + tuple(f"{name}_{side}" for name in PAIRED for side in ("right", "left"))
 
-ALIGNMENT = (
+SEVEN_POINTS = (
     "exocanthion_right",
     "exocanthion_left",
     "pronasale",

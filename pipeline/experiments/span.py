@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.landmarks import ALIGNMENT
+from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.pca import rigid_fit
 from pipeline.eigenheads.surface import vertex_areas
@@ -109,7 +109,7 @@ def read_truth(folder: Path) -> Truth:
     mesh = read_mesh(folder / "head.ply")
     mask = np.load(folder / "face_mask.npy")
     landmarks = json.loads((folder / "meta.json").read_text(encoding="utf-8"))["landmarks_world"]
-    features = {name: np.asarray(landmarks[name], float) for name in ALIGNMENT if name in landmarks}
+    features = {name: np.asarray(landmarks[name], float) for name in SEVEN_POINTS if name in landmarks}
     return Truth(
         folder.name.removesuffix(".truth"), mesh.vertices[mask], vertex_areas(mesh.vertices, mesh.faces)[mask], features
     )
@@ -123,7 +123,7 @@ def random_draws(model: HeadModel, count: int, *, seed: int = 0) -> list[Truth]:
     for k in range(count):
         vertices = model.vertices(rng.standard_normal(len(model.modes)))
         areas = vertex_areas(vertices, level.faces)[level.face_region]
-        features = {name: vertices[model.landmarks[name]] for name in ALIGNMENT}
+        features = {name: vertices[model.landmarks[name]] for name in SEVEN_POINTS}
         out.append(Truth(f"draw:{k}", vertices[level.face_region], areas, features))
     return out
 

@@ -14,35 +14,15 @@ from server.files import send_file
 from server.problems import Problem, documented
 from server.schemas import CalibrationList, CalibrationOut, NewCalibration
 from server.service import Service, ServiceOf
-from server.uploads import check_length, receive_multipart
+from server.uploads import check_length, described_form, receive_multipart
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
 JSON_BYTES = 1 << 20
 
-BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {
-                        "file": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": "archive of IMAGES/ and board.toml",
-                        },
-                        "label": {"type": "string"},
-                    },
-                }
-            },
-            "application/json": {"schema": NewCalibration.model_json_schema()},
-        },
-    }
-}
+BODY = described_form("archive of IMAGES/ and board.toml", ("label",))
+BODY["requestBody"]["content"]["application/json"] = {"schema": NewCalibration.model_json_schema()}
 
 
 @router.post("", status_code=202, responses=documented(400, 404, 413, 415, 507), openapi_extra=BODY)

@@ -14,31 +14,13 @@ from server.problems import Problem, documented
 from server.rigs import SHOT_BYTES
 from server.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures
 from server.service import Service, ServiceOf
-from server.uploads import check_length, receive_multipart
+from server.uploads import check_length, described_form, receive_multipart
 
 router = APIRouter(prefix="/v1", tags=["captures"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
 
-MULTIPART: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {
-                        "file": {"type": "string", "format": "binary", "description": ".zip, .tar or .tar.gz"},
-                        "session": {"type": "string"},
-                        "label": {"type": "string"},
-                        "expression": {"type": "string"},
-                    },
-                }
-            }
-        },
-    }
-}
+ARCHIVE = ".zip, .tar or .tar.gz"
 FIELDS = ("session", "label", "expression")
 
 
@@ -61,7 +43,10 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
 
 
 @router.post(
-    "/captures/uploads", status_code=201, responses=documented(400, 404, 413, 415, 507), openapi_extra=MULTIPART
+    "/captures/uploads",
+    status_code=201,
+    responses=documented(400, 404, 413, 415, 507),
+    openapi_extra=described_form(ARCHIVE, FIELDS),
 )
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
     """Takes a capture folder as an archive; 422 names every fault in it, and then nothing of it is kept."""
@@ -190,24 +175,7 @@ def delete_capture(service: ServiceOf, caller: Taker, capture_id: str) -> None:
     status_code=202,
     tags=["jobs"],
     responses=documented(400, 404, 409, 413, 415, 507),
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {
-                "multipart/form-data": {
-                    "schema": {
-                        "type": "object",
-                        "required": ["file"],
-                        "properties": {
-                            **MULTIPART["requestBody"]["content"]["multipart/form-data"]["schema"]["properties"],
-                            "model": {"type": "string"},
-                            "settings": {"type": "string", "description": "JSON object"},
-                        },
-                    }
-                }
-            },
-        }
-    },
+    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model"), settings="JSON object"),
 )
 async def reconstruct_upload(
     service: ServiceOf,

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.alignment import align_to_features
+from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from pipeline.eigenheads.model import HeadModel, load_model, with_modes
-from pipeline.features import SEVEN_POINTS
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.schedule import fit_simplex
 from pipeline.settings import Settings

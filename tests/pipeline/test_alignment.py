@@ -17,8 +17,8 @@ from pipeline.alignment import (
     landmark_statistics,
     procrustes,
 )
+from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.features import SEVEN_POINTS
 from pipeline.settings import AlignmentSettings
 from rig.camera import Camera, Intrinsics
 from rig.capture import Features
