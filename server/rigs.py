@@ -154,7 +154,7 @@ class RealRig:
             return self._board_shot(folder)
         rig = self._calibrated()
         if rig is None:
-            detail = "The rig has no calibration: take shots of the board, make one of them, then PUT it to use."
+            detail = "The rig has no calibration: take shots of the board, calibrate from them and use the result."
             raise Problem(503, "not-calibrated", detail)
         with self._lock:
             session = self._opened()

@@ -1,4 +1,5 @@
-"""Fixtures of all tests, and the rule that in CI no test skips unless ``allowed_skips.txt`` names it."""
+"""Fixtures of all tests, the figures that they measured, and the rule that in CI no test skips unless
+``allowed_skips.txt`` names it."""
 
 import os
 from collections.abc import Iterator
@@ -62,6 +63,16 @@ class SkipList:
             terminalreporter.section("skips that tests/allowed_skips.txt does not name (they fail in CI)")
             for line in self.unnamed:
                 terminalreporter.write_line(line)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Prints what tests gave to ``record_property``."""
+    ended = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
+    figures = [(report.nodeid, *figure) for report in ended for figure in report.user_properties]
+    if figures:
+        terminalreporter.section("figures")
+    for test, name, value in figures:
+        terminalreporter.write_line(f"{name} = {value}  ({test})")
 
 
 def pytest_configure(config: pytest.Config) -> None:

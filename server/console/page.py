@@ -12,17 +12,20 @@ from nicegui import app as pages
 from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
+from starlette.responses import RedirectResponse
 
 from server.access import Caller
 from server.child import WorkFailed
 from server.console.identity import caller_of, permit, service_of_pages
-from server.console.theme import Frame
+from server.console.removal import removals
+from server.console.theme import Frame, page_frame
 from server.health import readiness
 from server.problems import Problem, problem_from
 from server.service import Service
 
 REFRESH_S = 0.5
 STATUS_S = 2.0
+FIRST_LOOK_S = 1.0  # so long a page waits to be sent with its state in it, which saves it a turn over the socket
 KEEP_S = 3600.0  # of a value that is shared by all pages
 MAKE = Callable[[], Any]
 
@@ -91,8 +94,10 @@ class Page(Element):
         self.choice: dict[str, Any] = initial
         self._props["state"] = {"loading": True}
         self._in_turn = anyio.Lock()
+        self._told = ""
         self.on("act", self._act)
         self.on("choose", self._choose)
+        frame.on("undo", self._undo)
         ui.timer(REFRESH_S, self.refresh, immediate=True)
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
 
@@ -102,10 +107,15 @@ class Page(Element):
 
     async def refresh(self) -> None:
         try:
-            state = await anyio.to_thread.run_sync(self.look, limiter=_threads)
+            state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
+            told = ""
         except Exception as error:  # the page stays, says so once, and looks again
             problem = problem_from(error)
-            state = self._props["state"] | {"problem": {"detail": problem.detail, "errors": problem.errors}}
+            state, told = self._props["state"], problem.detail
+            if told != self._told:
+                self.frame.say("fault", told, problem.errors)
+        self._told = told
+        self.frame.show(removed=[{"id": i, "title": removal.title} for i, removal in removals.waiting().items()])
         if state != self._props["state"]:
             self._props["state"] = state
             self.update()
@@ -115,11 +125,14 @@ class Page(Element):
         if status is None:
             ui.navigate.to("/sign-in")
         else:
-            self.frame.show_status(status)
+            self.frame.show(status=status)
 
     async def _choose(self, event: GenericEventArguments) -> None:
         self.choice |= event.args
         await self.refresh()
+
+    async def _undo(self, event: GenericEventArguments) -> None:
+        await self._do({"name": "undo", "id": event.args})
 
     async def _act(self, event: GenericEventArguments) -> None:
         async with self._in_turn:  # two quick keys must not overtake each other in the threads
@@ -128,7 +141,8 @@ class Page(Element):
     async def _do(self, arguments: dict[str, Any]) -> None:
         name = arguments.pop("name")
         try:
-            said = await anyio.to_thread.run_sync(self._run, self.actions[name], arguments, limiter=_threads)
+            action = UNDO if name == "undo" else self.actions[name]
+            said = await anyio.to_thread.run_sync(self._run, action, arguments, limiter=_threads)
             if said:
                 self.frame.say("done", said)
         except Exception as error:
@@ -143,6 +157,26 @@ class Page(Element):
         return action.function(self, arguments)
 
 
+def undo(page: Page, event: dict[str, Any]) -> str:
+    """Takes back what waits to be removed, from whichever page."""
+    removal = removals.waiting().get(event["id"])
+    if removal is not None:
+        permit(page.caller, removal.scope)
+    if removal is None or not removals.undo(event["id"]):
+        raise Problem(410, "too-late", "It is removed already.")
+    shared.clear()
+    return f"It is back: {removal.title}."
+
+
+UNDO = Action("read", undo)
+
+
+def remove_later(identity: str, remove: Callable[[], None], title: str, scope: str) -> None:
+    """Out of sight of all pages at once; ``remove`` runs when nobody took it back."""
+    removals.add(identity, remove, title, scope)
+    shared.clear()
+
+
 def as_problem(error: Exception) -> Problem:
     if isinstance(error, WorkFailed) and error.kind != "bug":
         return Problem(500, error.kind, error.message, error.faults)
@@ -153,6 +187,18 @@ async def signed_in() -> Caller | None:
     """Who opens the page; None where a key is to be asked for first."""
     stored = dict(pages.storage.user)
     return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
+
+
+async def show(name: str, page: type[Page], **initial: Any) -> RedirectResponse | None:
+    """Draws ``page`` for who is signed in, or asks for a key first."""
+    caller = await signed_in()
+    if caller is None:
+        return RedirectResponse("/sign-in")
+    with page_frame(name) as frame:
+        drawn = page(frame, caller, **initial)
+    with anyio.move_on_after(FIRST_LOOK_S):
+        await drawn.refresh()
+    return None
 
 
 def status_of(service: Service, caller: Caller) -> dict[str, Any] | None:

@@ -1,10 +1,9 @@
-"""Removing with undo: a capture is out of sight at once and really removed a little later, unless it is taken back.
+"""Removing with undo: a thing is out of sight at once and really removed a little later, unless it is taken back.
 
-The wait is kept in the process: if the service dies meanwhile, the capture is there again, which is the safe side.
+The wait is kept in the process: if the service dies meanwhile, the thing is there again, which is the safe side.
 """
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -15,33 +14,45 @@ UNDO_S = 10.0
 log = structlog.get_logger()
 
 
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """``scope`` is what a key needs that takes it back."""
+
+    title: str
+    scope: str
+    timer: threading.Timer
+
+
 @dataclass
 class Removals:
-    """What waits to be removed, by id: when, and the timer that does it."""
+    """What waits to be removed, by id."""
 
     wait_s: float = UNDO_S
-    _waiting: dict[str, tuple[float, threading.Timer]] = field(default_factory=dict)
+    _waiting: dict[str, Removal] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def add(self, identity: str, remove: Callable[[], None]) -> None:
+    def __contains__(self, identity: object) -> bool:
+        return identity in self._waiting
+
+    def add(self, identity: str, remove: Callable[[], None], title: str, scope: str) -> None:
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True
         with self._lock:
             if identity not in self._waiting:
-                self._waiting[identity] = (time.monotonic() + self.wait_s, timer)
+                self._waiting[identity] = Removal(title, scope, timer)
                 timer.start()
 
     def undo(self, identity: str) -> bool:
         """Whether it was still there to be taken back."""
         with self._lock:
-            _, timer = self._waiting.pop(identity, (0.0, None))
-        if timer is not None:
-            timer.cancel()
-        return timer is not None
+            removal = self._waiting.pop(identity, None)
+        if removal is not None:
+            removal.timer.cancel()
+        return removal is not None
 
-    def remaining_s(self) -> dict[str, float]:
+    def waiting(self) -> dict[str, Removal]:
         with self._lock:
-            return {identity: max(0.0, at - time.monotonic()) for identity, (at, _) in self._waiting.items()}
+            return dict(self._waiting)
 
     def _remove(self, identity: str, remove: Callable[[], None]) -> None:
         with self._lock:
@@ -53,3 +64,6 @@ class Removals:
             log.warning("not removed", id=identity, error=str(error))
         with self._lock:
             self._waiting.pop(identity, None)
+
+
+removals = Removals()

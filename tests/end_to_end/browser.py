@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -90,6 +91,16 @@ def keep_screenshots(page: Page, folder: Path, name: str) -> None:
         found = violations(page)
         assert not found, f"{name} at {size}: {found}"
     page.set_viewport_size({"width": SIZES["1366x768"][0], "height": SIZES["1366x768"][1]})
+
+
+def live_rate(page: Page, seconds: float = 6.0) -> float:
+    """Pictures a second that the slowest tile of the rig's page gets."""
+    count = "[...document.querySelectorAll('article.tile')].map(t => Number(t.dataset.frames))"
+    page.wait_for_function(f"{count}.length > 0 && {count}.every(n => n > 0)", timeout=240_000)
+    before, began = page.evaluate(count), time.monotonic()
+    page.wait_for_timeout(seconds * 1000)
+    after = page.evaluate(count)
+    return min(b - a for a, b in zip(before, after, strict=True)) / (time.monotonic() - began)
 
 
 @cache

@@ -52,7 +52,7 @@ class RunningService:
             )
         self.await_answer()
 
-    def await_answer(self, timeout_s: float = 60.0) -> None:
+    def await_answer(self, timeout_s: float = 180.0) -> None:
         assert self.process is not None
         deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
@@ -89,8 +89,8 @@ def running_service(data: Path, *, worker: bool = True, **settings: str) -> Iter
     chosen = {"work": "tests.server.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
     environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
     service = RunningService(data, environment, free_port(), worker)
-    service.start()
     try:
+        service.start()
         yield service
     except BaseException:
         sys.stdout.write(f"{service.log}:\n{service.log.read_text()[-4000:]}")

@@ -73,13 +73,13 @@ def test_the_cookie_secret_stays_and_is_the_owners_alone(tmp_path: Path) -> None
 
 def test_a_removal_waits_and_can_be_taken_back() -> None:
     removals, removed = Removals(wait_s=0.15), []
-    removals.add("a", lambda: removed.append("a"))
-    removals.add("b", lambda: removed.append("b"))
-    assert set(removals.remaining_s()) == {"a", "b"}
+    for name in ("a", "b"):
+        removals.add(name, lambda name=name: removed.append(name), f"capture {name}", "capture")
+    assert {name: removal.title for name, removal in removals.waiting().items()} == {"a": "capture a", "b": "capture b"}
     assert removals.undo("a")
     assert not removals.undo("a")
     deadline = time.monotonic() + 5
-    while removals.remaining_s() and time.monotonic() < deadline:
+    while "b" in removals and time.monotonic() < deadline:
         time.sleep(0.01)
     assert removed == ["b"]
     assert not removals.undo("b")
@@ -92,12 +92,12 @@ def test_a_removal_that_fails_shows_the_thing_again() -> None:
         tried.set()
         raise Problem(409, "capture-in-use", "a job needs it")
 
-    removals.add("a", refuse)
+    removals.add("a", refuse, "capture a", "capture")
     assert tried.wait(5)
     deadline = time.monotonic() + 5
-    while removals.remaining_s() and time.monotonic() < deadline:
+    while "a" in removals and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert removals.remaining_s() == {}
+    assert removals.waiting() == {}
 
 
 def grid(size: int = 12, step: float = 10.0) -> Mesh:

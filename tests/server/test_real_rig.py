@@ -18,6 +18,7 @@ from server.console.live import RigSource
 from server.console.pages.rig import sync_of
 from server.rigs import open_rig
 from server.settings import ServiceSettings
+from tests.rig.board_pictures import BoardPictures
 from tests.rig.test_session import flat_rig
 from tests.rig.textured_studio import NAMES, FlatStudio
 from tests.server.services import running_service
@@ -77,20 +78,6 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         assert len(client.get("/v1/captures").json()["captures"]) == 2
 
 
-class BoardPictures:
-    """An ImageSource: recordings of a calibration board, one shot at a time, with sensor noise of their own."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.shot = folder, 0
-        self._noise = np.random.default_rng(0)
-
-    def __call__(self, camera: str, time_s: float) -> np.ndarray:
-        picture = cv2.imread(str(self.folder / camera / f"shot{self.shot:02}.jpg"))
-        assert picture is not None
-        noisy = picture[:, :, ::-1] + self._noise.standard_normal(picture.shape, np.float32)
-        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
-
-
 @pytest.mark.timeout(600)
 def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> None:
     """Four cameras that show the recorded board, shot by shot; the first shots lack a camera."""
@@ -109,9 +96,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
         assert refused.json()["type"].endswith("not-calibrated")
         captures = []
         for shot in range(26):
-            studio.seat(False)
-            board.shot = shot
-            studio.seat(True)
+            board.hold(studio, shot)
             if shot == 0:
                 studio.inject(DeviceFault("hung", "cam_2"))
             taken = client.post("/v1/captures", json={"label": "board", "board": True})
@@ -136,9 +121,7 @@ def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> 
         assert done["figures"]["rms_px"] <= 1.1
         used = client.put("/v1/rig/calibration", json={"calibration_id": done["id"]}).json()
         assert (used["calibration"], used["ready"]) == ("own", True)
-        studio.seat(False)
-        board.shot = 0  # as on the clean plates
-        studio.seat(True)
+        board.hold(studio, 0)  # as on the clean plates
         capture = client.post("/v1/captures", json={})
         assert capture.status_code == 201, capture.text
         assert (len(capture.json()["cameras"]), capture.json()["board"]) == (4, False)

@@ -4,8 +4,10 @@ import { clock, fixed, send } from "/console/static/words.js";
 export default {
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ chosen: null, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000" }, label: "", busy: "", over: false, upload: null }),
+  data: () => ({ chosen: null, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000", measured_width_mm: null, inverted: false }, label: "", busy: "", over: false, upload: null }),
+  watch: { "state.board": { handler(board) { if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board); }, immediate: true } },
   computed: {
+    collecting() { return this.state.shots > 0; }, // then the board stays what it is
     list() { return this.state.calibrations || []; },
     current() { return this.list.find((c) => c.id === this.chosen) || null; },
     cameras() { return Object.entries(this.current?.figures?.cameras || {}); },
@@ -43,19 +45,21 @@ export default {
           <template v-if="current.state === 'succeeded'">
             <div class="line wrap" style="gap: 2rem"><div><div class="small muted">Residual</div><div class="mono" style="font-size: 1.4rem">{{ fixed(current.figures.rms_px, 2) }} px</div></div><div><div class="small muted">Corners used</div><div class="mono" style="font-size: 1.4rem">{{ fixed(100 * current.figures.used_share, 1) }} %</div></div><div><div class="small muted">Front camera</div><div class="mono" style="font-size: 1.4rem">{{ current.front }}</div></div></div>
             <div class="columns" style="grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); flex: none">
-              <div class="stack"><h3>Checks</h3><table class="small"><tbody><tr v-for="c in current.checks" :key="c.name"><td><i :class="['dot', c.passed === null ? '' : c.passed ? 'good' : 'fault']"></i></td><td style="white-space: nowrap">{{ c.name }}</td><td>{{ c.detail }}<div v-if="c.passed === false && c.advice" class="warn">{{ c.advice }}</div></td></tr></tbody></table></div>
+              <div class="stack"><h3>Checks</h3><table class="small"><tbody><tr v-for="c in current.checks" :key="c.name"><td><i role="img" :aria-label="c.passed === null ? 'not checked' : c.passed ? 'passed' : 'failed'" :class="['dot', c.passed === null ? '' : c.passed ? 'good' : 'fault']"></i></td><td style="white-space: nowrap">{{ c.name }}</td><td>{{ c.detail }}<div v-if="c.passed === false && c.advice" class="warn">{{ c.advice }}</div></td></tr></tbody></table></div>
               <div class="stack"><h3>Residual by camera</h3><table class="small"><tbody><tr v-for="[name, f] in cameras" :key="name"><td>{{ name }}</td><td class="num">{{ fixed(f.rms_px, 2) }} px</td><td class="num muted">{{ current.pictures[name] }} pictures</td></tr></tbody></table></div>
             </div></template>
         </div>
         <div v-else class="stack" style="min-height: 0">
           <form class="panel pad line wrap" style="align-items: end" aria-label="The board" @submit.prevent="act('shoot', { board })">
-            <label class="field">Board<select v-model="board.kind"><option value="charuco">ChArUco</option><option value="checkerboard">checkerboard</option></select></label>
+            <fieldset :disabled="collecting" :title="collecting ? 'All shots are of one board: start over to change it' : ''" class="line wrap" style="align-items: end"><label class="field">Board<select v-model="board.kind"><option value="charuco">ChArUco</option><option value="checkerboard">checkerboard</option></select></label>
             <label class="field">Squares across<input v-model.number="board.columns" type="number" min="3" max="100" style="width: 6rem"></label>
             <label class="field">Squares down<input v-model.number="board.rows" type="number" min="3" max="100" style="width: 6rem"></label>
             <label class="field">Square, mm<input v-model.number="board.square_mm" type="number" min="0.5" step="any" style="width: 6rem"></label>
             <template v-if="board.kind === 'charuco'"><label class="field">Marker / square<input v-model.number="board.marker_ratio" type="number" min="0.3" max="0.95" step="any" style="width: 6rem"></label>
             <label class="field">Dictionary<input v-model="board.dictionary" style="width: 11rem" spellcheck="false"></label></template>
-            <span class="line push"><button type="button" class="b" :disabled="!!busy || !state.shots" @click="act('take_back', {})">Take the last one back</button><button class="b main-action" id="shoot" :disabled="!!busy">{{ busy === 'shoot' ? 'Looking for the board ...' : 'Take shot ' + ((state.shots || 0) + 1) }}</button></span>
+            <label class="field" title="Of the printed pattern, by a ruler: checks the scale">Measured width, mm<input v-model.number="board.measured_width_mm" type="number" min="1" step="any" style="width: 8rem" placeholder="optional"></label>
+            <label class="check small muted" style="padding-bottom: .4rem"><input v-model="board.inverted" type="checkbox">White on black</label></fieldset>
+            <span class="line push"><button v-if="collecting" type="button" class="b quiet" :disabled="!!busy" @click="act('start_over', {})">Start over</button><button type="button" class="b" :disabled="!!busy || !collecting" @click="act('take_back', {})">Take the last one back</button><button class="b main-action" id="shoot" :disabled="!!busy">{{ busy === 'shoot' ? 'Looking for the board ...' : 'Take shot ' + ((state.shots || 0) + 1) }}</button></span>
           </form>
           <div class="panel pad line"><span class="grow" role="status">{{ state.advice }}</span><span class="muted num">{{ state.shots || 0 }} shots</span><input v-model="label" placeholder="name of the calibration" aria-label="Name of the calibration" style="width: 14rem"><button class="b" id="calibrate" :class="{ 'main-action': state.shots >= 3 }" :disabled="!!busy || !(state.shots >= 3)" @click="act('calibrate', { label })">Calibrate</button></div>
           <div class="panel pad scroll grow" tabindex="0" role="region" aria-label="Coverage by camera"><div class="thumbs">

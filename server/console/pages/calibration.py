@@ -10,8 +10,8 @@ from starlette.responses import RedirectResponse
 from rig.errors import InputError
 from server.calibrations import from_captures
 from server.console.coverage import advice, detect_shot, summary
-from server.console.page import Action, Page, shared, signed_in
-from server.console.theme import page_frame
+from server.console.page import Action, Page, remove_later, shared, show
+from server.console.removal import removals
 from server.problems import Problem
 from server.routes.calibrations import remove_calibration
 from server.routes.captures import take_capture
@@ -21,6 +21,7 @@ from server.service import Service
 
 LABEL = "calibration board"
 SHOTS_LEAST = 3
+NO_BOARD = "The simulated studio shows a person and no board: drop an archive of board pictures at the left."
 
 
 class Shots:
@@ -33,17 +34,23 @@ class Shots:
 
     def add(self, board: dict[str, Any], capture: str, found: dict[str, list[list[float]]]) -> None:
         with self._lock:
-            if board != self.board:
-                self.board, self.taken = board, []
-            self.taken = [*self.taken, (capture, found)]
+            self.board, self.taken = board, [*self.taken, (capture, found)]
+
+    def check(self, board: dict[str, Any]) -> None:
+        """Raises a 409 problem where the shots so far are of another board."""
+        with self._lock:
+            if self.taken and board != self.board:
+                detail = f"The {len(self.taken)} shots so far are of another board. Calibrate or start over first."
+                raise Problem(409, "other-board", detail)
 
     def drop_last(self) -> None:
         with self._lock:
             self.taken = self.taken[:-1]
+            self.board = self.board if self.taken else {}
 
     def clear(self) -> None:
         with self._lock:
-            self.taken = []
+            self.board, self.taken = {}, []
 
 
 shots = Shots()
@@ -59,7 +66,9 @@ def calibration_state(service: Service) -> dict[str, Any]:
     names = [camera["name"] for camera in rig["cameras"]]
     lines = summary(names, [found for _, found in shots.taken])
     return {
-        "calibrations": shared.get("calibrations", 1.0, service.calibrations.find),
+        "calibrations": [
+            c for c in shared.get("calibrations", 1.0, service.calibrations.find) if c["id"] not in removals
+        ],
         "rig": {
             "kind": rig["kind"],
             "calibration": rig["calibration"],
@@ -68,19 +77,18 @@ def calibration_state(service: Service) -> dict[str, Any]:
         "board": shots.board,
         "shots": len(shots.taken),
         "coverage": lines,
-        "advice": advice(lines),
+        "advice": NO_BOARD if rig["kind"] == "simulated" and not shots.taken else advice(lines),
     }
 
 
 def board_of(event: dict[str, Any]) -> dict[str, Any]:
     """The board's document from the form. Raises InputError."""
     form = event.get("board") or {}
-    keys = ("kind", "columns", "rows", "square_mm")
-    board = {key: form[key] for key in keys if form.get(key) not in (None, "")}
-    if board.get("kind") == "charuco":
-        board |= {key: form[key] for key in ("marker_ratio", "dictionary") if form.get(key) not in (None, "")}
-    if len(board) < len(keys):
-        raise InputError("board", [f"{key} is missing" for key in keys if key not in board])
+    needed = ("kind", "columns", "rows", "square_mm")
+    other = ("measured_width_mm", "inverted") + (("marker_ratio", "dictionary") * (form.get("kind") == "charuco"))
+    board = {key: form[key] for key in needed + other if form.get(key) not in (None, "", False)}
+    if missing := [f"{key} is missing" for key in needed if key not in board]:
+        raise InputError("board", missing)
     return board
 
 
@@ -89,6 +97,7 @@ def shoot(page: Page, event: dict[str, Any]) -> str:
 
     board, service = board_of(event), page.service
     board_from_document(board)
+    shots.check(board)
     record = take_capture(service, page.caller, NewCapture.model_validate({"label": LABEL, "board": True}), Response())
     files = service.store.folder("captures", record.id) / "files"
     with service.children.one() as child:
@@ -105,6 +114,11 @@ def shoot(page: Page, event: dict[str, Any]) -> str:
 
 def take_back(page: Page, event: dict[str, Any]) -> None:
     shots.drop_last()
+    shared.forget("calibration page")
+
+
+def start_over(page: Page, event: dict[str, Any]) -> None:
+    shots.clear()
     shared.forget("calibration page")
 
 
@@ -130,10 +144,11 @@ def use(page: Page, event: dict[str, Any]) -> str:
     return "Every capture from now on gets this calibration."
 
 
-def remove(page: Page, event: dict[str, Any]) -> str:
-    remove_calibration(page.service, page.caller, event["id"])
-    _forget()
-    return "Its pictures and its report are removed."
+def remove(page: Page, event: dict[str, Any]) -> None:
+    service, caller, identity = page.service, page.caller, event["id"]
+    found = service.calibrations.get(identity)
+    title = f"calibration {found['label'] or identity[-6:]}"
+    remove_later(identity, lambda: remove_calibration(service, caller, identity), title, "capture")
 
 
 def _forget() -> None:
@@ -144,6 +159,7 @@ def _forget() -> None:
 CalibrationPage.actions = {
     "shoot": Action("capture", shoot),
     "take_back": Action("capture", take_back),
+    "start_over": Action("capture", start_over),
     "calibrate": Action("capture", calibrate),
     "use": Action("capture", use),
     "remove": Action("capture", remove),
@@ -152,9 +168,4 @@ CalibrationPage.actions = {
 
 @ui.page("/calibration")
 async def calibration_page() -> RedirectResponse | None:
-    caller = await signed_in()
-    if caller is None:
-        return RedirectResponse("/sign-in")
-    with page_frame("calibration") as frame:
-        CalibrationPage(frame, caller)
-    return None
+    return await show("calibration", CalibrationPage)

@@ -8,17 +8,16 @@ export default {
   computed: {
     sessions() { return this.state.sessions || []; },
     open() { return this.sessions.find((s) => s.id === this.session) || null; },
-    captures() { return (this.state.captures || []).filter((c) => !c.removed && (!this.open || c.session === this.open.id)); },
+    captures() { return (this.state.captures || []).filter((c) => !this.open || c.session === this.open.id); },
     models() { return this.state.models || []; },
-    removed() { return (this.state.captures || []).filter((c) => c.removed); },
     current() { return this.captures.find((c) => c.id === this.chosen) || this.captures[0] || null; },
   },
   watch: {
-    sessions(all) {
+    sessions: { handler(all) {
       const made = this.begun && all.find((s) => s.label === this.begun.label && !this.begun.known.includes(s.id));
       if (made) { this.session = made.id; this.begun = null; }
       else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
-    },
+    }, immediate: true },
     session(id) { keepSession(id); this.erasing = false; this.large = null; },
     current: { handler(c) { if (!this.writing) this.draft = c ? { label: c.label, expression: c.expression, session: c.session || "" } : {}; }, immediate: true },
   },
@@ -59,7 +58,6 @@ export default {
             <div v-if="!u.done" class="bar" role="progressbar" :aria-valuenow="Math.round(100 * u.share)" aria-valuemin="0" aria-valuemax="100" :aria-label="'Upload of ' + u.name"><i :style="{ width: 100 * u.share + '%' }"></i></div>
             <template v-if="u.detail"><p class="fault">{{ u.detail }}</p><ul class="faults scroll" style="max-height: 14rem"><li v-for="(f, i) in u.errors" :key="i">{{ f }}</li></ul></template>
           </div>
-          <div v-for="c in removed" :key="c.id" class="panel pad small line"><span class="grow">Removed {{ clock(c.created) }}</span><button class="b" @click="act('undo', c.id)">Undo</button></div>
           <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures">
             <button v-for="c in captures" :key="c.id" class="row-button" :aria-current="current && c.id === current.id" @click="chosen = c.id">
               <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
@@ -100,7 +98,7 @@ export default {
     act(name, id, more) { this.busy = name; this.$emit("act", { name, id, ...more }); },
     acted() { this.busy = ""; },
     name(session) { return session ? session.label || clock(session.created) : ""; },
-    count(id) { return (this.state.captures || []).filter((c) => c.session === id && !c.removed).length; },
+    count(id) { return (this.state.captures || []).filter((c) => c.session === id).length; },
     begin() { this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) }; this.act("new_session", "", this.form); this.form = null; },
     tag(c) {
       if (!c.job) return { text: "new", kind: "" };

@@ -7,9 +7,8 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model import list_models
-from server.console.page import Action, Page, shared, signed_in
-from server.console.removal import Removals
-from server.console.theme import page_frame
+from server.console.page import Action, Page, remove_later, shared, show
+from server.console.removal import removals
 from server.problems import Problem
 from server.routes.captures import delete_capture, edit_capture
 from server.routes.jobs import submit_job, submit_session
@@ -18,7 +17,6 @@ from server.schemas import CaptureEdit, NewJob, NewSession, NewSessionJobs, Sess
 from server.service import Service
 
 SHOWN = 500
-removals = Removals()
 
 
 class CapturesPage(Page, component="captures.js"):
@@ -27,24 +25,24 @@ class CapturesPage(Page, component="captures.js"):
 
 
 def captures_state(service: Service) -> dict[str, Any]:
-    """Captures, newest first, with the newest job of each, and what waits to be removed."""
-    waiting = removals.remaining_s()
+    """Captures, newest first, with the newest job of each."""
     jobs: dict[str, dict[str, Any]] = {}
     for job in service.jobs.find(limit=SHOWN):
         jobs.setdefault(job["capture_id"], {"id": job["id"], "state": job["state"], "progress": job["progress"]})
     captures = []
     for record in service.store.captures():
+        if record["id"] in removals:
+            continue
         about = {key: record[key] for key in ("id", "created", "source", "label", "expression", "front", "features")}
         about |= {"cameras": [camera["name"] for camera in record["cameras"]], "bytes": record["bytes"]}
         about |= {"session": record["session"], "job": jobs.get(record["id"]), "board": record.get("board", False)}
-        captures.append(about | {"size": record["cameras"][0], "removed": record["id"] in waiting})
+        captures.append(about | {"size": record["cameras"][0]})
         if len(captures) == SHOWN:
             break
     return {
         "captures": captures,
         "sessions": sessions_list(service),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
-        "undo_s": removals.wait_s,
     }
 
 
@@ -99,7 +97,7 @@ def erase(page: Page, event: dict[str, Any]) -> str:
 
 def remove(page: Page, event: dict[str, Any]) -> None:
     service, caller, identity = page.service, page.caller, event["id"]
-    service.store.capture(identity)
+    record = service.store.capture(identity)
     if active := service.jobs.active(capture=identity):
         detail = "Jobs that are queued or running need this capture; cancel them first."
         raise Problem(409, "capture-in-use", detail, [f"job {job}" for job in active])
@@ -107,15 +105,7 @@ def remove(page: Page, event: dict[str, Any]) -> None:
     def delete() -> None:
         delete_capture(service, caller, identity)
 
-    removals.add(identity, delete)
-    shared.forget("captures")
-
-
-def undo(page: Page, event: dict[str, Any]) -> str:
-    shared.forget("captures")
-    if not removals.undo(event["id"]):
-        raise Problem(410, "too-late", "It is removed already. Upload or shoot it again.")
-    return "The capture is back."
+    remove_later(identity, delete, f"capture {record['label'] or identity[-6:]}", "capture")
 
 
 CapturesPage.actions = {
@@ -126,15 +116,9 @@ CapturesPage.actions = {
     "edit_session": Action("capture", edit_consent),
     "erase": Action("capture", erase),
     "remove": Action("capture", remove),
-    "undo": Action("capture", undo),
 }
 
 
 @ui.page("/captures")
 async def captures_page() -> RedirectResponse | None:
-    caller = await signed_in()
-    if caller is None:
-        return RedirectResponse("/sign-in")
-    with page_frame("captures") as frame:
-        CapturesPage(frame, caller)
-    return None
+    return await show("captures", CapturesPage)

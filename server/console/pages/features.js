@@ -4,7 +4,8 @@ import { clock, typing } from "/console/static/words.js";
 const TITLES = { exocanthion_right: "Right eye, outer corner", exocanthion_left: "Left eye, outer corner", pronasale: "Tip of the nose", subnasale: "Below the nose",
   cheilion_right: "Right corner of the mouth", cheilion_left: "Left corner of the mouth", gnathion: "Underside of the chin" };
 const ZOOM = 5, LENS_REM = 11;
-const GRAB_SHARE = 0.012; // of the image's width: a press so near to the point drags it
+const GRAB_SHARE = 0.012; // of the image's width: who drags from so near carries the point, or the model's landmark
+const DRAG_PX = 3; // of the screen, which the pointer moves before a click is a drag
 const VIEWS_LEAST = 2, POINTS_LEAST = 3;
 
 export default {
@@ -101,15 +102,17 @@ export default {
       const at = this.pixel(event, event.currentTarget);
       if (event.button || !this.inside(at, camera)) return;
       event.currentTarget.focus(); event.currentTarget.setPointerCapture(event.pointerId);
-      const near = this.capture.points[this.point]?.[camera] || this.suggested("predicted", camera);
-      const off = near ? [near[0] - at[0], near[1] - at[1]] : [0, 0];
-      const grabbed = near && Math.hypot(...off) < GRAB_SHARE * this.sizes[camera].width && this.capture.points[this.point]?.[camera];
-      this.drag = { camera, at: grabbed ? [...near] : at, off: grabbed ? off : [0, 0] };
+      const reach = GRAB_SHARE * this.sizes[camera].width, held = this.here(camera) || this.suggested("reprojected", camera) || this.suggested("predicted", camera);
+      const off = held ? [held[0] - at[0], held[1] - at[1]] : [0, 0];
+      this.drag = { camera, at, from: [event.clientX, event.clientY], off: Math.hypot(...off) < reach ? off : [0, 0] };
     },
     move(event, camera) {
       const at = this.pixel(event, event.currentTarget);
       this.lens = this.inside(at, camera) ? { camera, x: at[0], y: at[1], clientX: event.clientX, clientY: event.clientY, step: 1 / ZOOM / event.currentTarget.getScreenCTM().a } : null;
-      if (this.drag?.camera === camera) this.drag.at = [at[0] + this.drag.off[0], at[1] + this.drag.off[1]];
+      if (this.drag?.camera !== camera) return;
+      const { from, off } = this.drag;
+      this.drag.moved ||= Math.hypot(event.clientX - from[0], event.clientY - from[1]) > DRAG_PX;
+      if (this.drag.moved) this.drag.at = [at[0] + off[0], at[1] + off[1]];
     },
     release() {
       if (!this.drag) return;

@@ -10,12 +10,12 @@ from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from pipeline.features import SEVEN_POINTS
+from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from rig.layout import Rig
 from rig.layout_files import find_rig_file, read_rig_file
 from server.console.guides import helps, nearest_views
-from server.console.page import Action, Page, shared, signed_in
-from server.console.theme import page_frame
+from server.console.page import Action, Page, shared, show
+from server.console.removal import removals
 from server.routes.captures import get_features, put_features
 from server.routes.jobs import submit_job
 from server.schemas import NewFeatures, NewJob
@@ -31,7 +31,7 @@ class FeaturesPage(Page, component="features.js"):
         captures = [
             {key: c[key] for key in ("id", "label", "created", "features")}
             for c in self.service.store.captures()
-            if not c.get("board")
+            if not c.get("board") and c["id"] not in removals
         ]
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         if chosen is None or all(capture["id"] != chosen for capture in captures):
@@ -125,9 +125,4 @@ FeaturesPage.actions = {
 @ui.page("/features")
 @ui.page("/features/{capture}")
 async def features_page(capture: str = "") -> RedirectResponse | None:
-    caller = await signed_in()
-    if caller is None:
-        return RedirectResponse("/sign-in")
-    with page_frame("features") as frame:
-        FeaturesPage(frame, caller, capture=capture or None)
-    return None
+    return await show("features", FeaturesPage, capture=capture or None)

@@ -1,5 +1,5 @@
 // The queue at the left, one job at the right.
-import { clock, fixed, span } from "/console/static/words.js";
+import { clock, fixed, span, stageWords } from "/console/static/words.js";
 
 const MOSTLY = 0.25; // of the rim: beyond it hair or clothes hide the face, and the residual says nothing
 const POOR_PX = 3.0; // contour residual from which a camera is worth a look
@@ -12,6 +12,10 @@ export default {
     jobs() { return this.state.jobs || []; },
     job() { return this.jobs.find((j) => j.id === this.state.detail?.id) || null; },
     active() { return this.job && ["queued", "running"].includes(this.job.state); },
+    waiting() {
+      const before = this.jobs.filter((j) => ["queued", "running"].includes(j.state) && j.created < this.job.created).length;
+      return before ? `Waiting, ${before} ${before === 1 ? "job" : "jobs"} before it` : "Waiting for the worker";
+    },
     sheet() { return `/console/jobs/${this.job.id}/contact_sheet.png`; },
     lead() {
       const running = this.jobs.filter((j) => j.state === "running").length, queued = this.jobs.filter((j) => j.state === "queued").length;
@@ -29,11 +33,10 @@ export default {
         </template></header>
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
         <div class="panel scroll" tabindex="0" role="region" aria-label="List of jobs">
-          <div v-if="!state.loading && !jobs.length" class="empty"><h2>No jobs yet</h2><p>Choose a capture and press Reconstruct.</p><a class="b main-action" href="/captures">Go to captures</a></div>
           <button v-for="j in jobs" :key="j.id" class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="$emit('choose', { job: j.id }); form = null">
             <span class="line"><strong class="cut grow">{{ j.capture || clock(j.captured) }}</strong><span class="tag" :class="kind(j)">{{ j.state }}</span></span>
             <span class="bar" role="progressbar" :aria-label="'Progress of ' + j.id.slice(-6)" :aria-valuenow="Math.round(100 * j.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * j.progress + '%' }"></i></span>
-            <span class="small muted line"><span class="grow cut">{{ j.state === 'running' ? j.stage : clock(j.created) }}<template v-if="j.restart_of"> &middot; after {{ j.restart_of.slice(-6) }}</template></span>
+            <span class="small muted line"><span class="grow cut">{{ j.state === 'running' ? stageWords(j.stage) : clock(j.created) }}<template v-if="j.restart_of"> &middot; after {{ j.restart_of.slice(-6) }}</template></span>
               <span class="num">{{ j.state === 'running' && j.eta_s !== null ? span(j.eta_s) + ' left' : took(j) }}</span></span>
           </button>
         </div>
@@ -54,10 +57,12 @@ export default {
             <ul v-if="state.detail.warnings.length" class="faults small"><li v-for="(w, i) in state.detail.warnings" :key="i" class="warn">{{ w.message }}</li></ul>
             <div class="columns" style="grid-template-columns: minmax(0, 1fr) 15rem; flex: none">
               <div v-if="state.detail.cameras.length" class="scroll" tabindex="0" role="region" aria-label="Residuals by camera"><table>
-                <thead><tr><th>Camera</th><th class="num" title="Overlap of silhouette and fitted head in the face region">IoU</th><th class="num">contour, px</th><th class="num">excluded</th><th class="num" title="Silhouette difference of the starting head">XOR before</th><th class="num">XOR after</th><th></th></tr></thead>
+                <thead><tr><th>Camera</th><th class="num" title="Overlap of silhouette and fitted head in the face region">IoU</th><th class="num" title="From the fitted rim to the silhouette, hair and clothes among it">contour, px</th><th class="num" title="Share of the rim farther than 3 px from the silhouette: hair, clothes or misfit">excluded</th><th class="num" title="Silhouette difference of the starting head">XOR before</th><th class="num" title="The same of the fitted head">XOR after</th><th></th></tr></thead>
                 <tbody><tr v-for="c in state.detail.cameras" :key="c.name"><td>{{ c.name }}</td><td class="num">{{ fixed(c.iou, 3) }}</td><td class="num" :class="{ warn: c.contour_rms_px > poor && c.excluded_share < mostly }">{{ fixed(c.contour_rms_px, 2) }}</td><td class="num">{{ c.excluded_share === null ? '-' : (100 * c.excluded_share).toFixed(0) + ' %' }}</td><td class="num">{{ fixed(c.xor_cost_start, 0) }}</td><td class="num">{{ fixed(c.xor_cost, 0) }}</td><td :class="{ warn: !c.used }">{{ c.used ? '' : 'left out' }}</td></tr></tbody></table></div>
-              <p v-else class="muted">{{ active ? 'Residuals by camera stand here when the job is done.' : 'The job left no report.' }}</p>
-              <div class="stack"><h3>Log</h3><table class="small"><tbody><tr v-for="(l, i) in state.detail.log" :key="i"><td class="num muted">{{ fixed(l.at_s, 1) }} s</td><td>{{ l.text }}</td></tr></tbody></table>
+              <div v-else-if="active" class="stack"><div class="line"><strong class="grow">{{ job.state === 'running' ? stageWords(job.stage) : waiting }}</strong><span class="num">{{ Math.round(100 * job.progress) }} %</span><span v-if="job.state === 'running' && job.eta_s !== null" class="num muted">about {{ span(job.eta_s) }} left</span></div>
+                <div class="bar" aria-hidden="true"><i :style="{ width: 100 * job.progress + '%' }"></i></div><p class="muted small">Residuals by camera, silhouettes and overlays stand here when the job is done.</p></div>
+              <p v-else class="muted">The job left no report.</p>
+              <div class="stack"><h3>Log</h3><table class="small log"><tbody><tr v-for="(l, i) in state.detail.log" :key="i"><td class="num muted">{{ fixed(l.at_s, 1) }} s</td><td>{{ stageWords(l.text) }}</td></tr></tbody></table>
                 <p v-if="state.detail.stopped_because" class="small muted">{{ state.detail.stopped_because }}, {{ state.detail.evaluations }} evaluations, {{ span(state.detail.seconds.total) }}</p></div>
             </div>
             <template v-if="state.detail.pictures">
@@ -67,11 +72,11 @@ export default {
               <div class="thumbs"><a v-for="c in state.detail.cameras" :key="c.name" class="thumb" :href="overlay(c.name)" target="_blank" rel="noopener" :aria-label="'Overlay of ' + c.name"><img :src="overlay(c.name)" :alt="'Contours in ' + c.name" loading="lazy"><span>{{ c.name }}</span></a></div>
             </template>
           </template>
-          <div v-else-if="!state.loading && jobs.length" class="empty"><p>Choose a job.</p></div>
+          <div v-else-if="!state.loading" class="empty"><h2>{{ jobs.length ? 'Choose a job' : 'No jobs yet' }}</h2><template v-if="!jobs.length"><p>Choose a capture and press Reconstruct.</p><a class="b main-action" href="/captures">Go to captures</a></template></div>
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, fixed, span, poor: POOR_PX, mostly: MOSTLY }); },
+  created() { Object.assign(this, { clock, fixed, span, stageWords, poor: POOR_PX, mostly: MOSTLY }); },
   methods: {
     kind(j) { return j.state === "failed" ? "fault" : j.state === "running" || j.state === "succeeded" ? "accent" : ""; },
     took(j) { return j.started && j.finished ? span((new Date(j.finished) - new Date(j.started)) / 1000) : ""; },

@@ -9,9 +9,9 @@ from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model import list_models
 from rig.errors import InputError
-from server.console.page import Action, Page, shared, signed_in
+from server.console.page import Action, Page, remove_later, shared, show
 from server.console.pages.rig import read_report
-from server.console.theme import page_frame
+from server.console.removal import removals
 from server.jobs import FINISHED
 from server.routes.jobs import cancel_job, delete_job, restart_job
 from server.schemas import Restart
@@ -38,6 +38,8 @@ def jobs_list(service: Service) -> list[dict[str, Any]]:
     found = []
     captures = {record["id"]: record for record in service.store.captures()}
     for job in service.jobs.find(limit=SHOWN):
+        if job["id"] in removals:
+            continue
         capture = captures.get(job["capture_id"], {"label": "removed capture", "created": None})
         named = {"capture": capture["label"], "captured": capture["created"]}
         found.append({key: value for key, value in job.items() if key != "files"} | named)
@@ -108,9 +110,10 @@ def cancel(page: Page, event: dict[str, Any]) -> None:
     cancel_job(page.service, page.caller, event["id"])
 
 
-def delete(page: Page, event: dict[str, Any]) -> str:
-    delete_job(page.service, page.caller, event["id"])
-    return "The job and its result are removed."
+def delete(page: Page, event: dict[str, Any]) -> None:
+    service, caller, identity = page.service, page.caller, event["id"]
+    service.jobs.get(identity)
+    remove_later(identity, lambda: delete_job(service, caller, identity), f"job {identity[-6:]}", "submit")
 
 
 JobsPage.actions = {
@@ -122,9 +125,4 @@ JobsPage.actions = {
 
 @ui.page("/jobs")
 async def jobs_page() -> RedirectResponse | None:
-    caller = await signed_in()
-    if caller is None:
-        return RedirectResponse("/sign-in")
-    with page_frame("jobs") as frame:
-        JobsPage(frame, caller)
-    return None
+    return await show("jobs", JobsPage)

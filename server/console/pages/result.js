@@ -43,8 +43,8 @@ export default {
   template: `
     <section class="page" aria-label="Result">
       <header><h1>Result</h1>
-        <label class="line grow"><span class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><option v-for="r in state.results" :key="r.id" :value="r.id">{{ r.capture || 'Capture ' + clock(r.captured) }} &middot; {{ clock(r.finished) }} &middot; {{ r.id.slice(-6) }}</option></select></label>
-        <template v-if="job"><span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
+        <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><option v-for="r in state.results" :key="r.id" :value="r.id">{{ r.capture || 'Capture ' + clock(r.captured) }} &middot; {{ clock(r.finished) }} &middot; {{ r.id.slice(-6) }}</option></select></label>
+        <template v-if="job"><span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="!other && colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
         <button class="b" :aria-pressed="wire" @click="wire = !wire">Wireframe <kbd>W</kbd></button>
         <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button></template></header>
       <div class="columns" style="grid-template-columns: minmax(0, 1fr) 20rem">
@@ -62,12 +62,12 @@ export default {
             <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ w.message }}</li></ul>
             <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ r.capture || 'Capture ' + clock(r.captured) }} &middot; {{ clock(r.finished) }} &middot; {{ r.id.slice(-6) }}</option></select></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
+            <h3>Downloads</h3>
+            <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
             <h3>Measurements, mm</h3>
             <table class="small"><tbody><tr v-for="[name, m] in rows" :key="name"><td>{{ name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td></tr></tbody></table>
             <h3>Fit</h3>
-            <table class="small"><tbody><tr><td>contour residual</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>method</td><td class="num">{{ job.method }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
-            <h3>Downloads</h3>
-            <div class="stack" style="gap: .3rem"><a v-for="(bytes, name) in job.files" :key="name" class="b small" :href="'/console/jobs/' + job.id + '/' + name" :download="name"><span class="grow">{{ name }}</span><span class="muted num">{{ size(bytes) }}</span></a></div>
+            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">contour residual, {{ job.clear_views }} clear {{ job.clear_views === 1 ? 'view' : 'views' }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>method</td><td class="num">{{ job.method }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
           </template>
         </div>

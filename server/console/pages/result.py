@@ -7,13 +7,13 @@ from nicegui import ui
 from nicegui.elements import scene
 from starlette.responses import RedirectResponse
 
-from server.console.page import Page, shared, signed_in
+from server.console.page import Page, shared, show
 from server.console.pages.jobs import jobs_list
 from server.console.pages.rig import read_report
-from server.console.theme import page_frame
 from server.service import Service
 
 THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of three.js
+MOSTLY = 0.25  # of a contour, as on the page Jobs
 
 
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
@@ -33,13 +33,13 @@ def head_of(service: Service, job: dict[str, Any]) -> dict[str, Any]:
     """What stands beside the head: measurements, warnings, files, whether the truth is known."""
     report = read_report(service, job["id"])
     truth = service.store.folder("captures", job["capture_id"]) / "truth" / "head.ply"
-    cameras = report.get("cameras", {}).values()
-    residuals = [c["contour_rms_px"] for c in cameras if c.get("used") and c.get("contour_rms_px") is not None]
+    residuals = clear_residuals(report)
     return job | {
         "measurements": report.get("measurements", {}),
         "quality": report.get("quality", {}),
         "warnings": report.get("warnings", []),
         "seconds": report.get("seconds", {}).get("total"),
+        "clear_views": len(residuals),
         "contour_px": sum(residuals) / len(residuals) if residuals else None,
         "method": report.get("method"),
         "model_name": report.get("model", {}).get("name"),
@@ -50,12 +50,13 @@ def head_of(service: Service, job: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def clear_residuals(report: dict[str, Any]) -> list[float]:
+    """Contour residuals (px) of the cameras that see most of the rim: elsewhere they tell of hair and clothes."""
+    cameras = [c for c in report.get("cameras", {}).values() if c.get("used") and c.get("contour_rms_px") is not None]
+    return [c["contour_rms_px"] for c in cameras if (c.get("excluded_share") or 0.0) < MOSTLY]
+
+
 @ui.page("/result")
 @ui.page("/result/{job}")
 async def result_page(job: str = "") -> RedirectResponse | None:
-    caller = await signed_in()
-    if caller is None:
-        return RedirectResponse("/sign-in")
-    with page_frame("result") as frame:
-        ResultPage(frame, caller, job=job or None)
-    return None
+    return await show("result", ResultPage, job=job or None)

@@ -12,7 +12,7 @@ export default {
   data: () => ({ live: {}, fault: "", now: Date.now(), count: 0, busy: "", frames: 0, session: openSession(), label: "", expression: "" }),
   watch: {
     session(id) { keepSession(id); },
-    "state.sessions"(all) { if (all && this.session && !this.open) this.session = ""; },
+    "state.sessions": { handler(all) { if (all && this.session && !this.open) this.session = ""; }, immediate: true },
   },
   computed: {
     open() { return (this.state.sessions || []).find((s) => s.id === this.session) || null; },
@@ -20,7 +20,7 @@ export default {
     lead() {
       if (this.state.loading) return "Reading the rig's state";
       const kind = this.state.kind === "simulated" ? "Simulated studio" : "Rig";
-      return `${kind}, ${this.cameras.length} cameras. ${this.state.last ? "Last capture " + clock(this.state.last.created) : "No capture yet: seat the subject and press the space bar"}`;
+      return `${kind}, ${this.cameras.length} cameras. ${this.state.last ? "Last capture " + clock(this.state.last.created) : this.state.calibration ? "No capture yet: seat the subject and press the space bar" : "Calibrate it before the first capture"}`;
     },
     calibration() {
       if (this.state.in_use) return { text: `calibrated ${clock(this.state.in_use.created)}`, kind: "good" };
@@ -30,14 +30,20 @@ export default {
     advice() {
       const todo = (this.state.faults || []).map((text) => ({ text, kind: "fault" }));
       const where = (test) => this.cameras.map((c) => c.name).filter((name) => this.live[name] && test(this.live[name])).join(", ");
-      const add = (names, text) => names && todo.push({ text: `${names}: ${text}`, kind: "warn" });
-      add(where((l) => l.clipped > EXPOSURE.clipped), "too bright, skin burns out. Close the aperture or dim the lamps.");
+      const add = (names, text, kind = "warn") => names && todo.push({ text: `${names}: ${text}`, kind });
+      add(where((l) => l.fault), "no picture. Check cable and power.", "fault");
+      add(where((l) => l.clipped > EXPOSURE.clipped || l.mean > EXPOSURE.bright), "too bright, skin burns out. Close the aperture or dim the lamps.");
       add(where((l) => l.mean < EXPOSURE.dark), "too dark. Open the aperture or raise the lamps.");
       add(where((l) => l.blur_px > SOFT_PX), "soft. Focus on the subject's near eye.");
       add(this.cameras.filter((c) => c.moved).map((c) => c.name).join(", "), "has moved since the calibration. Calibrate again.");
       add(this.cameras.filter((c) => this.sync(c).bad).map((c) => c.name).join(", "), "not in sync in the last shot. Check the trigger cable, shoot again.");
-      if (!this.state.loading && !this.state.calibration) todo.push({ text: "No calibration. Make one on the page Calibration and put it to use.", kind: "fault" });
       return todo;
+    },
+    looked() { return this.cameras.length > 0 && this.cameras.every((c) => this.live[c.name]?.bytes); },
+    ready() {
+      if (!this.looked) return "Waiting for a picture of every camera.";
+      const sharp = this.cameras.filter((c) => typeof this.live[c.name].blur_px === "number").length;
+      return `Exposure is in order. Sharpness is, in the ${sharp} of ${this.cameras.length} judged so far. ${this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot."}`;
     },
     columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
   },
@@ -64,9 +70,9 @@ export default {
           </div>
         </article>
         <aside class="panel pad stack scroll" aria-label="State of the rig">
-          <h2>{{ advice.length ? 'To do' : 'Ready to capture' }}</h2>
+          <h2>{{ advice.length ? 'To do' : looked ? 'Ready to capture' : 'Starting' }}</h2>
           <ul v-if="advice.length" class="faults small"><li v-for="(a, i) in advice" :key="i" :class="a.kind">{{ a.text }}</li></ul>
-          <p v-else class="muted small">Exposure, sharpness and sync are in order.</p>
+          <p v-else class="muted small">{{ ready }}</p>
           <div class="small stack" style="gap: .3rem; margin-top: auto">
             <label class="field">Session<select v-model="session" id="session"><option value="">none</option><option v-for="s in state.sessions || []" :key="s.id" :value="s.id">{{ s.label || clock(s.created) }}</option></select></label>
             <div class="line"><label class="field grow">Label<input v-model="label" maxlength="500"></label><label class="field grow">Expression<input v-model="expression" maxlength="500" placeholder="neutral"></label></div></div>

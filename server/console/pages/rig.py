@@ -8,9 +8,8 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from server.console.media import live_view
-from server.console.page import Action, Page, shared, signed_in
+from server.console.page import Action, Page, shared, show
 from server.console.pages.captures import sessions_list
-from server.console.theme import page_frame
 from server.routes.captures import take_capture
 from server.routes.rig import take_background
 from server.schemas import NewCapture
@@ -98,9 +97,4 @@ RigPage.actions = {"capture": Action("capture", capture), "plates": Action("capt
 
 @ui.page("/")
 async def rig_page() -> RedirectResponse | None:
-    caller = await signed_in()
-    if caller is None:
-        return RedirectResponse("/sign-in")
-    with page_frame("rig") as frame:
-        RigPage(frame, caller)
-    return None
+    return await show("rig", RigPage)

@@ -5,7 +5,8 @@ const MESSAGE_MS = 6000;
 const MESSAGES_MOST = 4;
 
 export default {
-  props: { links: Array, current: String, status: Object },
+  props: { links: Array, current: String, status: Object, removed: Array },
+  emits: ["undo"],
   data: () => ({ messages: [], next: 1, help: false }),
   computed: {
     faults() { return Object.entries(this.status?.faults || {}); },
@@ -18,7 +19,7 @@ export default {
           <span>{{ link.title }}</span><kbd aria-hidden="true">{{ i + 1 }}</kbd></a>
         <div class="foot" role="status">
           <div class="line"><i :class="['dot', faults.length ? 'warn' : 'good']"></i>{{ faults.length ? 'Needs a look' : 'Ready' }}</div>
-          <div v-for="[name, detail] in faults" :key="name" class="warn">{{ name }}: {{ detail }}</div>
+          <div v-for="[name, detail] in faults" :key="name" class="warn">{{ name === 'egl' ? 'graphics' : name }}: {{ detail }}</div>
           <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
           <div>{{ status.disk || '\\u00a0' }}</div>
           <a v-if="status.local === false" href="/sign-in" style="padding: 0">Other API key</a>
@@ -27,6 +28,7 @@ export default {
       </nav>
       <main class="main"><slot></slot></main>
       <div class="messages" role="log" aria-live="polite" aria-label="Messages">
+        <div v-for="r in removed" :key="r.id" class="message line"><span class="grow">Removed: {{ r.title }}</span><button class="b" @click="$emit('undo', r.id)">Undo</button></div>
         <div v-for="m in messages" :key="m.id" :class="['message', m.kind]">
           <div class="grow"><div>{{ m.text }}</div>
             <ul v-if="m.faults.length" class="faults small muted"><li v-for="(f, i) in m.faults" :key="i">{{ f }}</li></ul></div>
@@ -48,8 +50,8 @@ export default {
   unmounted() { window.removeEventListener("keydown", this.key); },
   methods: {
     say(kind, text, faults) {
-      const id = this.next++;
-      this.messages = [...this.messages, { id, kind, text, faults }].slice(-MESSAGES_MOST);
+      const id = this.next++, further = faults.filter((fault) => !text.includes(fault));
+      this.messages = [...this.messages, { id, kind, text, faults: further }].slice(-MESSAGES_MOST);
       if (kind === "done") setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
     },
     drop(id) { this.messages = this.messages.filter((m) => m.id !== id); },

@@ -27,6 +27,10 @@ export function fixed(value, digits) {
   return value === null || value === undefined ? "-" : Number(value).toFixed(digits);
 }
 
+const STAGES = { ingest: "taking the pictures in", read: "reading the pictures", segmentation: "finding silhouettes", alignment: "placing the head", fit: "fitting the head",
+  texture: "colouring the head", evidence: "judging the fit", write: "writing the files" };
+export function stageWords(stage) { return STAGES[stage] || stage; }
+
 // The session that the operator works in, kept for the pages of this browser tab.
 export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
 export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }

@@ -1,0 +1,105 @@
+"""The operator's pages before real cameras: four streams and a trigger box, and somebody with a board."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from rig.studio.serve import DeviceFault, StudioDevices
+from tests.end_to_end.browser import chromium, keep_screenshots, live_rate, visit
+from tests.rig.board_pictures import BoardPictures
+from tests.server.services import RunningService, running_service
+from tests.shared_data import shared
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+NAMES = tuple(f"cam_{i}" for i in range(4))
+SHOTS = range(0, 26, 2)
+LONG_MS = 120_000
+
+
+@pytest.fixture
+def board() -> BoardPictures:
+    return BoardPictures(shared("data/multicam-board"))
+
+
+@pytest.fixture
+def studio(board: BoardPictures, tmp_path: Path) -> Iterator[StudioDevices]:
+    (tmp_path / "studio").mkdir()
+    with StudioDevices(tmp_path / "studio", NAMES, board, board) as devices:
+        yield devices
+
+
+@pytest.fixture
+def browser(studio: StudioDevices) -> Iterator[Browser]:
+    """Opened after the studio and closed before it: both run an event loop of their own in this thread."""
+    with chromium() as opened:
+        yield opened
+
+
+@pytest.fixture
+def service(studio: StudioDevices, tmp_path: Path) -> Iterator[RunningService]:
+    with running_service(tmp_path / "data", console="true", rig=str(studio.folder / "rig.toml")) as running:
+        yield running
+
+
+def test_a_rig_is_calibrated_and_captures(
+    browser: Browser, service: RunningService, studio: StudioDevices, board: BoardPictures, screenshots: Path
+) -> None:
+    """Faults in plain words, clean plates, board shots with their coverage on two pages, the calibration put to use, a
+    capture in sync, and a camera that falls silent."""
+    v = visit(browser, service.url)
+    page = v.go("/")
+    expect(page.locator("article.tile")).to_have_count(len(NAMES))
+    live_rate(page, 0.1)
+    expect(page.get_by_label("State of the rig").get_by_text("no calibration: calibrate the rig")).to_be_visible()
+    page.keyboard.press("b")
+    expect(page.get_by_text("5 clean plates of 4 cameras")).to_be_visible(timeout=LONG_MS)
+    expect(page.locator("#capture")).to_be_enabled()
+    page.keyboard.press("Space")
+    expect(page.get_by_text("The rig has no calibration: take shots")).to_be_visible(timeout=LONG_MS)
+    keep_screenshots(page, screenshots, "rig-uncalibrated")
+
+    page, other = v.go("/calibration"), visit(browser, service.url)
+    other.go("/calibration")
+    describe_board(page)
+    for taken, shot in enumerate(SHOTS, start=1):
+        board.hold(studio, shot)
+        page.locator("#shoot").click()
+        for shown in (page, other.page):
+            expect(shown.get_by_text(f"{taken} shots", exact=True)).to_be_visible(timeout=LONG_MS)
+    expect(other.page.get_by_label("Squares across")).to_have_value("4")
+    expect(other.page.get_by_label("Squares across")).to_be_disabled()
+    keep_screenshots(page, screenshots, "calibration-coverage")
+    page.get_by_role("button", name="Take the last one back").click()
+    for shown in (page, other.page):
+        expect(shown.get_by_text(f"{len(SHOTS) - 1} shots", exact=True)).to_be_visible()
+    page.get_by_label("Name of the calibration").fill("four cameras")
+    page.locator("#calibrate").click()
+    row = page.locator("[data-calibration][data-state=succeeded]")
+    expect(row).to_have_count(1, timeout=LONG_MS)
+    row.click()
+    page.get_by_role("button", name="Use this").click()
+    for shown in (page, other.page):
+        expect(shown.get_by_text("In use: four cameras")).to_be_visible(timeout=LONG_MS)
+
+    board.hold(studio, 0)
+    page = v.go("/")
+    expect(page.locator("article.tile").first.get_by_text("calibrated")).to_be_visible()
+    page.keyboard.press("Space")
+    expect(page.get_by_text("Captured 4 pictures")).to_be_visible(timeout=LONG_MS)
+    expect(page.locator("article.tile").get_by_text("in sync")).to_have_count(len(NAMES))
+    studio.inject(DeviceFault("hung", "cam_1"))
+    expect(page.locator("[data-camera=cam_1]").get_by_text("shows nothing")).to_be_visible(timeout=LONG_MS)
+    page.keyboard.press("Space")
+    expect(page.get_by_text("The shot is no capture: cam_1")).to_be_visible(timeout=LONG_MS)
+    keep_screenshots(page, screenshots, "rig-fault")
+    v.check_clean()
+    other.check_clean()
+
+
+def describe_board(page: Page) -> None:
+    for label, value in (("Squares across", "4"), ("Squares down", "5"), ("Square, mm", "54")):
+        page.get_by_label(label).fill(value)
+    page.get_by_label("White on black").check()
