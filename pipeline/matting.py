@@ -46,7 +46,8 @@ class Matte:
 
     alpha: Float32[np.ndarray, "hb wb"]
     box: tuple[slice, slice]  # rows and columns of the image; a margin without subject but at the image's own border
-    contrast: Float32[np.ndarray, " c"]  # |F - B| in standard deviations, at every pixel of the contour
+    contrast: Float32[np.ndarray, " c"]  # |F - B| in standard deviations, at every pixel of the contour; 0 where the
+    # coarse mask alone put it
 
 
 def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings: SegmentationSettings) -> Matte:
@@ -72,7 +73,8 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)
     alpha, contrast, trust = _alpha(*args, _subject_inside(own, alpha, paint), LEAN, SHADE, False)
     alpha = _smooth(alpha, trust, settings.alpha_blur_px)
-    return Matte(alpha, box, contrast[(np.abs(alpha - 0.5) < 0.25) & (contrast >= 0)])
+    unasked = dilated(contrast < 0, 1)
+    return Matte(alpha, box, np.where(unasked, np.float32(0), contrast)[np.abs(alpha - 0.5) < 0.25])
 
 
 def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int, ...]) -> tuple[slice, slice]:

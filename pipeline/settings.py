@@ -38,7 +38,7 @@ class SegmentationSettings:
     weak_contrast: float = 4.0  # standard deviations between subject and background below which a contour piece is weak
     other_pieces_warned: float = 0.01  # of the subject: area that differs from the plate but hangs on nothing
     other_pieces_unusable: float = 0.15
-    weak_share_warned: float = 0.015  # of the contour; 0.009 in 95 % of the good views of the studio's preset
+    weak_share_warned: float = 0.015  # of the contour; 0.003 in 95 % of 66 good views
     weak_share_unusable: float = 0.25
     strange_share_warned: float = 0.003  # of the mask: area that the other cameras say is empty; 0 in 22 good views
     strange_share_unusable: float = 0.01

@@ -23,6 +23,7 @@ from rig.studio.subject import Subject
 pytestmark = [pytest.mark.slow, pytest.mark.gl, pytest.mark.timeout(900)]
 RESOLUTION_PX = 1.5  # chosen with the results in view: at the lens's own 0.7 px strands make it 0.9 to 2.3 px RMS
 CAPTURES = 5
+GROSS_PX = 1.5  # of the contour: beyond it more is wrong than strands of hair, and a view must say so
 
 
 def take(seed: int, renderer: Renderer, *faults: Fault) -> tuple[SimulatedCapture, dict[str, Silhouette]]:
@@ -50,6 +51,10 @@ def offsets(silhouette: Silhouette, share: np.ndarray) -> np.ndarray:
     return np.concatenate(found)
 
 
+def rms(silhouette: Silhouette, share: np.ndarray) -> float:
+    return float(np.sqrt((offsets(silhouette, share) ** 2).mean()))
+
+
 def iou(silhouette: Silhouette, mask: np.ndarray) -> float:
     return np.count_nonzero(silhouette.mask & mask) / np.count_nonzero(silhouette.mask | mask)
 
@@ -57,19 +62,19 @@ def iou(silhouette: Silhouette, mask: np.ndarray) -> float:
 @pytest.fixture(scope="module")
 def measured(renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
     """IoU and RMS of the contour (px) of every view of the first captures, in order and none left out."""
-    overlap, rms = [], []
+    overlap, off = [], []
     for seed in range(CAPTURES):
         taken, silhouettes = take(seed, renderer)
         for name, silhouette in silhouettes.items():
             overlap.append(iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5))
-            rms.append(np.sqrt((offsets(silhouette, coverage(taken, name, RESOLUTION_PX)) ** 2).mean()))
-    return np.array(overlap), np.array(rms)
+            off.append(rms(silhouette, coverage(taken, name, RESOLUTION_PX)))
+    return np.array(overlap), np.array(off)
 
 
 def test_the_median_view_of_the_preset(measured: tuple[np.ndarray, np.ndarray]) -> None:
-    overlap, rms = measured
+    overlap, off = measured
     assert np.median(overlap) >= 0.995
-    assert np.median(rms) <= 0.35
+    assert np.median(off) <= 0.35
 
 
 @pytest.mark.xfail(
@@ -78,26 +83,29 @@ def test_the_median_view_of_the_preset(measured: tuple[np.ndarray, np.ndarray]) 
     "hair (python -m tests.benchmarks.studio_masks prints them)",
 )
 def test_the_worst_view_of_the_preset(measured: tuple[np.ndarray, np.ndarray]) -> None:
-    overlap, rms = measured
+    overlap, off = measured
     assert overlap.min() >= 0.995
-    assert rms.max() <= 0.8
+    assert off.max() <= 0.8
 
 
 FAULTS = [
-    Fault("exposure", None, 0.1),
-    Fault("shadow"),
-    Fault("chair", "cam03"),
-    Fault("camouflage"),
-    Fault("dark", "cam05"),
+    (4, Fault("exposure", None, 0.1)),
+    (3, Fault("shadow")),  # fills the gap under a chin
+    (4, Fault("shadow")),  # moves the edge of a coat of the backdrop's hue
+    (4, Fault("chair", "cam03")),
+    (4, Fault("camouflage")),
+    (4, Fault("dark", "cam05")),
 ]
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.kind)
-def test_the_mask_is_right_or_the_view_says_so(fault: Fault, renderer: Renderer) -> None:
-    taken, silhouettes = take(4, renderer, fault)
+@pytest.mark.parametrize(("seed", "fault"), FAULTS, ids=[f"{fault.kind} {seed}" for seed, fault in FAULTS])
+def test_the_mask_is_right_or_the_view_says_so(seed: int, fault: Fault, renderer: Renderer) -> None:
+    taken, silhouettes = take(seed, renderer, fault)
     for name, silhouette in silhouettes.items():
-        right = iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5) > 0.98
-        assert right or silhouette.quality.warnings, name
+        if silhouette.quality.warnings:
+            continue
+        assert iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5) > 0.98, name
+        assert rms(silhouette, coverage(taken, name, RESOLUTION_PX)) < GROSS_PX, name
     if fault.kind in ("exposure", "shadow"):
         assert all(s.quality.usable for s in silhouettes.values())
     if fault.kind in ("chair", "dark"):
