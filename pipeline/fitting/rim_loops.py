@@ -9,6 +9,7 @@ from numba import njit
 from pipeline.lens import NOWHERE, distorted
 
 BLOCK = 1024  # faces whose planes stay in the cache while all views look at them
+LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by more than 60 degrees, they are no curve
 
 
 @njit(cache=True, fastmath=True)
@@ -290,7 +291,7 @@ def _crossings(vertices, normals, turned, faces, crossed, words, bit, centre, co
 
 @njit(cache=True, fastmath=True)
 def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words, bit, rotation,
-          translation, lens, width, height, distance, offset, steps, corners, floats):  # fmt: skip
+          translation, lens, width, height, distance, offset, steps, averaged, corners, floats):  # fmt: skip
     """One view: fills ``corners`` and ``floats`` with the samples on the outer outline; returns their number."""
     centre = -(rotation.T @ translation)
     chain = _chain(vertices, edges, folds, fold_words, bit, facing, rotation, translation, lens)
@@ -305,7 +306,7 @@ def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, cr
         half = 0.5 * np.sqrt((floats[a, 7] - floats[b, 7]) ** 2 + (floats[a, 8] - floats[b, 8]) ** 2)
         floats[a, 11] += half
         floats[b, 11] += half
-    kept = 0
+    kept, place = 0, np.full(count, -1, np.int32)
     for s in range(count):
         u, v = floats[s, 7], floats[s, 8]
         if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
@@ -337,8 +338,44 @@ def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, cr
         floats[kept, 7], floats[kept, 8], floats[kept, 9], floats[kept, 10] = u, v, nx, ny
         floats[kept, 11] = floats[s, 11]
         floats[kept, 12] = _bilinear(distance, offset, width, height, u, v)
+        place[s] = kept
         kept += 1
+    if averaged:
+        _average(segments[:joined], place, kept, distance, offset, width, height, floats)
     return kept
+
+
+@njit(cache=True, fastmath=True)
+def _average(segments, place, kept, distance, offset, width, height, floats):
+    """Residuals as means over the outline that samples stand for, half way to their neighbours.
+
+    The rim crosses the mesh every 2 to 6 px, and the noise of a contour is another after 2 px: read at the samples
+    alone, half of what a contour says is thrown away.
+    """
+    total, read = np.zeros(kept), np.zeros(kept)
+    for j in range(len(segments)):
+        a, b = place[segments[j, 0]], place[segments[j, 1]]
+        if a < 0 or b < 0:
+            continue
+        dx, dy = floats[b, 7] - floats[a, 7], floats[b, 8] - floats[a, 8]
+        half = 0.5 * np.sqrt(dx * dx + dy * dy)
+        turn_x, turn_y = floats[b, 9] - floats[a, 9], floats[b, 10] - floats[a, 10]
+        if 2.0 * half > LONGEST_PX or turn_x * turn_x + turn_y * turn_y > 1.0:
+            continue
+        bend = turn_x * dx + turn_y * dy  # the outline bulges over the chord by t (1 - t) / 2 of it, its sagitta
+        reads = int(half) + 1
+        for i in range(2 * reads):
+            t = (i + 0.5) / (2 * reads)
+            end = a if i < reads else b
+            lift = 0.5 * t * (1.0 - t) * bend
+            x = floats[a, 7] + t * dx + lift * floats[end, 9]
+            y = floats[a, 8] + t * dy + lift * floats[end, 10]
+            total[end] += half / reads * _bilinear(distance, offset, width, height, x, y)
+        read[a] += half
+        read[b] += half
+    for s in range(kept):
+        if floats[s, 11] > 0.0:
+            floats[s, 12] = (total[s] + (floats[s, 11] - read[s]) * floats[s, 12]) / floats[s, 11]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -353,10 +390,10 @@ def swept(vertices, normals, planes, faces, edges, speaking, centres):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def see(first, last, vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
-         rotation, translation, lens, size, distance, offset, steps, counts, corners, floats):  # fmt: skip
+         rotation, translation, lens, size, distance, offset, steps, averaged, counts, corners, floats):  # fmt: skip
     for k in range(first, last):
         counts[k] = _view(
             vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
             np.uint64(1) << np.uint64(k), rotation[k], translation[k], lens[k], size[k, 0], size[k, 1], distance,
-            offset[k], steps, corners[k], floats[k],
+            offset[k], steps, averaged, corners[k], floats[k],
         )  # fmt: skip
