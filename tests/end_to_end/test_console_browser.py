@@ -99,7 +99,7 @@ def test_the_whole_way(
     expect(page.locator("table tbody tr", has_text="cam10").first).to_be_visible()
     keep_screenshots(page, screenshots, "jobs")
     page.locator("#to-result").click()
-    page.wait_for_selector("canvas[data-loaded]:not([data-loaded=''])", timeout=60_000)
+    page.wait_for_selector("canvas[data-loaded]:not([data-loaded=''])", timeout=LONG_MS)
     keep_screenshots(page, screenshots, "result")
     check_viewer(page, screenshots, tmp_path)
 
@@ -112,7 +112,7 @@ def test_the_whole_way(
     report = newest_report(studio)
     assert "features.json" in report["inputs"]
     page.locator("#to-result").click()
-    page.wait_for_selector("canvas[data-loaded]:not([data-loaded=''])", timeout=60_000)
+    page.wait_for_selector("canvas[data-loaded]:not([data-loaded=''])", timeout=LONG_MS)
     compare = page.get_by_label("Compare with")
     compare.select_option(index=2)  # the head of the job before
     expect(page.get_by_text("Distance to the other head")).to_be_visible(timeout=60_000)

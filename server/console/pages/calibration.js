@@ -1,11 +1,14 @@
 // History at the left; at the right the shots that are being taken, or the report of the chosen calibration.
+import { liveView } from "/console/static/live.js";
 import { clock, fixed, send } from "/console/static/words.js";
 
 export default {
+  mixins: [liveView],
   props: { state: Object },
   emits: ["act"],
   data: () => ({ chosen: null, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000", measured_width_mm: null, inverted: false }, label: "", busy: "", over: false, upload: null }),
-  watch: { "state.board": { handler(board) { if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board); }, immediate: true } },
+  watch: { "state.board": { handler(board) { if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board); }, immediate: true },
+    "state.rig.kind": { handler(kind) { if (kind === "real") this.look(); }, immediate: true } }, // nobody holds a board in the simulated studio
   computed: {
     collecting() { return this.state.shots > 0; }, // then the board stays what it is
     list() { return this.state.calibrations || []; },
@@ -62,12 +65,12 @@ export default {
             <span class="line push"><button v-if="collecting" type="button" class="b quiet" :disabled="!!busy" @click="act('start_over', {})">Start over</button><button type="button" class="b" :disabled="!!busy || !collecting" @click="act('take_back', {})">Take the last one back</button><button class="b main-action" id="shoot" :disabled="!!busy">{{ busy === 'shoot' ? 'Looking for the board ...' : 'Take shot ' + ((state.shots || 0) + 1) }}</button></span>
           </form>
           <div class="panel pad line"><span class="grow" role="status">{{ state.advice }}</span><span class="muted num">{{ state.shots || 0 }} shots</span><input v-model="label" placeholder="name of the calibration" aria-label="Name of the calibration" style="width: 14rem"><button class="b" id="calibrate" :class="{ 'main-action': state.shots >= 3 }" :disabled="!!busy || !(state.shots >= 3)" @click="act('calibrate', { label })">Calibrate</button></div>
-          <div class="panel pad scroll grow" tabindex="0" role="region" aria-label="Coverage by camera"><div class="thumbs">
+          <div class="panel pad scroll grow" tabindex="0" role="region" aria-label="Coverage by camera"><div class="thumbs four">
             <figure v-for="c in state.coverage" :key="c.name" style="margin: 0" class="stack">
-              <svg viewBox="0 0 4 3" role="img" :aria-label="c.name + ': ' + c.views + ' views, ' + Math.round(100 * c.covered) + ' % covered'" style="background: #08090b; border-radius: 3px; width: 100%; display: block">
-                <path d="M1 0v3M2 0v3M3 0v3M0 1h4M0 2h4" stroke="#2a303a" stroke-width=".01"></path>
-                <circle v-for="(p, i) in c.corners" :key="i" :cx="4 * p[0]" :cy="3 * p[1]" r=".03" fill="#4a5361"></circle>
-                <circle v-for="(p, i) in c.last" :key="'l' + i" :cx="4 * p[0]" :cy="3 * p[1]" r=".035" fill="#6cb2ff"></circle></svg>
+              <div class="seen"><canvas :ref="el => keep(c.name, el)" width="640" height="480" aria-hidden="true"></canvas><svg viewBox="0 0 4 3" preserveAspectRatio="none" role="img" :aria-label="c.name + ': ' + c.views + ' views, ' + Math.round(100 * c.covered) + ' % covered'">
+                <path d="M1 0v3M2 0v3M3 0v3M0 1h4M0 2h4" stroke="#4a5361" stroke-width=".01"></path>
+                <circle v-for="(p, i) in c.corners" :key="i" :cx="4 * p[0]" :cy="3 * p[1]" r=".03" fill="#e8ebf0"></circle>
+                <circle v-for="(p, i) in c.last" :key="'l' + i" :cx="4 * p[0]" :cy="3 * p[1]" r=".035" fill="#6cb2ff"></circle></svg></div>
               <figcaption class="line small" style="margin-top: -.3rem"><i :class="['dot', c.enough ? 'good' : '']"></i><span class="grow">{{ c.name }}</span><span class="muted num">{{ c.views }} views, {{ Math.round(100 * c.covered) }} %</span></figcaption></figure>
           </div></div>
         </div>

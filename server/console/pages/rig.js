@@ -1,4 +1,5 @@
 // Eleven tiles. Pictures and their exposure and sharpness come by one stream; the rest is the page's state.
+import { liveView } from "/console/static/live.js";
 import { clock, fixed, keepSession, openSession, typing } from "/console/static/words.js";
 
 const COUNT_S = 3;
@@ -7,9 +8,10 @@ const EXPOSURE = { dark: 50, bright: 205, clipped: 0.02 }; // mean grey level of
 const SOFT_PX = 2.0; // spread of an edge from which a contour is measurably worse
 
 export default {
+  mixins: [liveView],
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ live: {}, fault: "", now: Date.now(), count: 0, busy: "", frames: 0, session: openSession(), label: "", expression: "" }),
+  data: () => ({ now: Date.now(), count: 0, busy: "", session: openSession(), label: "", expression: "" }),
   watch: {
     session(id) { keepSession(id); },
     "state.sessions": { handler(all) { if (all && this.session && !this.open) this.session = ""; }, immediate: true },
@@ -43,7 +45,7 @@ export default {
     ready() {
       if (!this.looked) return "Waiting for a picture of every camera.";
       const sharp = this.cameras.filter((c) => typeof this.live[c.name].blur_px === "number").length;
-      return `Exposure is in order. Sharpness is, in the ${sharp} of ${this.cameras.length} judged so far. ${this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot."}`;
+      return `Exposure is in order. ${sharp ? `So is sharpness, in the ${sharp} of ${this.cameras.length} judged so far.` : "Sharpness is looked at next."} ${this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot."}`;
     },
     columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
   },
@@ -82,19 +84,17 @@ export default {
       </div>
       <div v-if="count" class="countdown" role="alert"><span>{{ count }}</span></div>
     </section>`,
-  created() { this.soft = SOFT_PX; this.limit = EXPOSURE; this.canvas = {}; this.fixed = fixed; },
+  created() { this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; },
   mounted() {
     window.addEventListener("keydown", this.key);
     this.clockTimer = setInterval(() => (this.now = Date.now()), 500);
-    this.watch();
+    this.look();
   },
   unmounted() {
     window.removeEventListener("keydown", this.key);
     clearInterval(this.clockTimer); clearInterval(this.counter);
-    this.gone = true; this.reader?.cancel();
   },
   methods: {
-    keep(name, element) { if (element) this.canvas[name] = element; },
     percent(share) { return share === undefined ? "-" : `${(100 * share).toFixed(share < 0.1 ? 1 : 0)}%`; },
     light(name) {
       const mean = this.live[name]?.mean;
@@ -127,51 +127,6 @@ export default {
       if (event.key === " ") { event.preventDefault(); if (!event.repeat) this.start(); }
       else if (event.key === "Escape") this.stop();
       else if (event.key === "b" || event.key === "B") this.plates();
-    },
-    async watch() {
-      while (!this.gone) {
-        try {
-          const answer = await fetch("/console/live");
-          if (!answer.ok) throw new Error(answer.statusText);
-          this.reader = answer.body.getReader();
-          await this.read(this.reader);
-        } catch (error) { this.fault = "Waiting for the service ..."; }
-        await new Promise((resolve) => setTimeout(resolve, 1000));
-      }
-    },
-    async read(reader) {
-      let kept = new Uint8Array(0);
-      for (;;) {
-        const { done, value } = await reader.read();
-        if (done) return;
-        const joined = new Uint8Array(kept.length + value.length);
-        joined.set(kept); joined.set(value, kept.length); kept = joined;
-        for (;;) {
-          if (kept.length < 8) break;
-          const view = new DataView(kept.buffer, kept.byteOffset);
-          const header = view.getUint32(0), body = view.getUint32(4);
-          if (kept.length < 8 + header + body) break;
-          const document = JSON.parse(new TextDecoder().decode(kept.subarray(8, 8 + header)));
-          await this.show(document, kept.slice(8 + header, 8 + header + body));
-          kept = kept.slice(8 + header + body);
-        }
-      }
-    },
-    async show(document, body) {
-      this.fault = document.fault;
-      let start = 0;
-      const drawn = document.cameras.map(async (camera) => {
-        const data = body.subarray(start, (start += camera.bytes));
-        const before = this.live[camera.name]?.frames || 0;
-        this.live[camera.name] = { ...camera, at: Date.now(), frames: before + (camera.bytes > 0) };
-        const canvas = this.canvas[camera.name];
-        if (!canvas || !camera.bytes) return;
-        const picture = await createImageBitmap(new Blob([data], { type: "image/jpeg" }));
-        if (canvas.width !== picture.width || canvas.height !== picture.height) { canvas.width = picture.width; canvas.height = picture.height; }
-        canvas.getContext("2d").drawImage(picture, 0, 0);
-        picture.close();
-      });
-      await Promise.all(drawn);
     },
   },
 };
