@@ -259,15 +259,13 @@ def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) 
         ours = find_rim(make_topology(full.faces, full.face_region), mesh.vertices, views, whole_head=True)
         nearest = KDTree(ours.pixel).query(true.pixel)[1]
         across = ((true.pixel - ours.pixel[nearest]) * ours.normal[nearest]).sum(axis=1)
-        found[level] = {
-            "contour_rms_px": _rms(across[shown], true.length[shown]),
-            "contour_rms_with_hair_px": _rms(across, true.length),
-            "shown_share": float(true.length[shown].sum() / true.length.sum()),
-            "psnr_db": colour_psnr(
-                known.rig[camera], known.capture.images[camera], mesh, coloured.colours, full.face_region,
-                silhouettes[camera].mask,
-            ),
-        }  # fmt: skip
+        photograph, mask = known.capture.images[camera], silhouettes[camera].mask
+        psnr = colour_psnr(known.rig[camera], photograph, mesh, coloured.colours, full.face_region, mask)
+        found[level] = {"psnr_db": psnr}
+        if shown.any():  # from above, a face's outline may lie wholly before the shoulders
+            found[level]["contour_rms_px"] = _rms(across[shown], true.length[shown])
+        if len(across):
+            found[level]["contour_rms_with_hair_px"] = _rms(across, true.length)
     return found
 
 
