@@ -1,0 +1,1 @@
+"""A rig from pictures of a board, refined by silhouettes, and the checks on it."""

@@ -1,34 +1,33 @@
 """From pictures of a board to a calibrated rig: detection, lenses, pose graph, bundle, checks; one function."""
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.board import Board
-from calibration.bundle import (
+from calibration.adjustment.bundle import CAUCHY, HUBER, BundleSolution, Free, corner_sigma, solve
+from calibration.adjustment.gauge import effective_pose, gauge_projection, image_sigma, subject_points
+from calibration.adjustment.intrinsics import Lens, estimate_lenses
+from calibration.adjustment.lens_prior import LensPrior, weak_prior
+from calibration.adjustment.pose_graph import Graph, build_graph
+from calibration.adjustment.state import (
     INTRINSICS,
     PER_CAMERA,
-    Free,
+    BundleState,
     Observations,
-    Prior,
-    Solution,
-    State,
     camera_of,
-    corner_sigma,
     observations,
     orthonormal,
     residuals,
-    solve,
     values_of,
-    weak_prior,
 )
-from calibration.checks import (
-    Check,
+from calibration.adjustment.timing import TimeOffsets, board_velocities, estimate_offsets
+from calibration.adjustment.world import in_world_frame
+from calibration.board.board import Board
+from calibration.board.detection import Detections, Report, View, WrongBoard, detect_folder, ignore_progress
+from calibration.quality.checks import (
     check_against_previous,
     check_cheirality,
     check_determined,
@@ -37,114 +36,14 @@ from calibration.checks import (
     failed,
     measure_aspect,
 )
-from calibration.detection import Detections, Report, View, WrongBoard, detect_folder, ignore_progress
-from calibration.gauge import effective_pose, gauge_projection, image_sigma, subject_points
-from calibration.intrinsics import Lens, estimate_lenses
-from calibration.outliers import (
-    CORNER_SIGMAS,
-    Dropped,
-    bad_views,
-    drop_blurred,
-    drop_misread,
-    explain_shot,
-)
-from calibration.pose_graph import Graph, build_graph
-from calibration.timing import TimeOffsets, board_velocities, estimate_offsets
-from calibration.world import in_world_frame
-from rig.errors import EigenheadError
-from rig.files import write_atomically
+from calibration.quality.outliers import CORNER_SIGMAS, Dropped, bad_views, drop_blurred, drop_misread, explain_shot
+from calibration.result import Calibration, CalibrationRefused
 from rig.geometry import RigidTransform
-from rig.layout import Rig, document_from_rig
+from rig.rig import Rig
 
 # Time offsets are used where they explain this share of the residuals; below it they would only follow noise.
 OFFSET_GAIN = 0.05
 ROUNDS = 4  # of leaving out what the rest contradicts
-
-
-class CalibrationRefused(EigenheadError):
-    """The pictures were understood, but what they give is not to be used. ``calibration`` is there for the report."""
-
-    def __init__(self, reasons: Iterable[str], calibration: "Calibration | None" = None) -> None:
-        self.reasons = tuple(reasons)
-        self.calibration = calibration
-        super().__init__("the calibration is refused: " + "; ".join(self.reasons))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
-    """A calibrated rig with its evidence.
-
-    ``rig`` has per-camera pose covariances in the gauge of ``calibration.gauge``; ``pose_covariance`` is the joint one
-    of all cameras' left perturbations (rad, mm) in that gauge, with what the uncertainty of the lenses adds to it;
-    ``pose_sigma_px`` its size at the subject; ``intrinsics_sigma`` per camera that of fx fy cx cy k1 k2 p1 p2 k3.
-    ``misses`` per view: the used corners' numbers, pixels, and projected less detected (px)."""
-
-    rig: Rig
-    board: Board
-    front: str
-    pose_covariance: Float[np.ndarray, "6c 6c"]
-    intrinsics_sigma: dict[str, Float[np.ndarray, " 9"]]
-    pose_sigma_px: dict[str, float]
-    misses: dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]
-    detected: int
-    lenses: dict[str, Lens]
-    sync_px: float
-    offsets: TimeOffsets | None
-    offsets_used: bool
-    dropped: tuple[Dropped, ...]
-    checks: tuple[Check, ...]
-    warnings: tuple[str, ...]
-
-    def figures(self) -> dict[str, Any]:
-        """The numbers of ``calibrate --json``."""
-        everything = np.concatenate([miss for _, _, miss in self.misses.values()])
-        cameras = {}
-        for camera in self.rig:
-            own = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
-            cameras[camera.name] = {
-                "rms_px": _rms(np.concatenate(own)),
-                "alone_rms_px": self.lenses[camera.name].rms_px,
-                "views": len(own),
-                "corners": int(sum(len(miss) for miss in own)),
-                "pose_sigma_px": self.pose_sigma_px[camera.name],
-                "focal_sigma_px": float(self.intrinsics_sigma[camera.name][0]),
-            }
-        return {
-            "rms_px": _rms(everything),
-            "used_share": len(everything) / self.detected,
-            "corners": len(everything),
-            "sync_px": self.sync_px,
-            "cameras": cameras,
-        }
-
-    def document(self) -> dict[str, Any]:
-        """Everything but the residuals, as JSON."""
-        names = self.rig.names
-        offsets = None
-        if self.offsets is not None:
-            offsets = {
-                "used": self.offsets_used,
-                "unit": "shots",
-                "cameras": dict(zip(names, self.offsets.offsets.tolist(), strict=True)),
-                "sigma": dict(zip(names, self.offsets.sigma.tolist(), strict=True)),
-                "rms_without_px": self.offsets.rms_without_px,
-                "rms_with_px": self.offsets.rms_with_px,
-            }
-        sigma = {
-            name: dict(zip(INTRINSICS, values.tolist(), strict=True)) for name, values in self.intrinsics_sigma.items()
-        }
-        return {
-            "figures": self.figures(),
-            "front": self.front,
-            "checks": [
-                {"name": c.name, "passed": c.passed, "detail": c.detail, "advice": c.advice} for c in self.checks
-            ],
-            "dropped": [{"shot": d.shot, "camera": d.camera, "reason": d.reason} for d in self.dropped],
-            "warnings": list(self.warnings),
-            "time_offsets": offsets,
-            "intrinsics_sigma": sigma,
-            "rig": document_from_rig(self.rig),
-        }
 
 
 def calibrate(
@@ -185,19 +84,14 @@ def calibrate_detections(
     return _judged(fit, detections, lenses, [*dropped, *fit.dropped], detected, front, previous, report)
 
 
-def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Writes ``cameras.json`` with covariances."""
-    write_atomically(path, json.dumps(document_from_rig(calibration.rig), indent=1).encode())
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    solution: Solution
+    solution: BundleSolution
     seen: Observations
     views: tuple[View, ...]
     kept: Bool[np.ndarray, " n"]
     names: tuple[str, ...]
-    prior: Prior
+    prior: LensPrior
     sigma: Float[np.ndarray, " c"]
     sync_px: float
     offsets: TimeOffsets
@@ -241,9 +135,9 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
         if attempt == 0:
             for scale in (8.0, 2.0):
                 sigma = np.sqrt(noise**2 + 0.25) * scale
-                state = solve(state, seen, weak, sigma, robust="cauchy", tick=tick).state
+                state = solve(state, seen, weak, sigma, loss=CAUCHY, tick=tick).state
         sigma, _ = corner_sigma(state, seen, noise)
-        state = solve(state, seen, _prior(weak, names, lenses, noise, sigma), sigma, robust="cauchy", tick=tick).state
+        state = solve(state, seen, _prior(weak, names, lenses, noise, sigma), sigma, loss=CAUCHY, tick=tick).state
         bad = bad_views(state, seen)
         if not bad.any():
             break
@@ -256,12 +150,12 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
 
 
 def _finish(
-    state: State,
+    state: BundleState,
     views: tuple[View, ...],
     graph: Graph,
     detections: Detections,
     lenses: dict[str, Lens],
-    weak: Prior,
+    weak: LensPrior,
     noise: Float[np.ndarray, " c"],
     dropped: tuple[Dropped, ...],
     report: Report,
@@ -294,7 +188,7 @@ def _finish(
         report("bundle", 0.9)
         if used:
             state = replace(state, velocities=board_velocities(state))
-        solution = solve(state, everything.subset(kept), prior, sigma, free=free, robust="huber")
+        solution = solve(state, everything.subset(kept), prior, sigma, free=free, loss=HUBER)
         state = solution.state
         if round_number == 2:
             break
@@ -309,19 +203,19 @@ def _finish(
 
 
 def _prior(
-    weak: Prior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
-) -> Prior:
+    weak: LensPrior, names: Sequence[str], lenses: dict[str, Lens], noise: Float[np.ndarray, " c"], sigma: np.ndarray
+) -> LensPrior:
     """Where views err as a whole (moments that differ), the joint fit must take their corners for noisier than they are
     to each other, and would bend the lenses to explain the rest. What each lens was found to be by itself then counts
     as knowledge, by the share of the noise that is not the corners' own."""
     share = 1.0 - noise**2 / sigma**2
     mean = np.stack([values_of(lenses[name].intrinsics) for name in names])
     information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])
-    return weak.and_also(mean, information * share[:, None, None])
+    return weak.combine(mean, information * share[:, None, None])
 
 
 def _explain(
-    strange: Iterable[View], graph: Graph, state: State, detections: Detections, noise_px: float
+    strange: Iterable[View], graph: Graph, state: BundleState, detections: Detections, noise_px: float
 ) -> Iterable[Dropped]:
     boards = {
         shot: RigidTransform(rotation, translation)
@@ -388,7 +282,7 @@ def _judged(
 
 def _covariances(
     fit: _Fit, rig: Rig
-) -> tuple[Float[np.ndarray, "6c 6c"], dict[str, Float[np.ndarray, " 9"]], Float[np.ndarray, " c"]]:
+) -> tuple[Float[np.ndarray, "p p"], dict[str, Float[np.ndarray, " 9"]], Float[np.ndarray, " c"]]:
     """Poses' joint covariance in the subject's gauge, standard deviations of the intrinsics, and what both amount to in
     pixels at the subject. The uncertainty of the
     lenses is contained in that of the poses (``effective_pose``), for a fit takes the intrinsics as they are.
@@ -442,7 +336,3 @@ def _warnings(fit: _Fit, lenses: dict[str, Lens], dropped: Sequence[Dropped]) ->
         late = ", ".join(f"{n} {o:+.2f}" for n, o in zip(fit.names, fit.solution.state.offsets, strict=True))
         found.append(f"the cameras' moments differ; offsets in shots were estimated and used: {late}")
     return tuple(found)
-
-
-def _rms(misses: Float[np.ndarray, "n 2"]) -> float:
-    return float(np.sqrt((misses**2).sum(axis=1).mean()))

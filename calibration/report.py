@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from calibration.bundle import INTRINSICS
-from calibration.calibrate import Calibration
+from calibration.adjustment.state import INTRINSICS
+from calibration.result import Calibration
+from rig.atomic_write import write_atomically
 from rig.camera import Camera
-from rig.files import write_atomically
 
 PICTURE_WIDTH = 420.0  # of a camera's drawing on the page, CSS pixels
 MAGNIFIED = 40.0  # residual vectors are drawn this many times longer

@@ -28,7 +28,7 @@ done
 
 # The stamp holds what the environment was made from; with --tests it stands for the packages too.
 stamp=".venv/.ready${tests:+-$tests}"
-wanted="$(cat uv.lock pyproject.toml deploy/setup.sh | sha256sum) $PWD"
+wanted="$(cat uv.lock pyproject.toml deploy/setup.sh deploy/wheel_imports.py | sha256sum) $PWD"
 if [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$wanted" ]; then
   exit 0
 fi

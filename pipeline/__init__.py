@@ -1,1 +1,1 @@
-"""From a capture to a head: one module per section of the paper."""
+"""From a capture to a head: values in, values out; no stage reads or writes files, the clock or a global."""

@@ -3,36 +3,46 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
-from pipeline.alignment import feature_alignment
-from pipeline.alignment_search import search_alignment
-from pipeline.atlas import paint_atlas
-from pipeline.drift import find_drift
-from pipeline.eigenheads.kernel import with_kernel
+from pipeline.alignment.landmarks import feature_alignment
+from pipeline.alignment.silhouette_search import search_alignment
+from pipeline.dense.depth_map import DepthMap
+from pipeline.dense.estimate import estimate_depth
+from pipeline.dense.surface.fusion import NoSurface
+from pipeline.diagnostics import Detail, ReportWarning
+from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_modes
-from pipeline.evidence import camera_figures, start_masks
 from pipeline.fitting.contour import finish, solve_contour
+from pipeline.fitting.fine.dense_points import dense_points, head_place
+from pipeline.fitting.fine.eyelids import look_at_eyes
+from pipeline.fitting.fine.refine import Displaced, refine_to_surface
 from pipeline.fitting.fit import Fit
-from pipeline.fitting.photo import refine_with_photographs
-from pipeline.fitting.posterior import vertex_deviation_mm
-from pipeline.fitting.schedule import fit_simplex
-from pipeline.measurements import landmarks, measurements
-from pipeline.reconstruction import Detail, Reconstruction, ReportWarning
-from pipeline.segmentation import segment
+from pipeline.fitting.photo.refine import refine_with_photographs
+from pipeline.fitting.posterior import vertex_deviation_mm, with_estimated_prior
+from pipeline.fitting.simplex.hierarchy import fit_simplex
+from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.camera_drift import find_drift
+from pipeline.results.bust import Bust, make_bust
+from pipeline.results.camera_metrics import camera_figures, start_masks
+from pipeline.results.measurements import landmarks, measurements
+from pipeline.results.plausibility import plausibility_warnings, refuse
+from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import Settings
-from pipeline.silhouette import Silhouette
-from pipeline.texture import texture
-from pipeline.unwrap import unwrap
-from pipeline.zbuffer import depth_maps
+from pipeline.silhouettes.own_pictures import own_pictures
+from pipeline.silhouettes.segment import segment
+from pipeline.texture.atlas import paint_atlas
+from pipeline.texture.uv_unwrap import unwrap
+from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
-from rig.layout import Rig
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
+from rig.rig import Rig
 
 VIEWS_LEAST = 3
 Report = Callable[[str, float], None]
@@ -82,13 +92,18 @@ def reconstruct(
     """Capture to textured head (section 4). Reads and writes no files. A caller that keeps silhouettes gives a
     ``segment`` of its own.
 
-    Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing), and
-    Cancelled when ``report`` does.
+    Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
+    warning is one that the settings do not let pass, and Cancelled when ``report`` does.
     """
     started = time.perf_counter()
     clock = Clock(report)
     clock("segmentation")
-    silhouettes = segment(capture, rig, settings.segmentation, report=report)
+
+    def segmented(shot: Capture) -> dict[str, Silhouette]:
+        return segment(shot, rig, settings.segmentation, report=report)
+
+    own = own_pictures(capture, rig, segmented, exchanged=settings.exchanged_pictures)
+    digests, capture, silhouettes = capture.digests, own.capture, own.silhouettes
     if sum(silhouette.quality.usable for silhouette in silhouettes.values()) < VIEWS_LEAST:
         raise TooFewViews(silhouettes)
     silhouettes, moved = without_moved_cameras(silhouettes, rig)
@@ -98,11 +113,25 @@ def reconstruct(
     start, warnings = align(model, capture, silhouettes, rig, settings, front, report)
     clock("fit")
     fit, model, detail = fit_head(model, start, capture, silhouettes, rig, settings, renderer, report)
+    full, finer = model.levels["full"], None
+    mesh, quality = fitted_mesh(model, fit), vertex_deviation_mm(model, fit)
+    fine = detail.level == "photo" and settings.detail == "fine"
+    maps: tuple[DepthMap, ...] = ()
+    if fine or settings.outputs.surface != "head":
+        clock("depth")
+        told_depth = partial(_of_stage, clock.report, "depth")
+        maps = estimate_depth(capture.images, silhouettes, rig, mesh, settings.dense, report=told_depth)
+    if fine:
+        clock("fine")
+        finer, detail = fine_head(model, fit, quality, maps, capture, rig, settings, report)
+        if finer is not None:
+            mesh, quality = Mesh(finer.vertices, full.faces), finer.deviation_mm
     clock("texture")
-    full = model.levels["full"]
-    mesh = Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), full.faces)
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture)
+    bust, bust_warnings = None, []
+    if settings.outputs.surface != "head":
+        bust, bust_warnings = find_bust(maps, capture, silhouettes, rig, mesh, settings, clock)
     atlas = None
     if settings.outputs.atlas:
         clock("atlas")
@@ -112,7 +141,19 @@ def reconstruct(
     before = start_masks(model, start, rig)
     fitted_masks = {name: np.isfinite(depth) for name, depth in depths.items()}
     figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, before)
-    quality = vertex_deviation_mm(model, fit)
+    widths = {camera.name: camera.intrinsics.width for camera in rig}
+    implausible = plausibility_warnings(fit, figures, widths)
+    told = (
+        *own.warnings,
+        *implausible,
+        *view_warnings(silhouettes),
+        *moved,
+        *warnings,
+        *eye_warnings(finer),
+        *coloured.warnings,
+        *bust_warnings,
+    )
+    refuse(told, settings.fail_on)
     clock("")
     report("done", 1.0)
     return Reconstruction(
@@ -128,17 +169,41 @@ def reconstruct(
         start_masks=before,
         fitted_masks=fitted_masks,
         cameras=figures,
-        landmarks=landmarks(model, fit),
-        measurements=measurements(model, fit),
+        landmarks=landmarks(model, fit, mesh.vertices),
+        measurements=measurements(model, fit, mesh.vertices),
         front=front,
         settings=settings,
-        digests=capture.digests,
+        digests=digests,
+        pictures=own.pictures,
         seconds=clock.seconds | {"total": time.perf_counter() - started},
-        warnings=(*view_warnings(silhouettes), *moved, *warnings, *coloured.warnings),
+        warnings=told,
         gains=coloured.gains,
         detail=detail,
         atlas=atlas,
+        bust=bust,
     )
+
+
+def find_bust(
+    maps: tuple[DepthMap, ...],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    head_world: Mesh,
+    settings: Settings,
+    clock: Clock,
+) -> tuple[Bust | None, list[ReportWarning]]:
+    """All that the cameras see, as one closed surface; a warning where the photographs do not tell it."""
+    clock("bust")
+    try:
+        bust = make_bust(maps, capture, silhouettes, rig, head_world, settings, report=clock.report)
+    except NoSurface as reason:
+        return None, [ReportWarning("no-bust", str(reason))]
+    return bust, list(bust.surface.warnings)
+
+
+def _of_stage(report: Report, stage: str, _: str, fraction: float) -> None:
+    report(stage, fraction)
 
 
 def without_moved_cameras(
@@ -209,9 +274,48 @@ def fit_head(
         return fit, model, Detail("span", "the simplex searches the eigenheads alone")
     solved = solve_contour(model, start, silhouettes, rig, settings.fitting, features=capture.features, report=report)
     detail = Detail("span" if settings.detail == "span" else "kernel", "the settings ask for it")
-    if settings.detail in (None, "photo"):
+    if settings.detail in (None, "photo", "fine"):
         solved, detail = refine_with_photographs(solved, capture.images, settings.photo)
-    return finish(solved), solved.problem.model, detail
+    model, eigenheads = solved.problem.model, min(settings.fitting.modes, len(model.modes))
+    return with_estimated_prior(model, finish(solved), eigenheads), model, detail
+
+
+def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
+    """The fit's head, full level, world frame."""
+    return Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), model.levels["full"].faces)
+
+
+def fine_head(
+    model: HeadModel,
+    fit: Fit,
+    deviation_mm: np.ndarray,
+    depth: tuple[DepthMap, ...],
+    capture: Capture,
+    rig: Rig,
+    settings: Settings,
+    report: Report,
+) -> tuple[Displaced | None, Detail]:
+    """The fit's head drawn to what the dense stage knows, and why no deeper where that is too little."""
+    mesh = fitted_mesh(model, fit)
+    surface = dense_points(depth, head_place(model, mesh, fit.world_from_head), settings.fine)
+    eyes = look_at_eyes(model, mesh.vertices, capture.images, rig)
+    eigenheads = min(settings.fitting.modes, len(fit.coefficients))
+    head = refine_to_surface(
+        fit, model, surface, settings.fine, eigenheads=eigenheads, deviation_mm=deviation_mm, eyes=eyes, report=report
+    )
+    share = float(head.observed[model.levels["full"].face_region].mean())
+    if share < settings.fine.least_share:
+        why = f"the dense surface shows only {share:.0%} of the face, {settings.fine.least_share:.0%} are needed"
+        return None, Detail("photo", why)
+    return head, Detail("fine", f"the dense surface shows {share:.0%} of the face")
+
+
+def eye_warnings(head: Displaced | None) -> list[ReportWarning]:
+    """Closed eyes are no fault, but most studios want another shot."""
+    if head is None or not head.closed_eyes:
+        return []
+    which = "both eyes are" if len(head.closed_eyes) == 2 else f"the {min(head.closed_eyes)} eye is"
+    return [ReportWarning("eyes-closed", f"{which} closed: no white and no iris in the photographs; lids were closed")]
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:

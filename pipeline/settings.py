@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
+from pipeline.diagnostics import WARNING_CODES
 from rig.errors import InputError
 
 T = TypeVar("T")
@@ -94,6 +95,50 @@ class PhotoSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class FineSettings:
+    """The head drawn to the dense surface. Chosen on two captures rendered by another program."""
+
+    coarse_length_mm: float = 12.0  # over which a displacement of the nodes fades where nothing is seen
+    length_mm: float = 5.0  # the same of the displacement along the normals that follows it
+    least_amplitude_mm: float = 0.7  # standard deviation of a displacement, where the fit claims to be better
+    cell_mm: float = 0.8  # points nearer than that are one: three quarters of a pixel of the usual rig
+    coarse_cell_mm: float = 2.5
+    floor_mm: float = 0.05  # error of a point that its deviation does not show
+    coarse_floor_mm: float = 0.3  # the nodes' edges are 4 mm long: relief that they cannot follow
+    correlation_mm: float = 2.5  # radius within which points err alike: a window of dense matching
+    common_mm: float = 0.1  # what points may err alike beyond that: cameras, shading
+    views_least: int = 4  # that agree on a point: with fewer, beside hair and behind ears, it lies 1 mm too deep
+    facing_least: float = 0.35  # cosine between a point's normal and its view: flatter windows smear
+    least_share: float = 0.2  # of the face's vertices that the dense surface must show, or it is no use
+    draws: int = 24  # of the posterior: its deviation is known to a seventh
+
+
+@dataclass(frozen=True, slots=True)
+class DenseSettings:
+    """Depth in every view from the photographs. Chosen on two captures rendered by another program; where no unit is in
+    the name, numbers are shares or counts."""
+
+    pixel_mm: float = 0.4  # on the subject; finer photographs are reduced to it, for their noise is below 0.1 mm there
+    reach_mm: float = 90.0  # behind the hull's front where the fitted head bounds nothing: hair is 60 mm thick at most
+    behind_head_mm: float = 6.0  # the surface may lie that far behind the fitted head: its own error beside the face
+    labels: int = 40  # places along a ray in the first sweep: 2 mm apart, a pixel of quarter size
+    contrast_levels: float = 30.0  # a pixel that differs by this from its window's middle weighs half
+    angle_least_deg: float = 8.0  # between the views of a pair: nearer ones say little about depth
+    angle_most_deg: float = 45.0  # farther ones match hair and ears wrongly ...
+    angle_widest_deg: float = 65.0  # ... and are asked only where a view has fewer than ``neighbours_least``
+    neighbours_least: int = 3
+    neighbours_most: int = 5
+    match_factor: float = 1.6  # of a match's own standard deviation: samples of a window are not independent
+    match_floor_mm: float = 0.1  # error of a match that its window does not show
+    worst_mm: float = 2.0  # a depth with a larger standard deviation is not told
+    outline_px: float = 1.0  # nothing is told nearer to the background: the edge is blurred over it
+    agree_mm: float = 1.5  # two views agree where their surfaces are nearer than that ...
+    agree_deviations: float = 3.0  # ... and than this many of their joint standard deviation
+    carried: float = 0.5  # share of the information that goes on to the next size, as far as ...
+    relief_factor: float = 3.0  # ... this many times the relief about a pixel allows: without it hair and lids blur
+
+
+@dataclass(frozen=True, slots=True)
 class TextureSettings:
     """Section 4.5. Chosen by the colour error over the visible face of captures rendered by another program."""
 
@@ -108,10 +153,21 @@ class TextureSettings:
     highlight: float = 0.12  # excess over the median of the views, by its level, at which a view counts half
 
 
+SPACING_RANGE_MM = (0.5, 3.0)  # finer is below the photographs' pixels, coarser has no lids
+
+
+@dataclass(frozen=True, slots=True)
+class BustSettings:
+    """The whole visible surface."""
+
+    spacing_mm: float = 1.5  # of its vertices, 0.5 to 3: three pixels of the usual rig
+
+
 @dataclass(frozen=True, slots=True)
 class OutputSettings:
-    """Files beside those that every result has."""
+    """Which surfaces are made, and files beside those that every result has."""
 
+    surface: Literal["head", "bust", "both"] = "both"  # the model's head, all that the cameras see, or both
     obj: bool = False  # head.obj, with vertex colours
     atlas: bool = False  # head_atlas.glb, whose texture keeps the photographs' resolution
 
@@ -121,13 +177,20 @@ class Settings:
     """All settings of one reconstruction."""
 
     method: Literal["contour", "simplex"] = "contour"
-    detail: Literal["span", "kernel", "photo"] | None = None  # None: as deep as the images carry
+    detail: Literal["span", "kernel", "photo", "fine"] | None = (
+        None  # None: photo where images carry it; fine, the dense surface, is asked for
+    )
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
+    exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
+    fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.diagnostics.WARNING_CODES) that are failures here
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
     fitting: FittingSettings = field(default_factory=FittingSettings)
     photo: PhotoSettings = field(default_factory=PhotoSettings)
+    fine: FineSettings = field(default_factory=FineSettings)
+    dense: DenseSettings = field(default_factory=DenseSettings)
     texture: TextureSettings = field(default_factory=TextureSettings)
+    bust: BustSettings = field(default_factory=BustSettings)
     outputs: OutputSettings = field(default_factory=OutputSettings)
 
 
@@ -135,6 +198,11 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
     """Settings from decoded JSON or TOML. Raises InputError naming every unknown key and every wrong value."""
     faults: list[str] = []
     settings = _read(Settings, document, "", faults)
+    unknown = [code for code in settings.fail_on if code not in WARNING_CODES]
+    faults += [f"fail_on: {code!r:.80} is none of {', '.join(WARNING_CODES)}" for code in unknown]
+    least, most = SPACING_RANGE_MM
+    if not least <= settings.bust.spacing_mm <= most:
+        faults.append(f"bust.spacing_mm is {settings.bust.spacing_mm:g}, wanted {least:g} to {most:g}")
     if faults:
         raise InputError(subject, faults)
     return settings
@@ -172,10 +240,16 @@ def _value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
             return value
         if option is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
+        if typing.get_origin(option) is tuple and _are_texts(value):
+            return tuple(typing.cast(list, value))
         if option in (int, bool, str) and type(value) is option:
             return value
     faults.append(f"{where} is {value!r:.80}, wanted {_wanted(options)}")
     return ...
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(isinstance(entry, str) for entry in value)
 
 
 def _wanted(options: tuple[Any, ...]) -> str:
@@ -183,6 +257,8 @@ def _wanted(options: tuple[Any, ...]) -> str:
     for option in options:
         if typing.get_origin(option) is Literal:
             words += [repr(word) for word in typing.get_args(option)]
+        elif typing.get_origin(option) is tuple:
+            words.append("a list of texts")
         else:
             words.append(
                 {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}.get(

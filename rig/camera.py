@@ -36,27 +36,12 @@ class Distortion:
         return float(np.sqrt(squares.min())) if len(squares) else np.inf
 
     def apply(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        x, y = normalised[:, 0], normalised[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        return np.stack(
-            [
-                x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
-                y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
-            ],
-            axis=1,
-        )
+        """Distorted places of ``X / Z, Y / Z``."""
+        return _distorted(normalised, self.opencv())
 
     def jacobian(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
         """d(distorted) / d(normalised)."""
-        x, y = normalised[:, 0], normalised[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = 2 * (self.k1 + r2 * (2 * self.k2 + 3 * r2 * self.k3))  # d(radial) / d(r^2) * 2
-        cross = slope * x * y + 2 * self.p1 * x + 2 * self.p2 * y
-        xx = radial + slope * x * x + 2 * self.p1 * y + 6 * self.p2 * x
-        yy = radial + slope * y * y + 6 * self.p1 * y + 2 * self.p2 * x
-        return np.stack([np.stack([xx, cross], 1), np.stack([cross, yy], 1)], axis=1)
+        return _distortion_slopes(normalised, self.opencv())
 
     def remove(self, distorted: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Inverse of ``apply`` by Newton's method; NaN where no point inside the turning radius maps there."""
@@ -90,6 +75,10 @@ class Intrinsics:
     cy: float
     distortion: Distortion = field(default_factory=Distortion)
 
+    def values(self) -> Float[np.ndarray, " 9"]:
+        """fx fy cx cy k1 k2 p1 p2 k3, as ``lens_image`` takes them."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion.opencv()])
+
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
@@ -121,20 +110,16 @@ class Camera:
 
     def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Pixels of world points (mm); NaN behind the camera and past the turning point of the distortion."""
-        return self._image(self.camera_from_world.apply(points_world))[0]
+        return self._image(self.camera_from_world.apply(points_world))
 
     def project_with_jacobian(
         self, points_world: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
         """Pixels, and their derivative by the world point (px / mm)."""
         points = self.camera_from_world.apply(points_world)
-        pixels, normalised = self._image(points)
-        x, y, z = normalised[:, 0], normalised[:, 1], points[:, 2]
-        zero = np.zeros_like(z)
-        pinhole = np.stack([np.stack([1 / z, zero, -x / z], 1), np.stack([zero, 1 / z, -y / z], 1)], axis=1)
-        lens = self.intrinsics.distortion.jacobian(normalised)
-        focal = np.array([[self.intrinsics.fx], [self.intrinsics.fy]])
-        return pixels, focal * (lens @ pinhole) @ self.camera_from_world.rotation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            by_point, _ = lens_jacobians(points, self.intrinsics.values())
+        return self._image(points), by_point @ self.camera_from_world.rotation
 
     def rays_world(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Unit directions, in the world frame, of the rays through ``pixels``."""
@@ -147,11 +132,66 @@ class Camera:
         k = self.intrinsics
         return k.distortion.remove((pixels - (k.cx, k.cy)) / (k.fx, k.fy))
 
-    def _image(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-        k = self.intrinsics
+    def _image(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Pixels of points in the camera's frame."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            normalised = points[:, :2] / points[:, 2:]
-            pixels = k.distortion.apply(normalised) * (k.fx, k.fy) + (k.cx, k.cy)
-            bad = (points[:, 2] <= 0) | (np.linalg.norm(normalised, axis=1) > k.distortion.turning_radius())
+            pixels = lens_image(points, self.intrinsics.values())
+            radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
+            bad = (points[:, 2] <= 0) | (radius > self.intrinsics.distortion.turning_radius())
         pixels[bad] = np.nan
-        return pixels, normalised
+        return pixels
+
+
+def lens_image(points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2"]:
+    """Pixels of points in front of a camera, in its frame (mm).
+
+    ``lens``: fx fy cx cy (px) k1 k2 p1 p2 k3, the same for all points or one a point. Nothing is tested: neither that a
+    point lies in front, nor that it is inside the distortion's turning radius.
+    """
+    return _distorted(points[:, :2] / points[:, 2:], lens[..., 4:]) * lens[..., :2] + lens[..., 2:4]
+
+
+def lens_jacobians(
+    points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]
+) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 9"]]:
+    """Derivatives of ``lens_image`` by the point (px / mm) and by the lens's nine values."""
+    normalised, z = points[:, :2] / points[:, 2:], points[:, 2]
+    (x, y), focal = normalised.T, lens[..., :2, None]
+    slopes = focal * _distortion_slopes(normalised, lens[..., 4:])
+    pinhole = np.zeros((len(points), 2, 3))
+    pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1.0 / z
+    pinhole[:, :, 2] = -normalised / z[:, None]
+    r2 = x * x + y * y
+    by_lens = np.zeros((len(points), 2, 9))
+    by_lens[:, [0, 1], [0, 1]] = _distorted(normalised, lens[..., 4:])
+    by_lens[:, [0, 1], [2, 3]] = 1.0
+    by_lens[:, 0, 4:] = np.stack([x * r2, x * r2**2, 2.0 * x * y, r2 + 2.0 * x * x, x * r2**3], axis=1)
+    by_lens[:, 1, 4:] = np.stack([y * r2, y * r2**2, r2 + 2.0 * y * y, 2.0 * x * y, y * r2**3], axis=1)
+    by_lens[:, :, 4:] *= focal
+    return slopes @ pinhole, by_lens
+
+
+def _distorted(normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "n 2"]:
+    """The module's equation."""
+    (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    across, down = (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+    return np.stack([across, down], axis=1)
+
+
+def _distortion_slopes(
+    normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n 5"]
+) -> Float[np.ndarray, "n 2 2"]:
+    """Its derivative by the normalised place, which is symmetric."""
+    (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial) / d(r^2) * 2
+    cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return np.stack([np.stack([xx, cross], 1), np.stack([cross, yy], 1)], axis=1)

@@ -2,11 +2,9 @@
 
 import resource
 import time
+from collections.abc import Mapping
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
-
-from server.jobs import STATES, WORKFLOW
-from server.service import Service
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS = (0.005, 0.02, 0.1, 0.5, 2.0, 10.0, 60.0)
@@ -42,16 +40,12 @@ class Metrics:
         self.requests.labels(method, route, str(status)).inc()
         self.seconds.labels(route).observe(time.monotonic() - began)
 
-
-def exposition(service: Service) -> bytes:
-    metrics = service.metrics
-    counts = dict.fromkeys(set(STATES.values()), 0)
-    for row in service.jobs.client.list_workflows(name=WORKFLOW, load_input=False, load_output=False):
-        counts[STATES[row.status]] += 1
-    for state, count in counts.items():
-        metrics.jobs.labels(state).set(count)
-    metrics.captures.set(len(service.store.ids("captures")))
-    metrics.free.set(service.store.free_bytes())
-    metrics.memory.set(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
-    metrics.set_aside.set(len(service.store.set_aside()))
-    return generate_latest(metrics.registry)
+    def exposition(self, jobs: Mapping[str, int], *, captures: int, free: int, damaged: int) -> bytes:
+        """Prometheus' text format. ``jobs`` by state, ``free`` in bytes."""
+        for state, count in jobs.items():
+            self.jobs.labels(state).set(count)
+        self.captures.set(captures)
+        self.free.set(free)
+        self.memory.set(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+        self.set_aside.set(damaged)
+        return generate_latest(self.registry)

@@ -1,18 +1,18 @@
 """Settings of the service: from the command line, from EIGENHEAD_* variables, or these defaults."""
 
 import json
-import os
 from pathlib import Path
 
-from pydantic import Field
+import sqlalchemy as sa
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from pipeline.eigenheads.data_folder import data_folder
+from server.address import is_loopback
+
 PREFIX = "EIGENHEAD_"
-
-
-def default_data() -> Path:
-    """``$XDG_DATA_HOME/eigenhead``, by default ~/.local/share/eigenhead."""
-    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share") / "eigenhead"
+RECONSTRUCT = ".tasks.reconstruct:reconstruct_capture"
+MOVED: dict[str, str] = {"server.work:reconstruct_capture": RECONSTRUCT}
 
 
 class ServiceSettings(BaseSettings):
@@ -20,10 +20,18 @@ class ServiceSettings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid")
 
-    data: Path = Field(default_factory=default_data, description="folder of captures, results and the job database")
+    data: Path = Field(default_factory=data_folder, description="folder of captures, results and the job database")
     database_url: str | None = Field(default=None, description="postgresql://...; without it SQLite in the data folder")
     host: str = "127.0.0.1"
     port: int = Field(default=8600, ge=0, le=65535)
+    public_url: str | None = Field(
+        default=None,
+        pattern=r"^https?://[^/?#\s]+$",
+        description="how browsers reach the service through a proxy, such as https://heads.example; needs an API key",
+    )
+    cors_origins: tuple[str, ...] = Field(
+        default=(), description="other web pages that may call the API with a key, such as https://lab.example"
+    )
     rig: Path | None = Field(default=None, description="rig.toml; without it the simulated studio")
 
     queue: str = Field(
@@ -32,7 +40,8 @@ class ServiceSettings(BaseSettings):
     queues: tuple[str, ...] = Field(default=("cpu", "gpu"), description="queues that a job may name")
     concurrency: int = Field(default=1, ge=1, le=64, description="jobs that one worker runs at once")
     work: str = Field(
-        default="server.work:reconstruct_capture", description="what a job runs in the worker's child process"
+        default=RECONSTRUCT,
+        description="what a job runs in the worker's child process",
     )
     heartbeat_s: float = Field(default=3.0, gt=0)
     silent_s: float = Field(
@@ -67,6 +76,22 @@ class ServiceSettings(BaseSettings):
     console: bool = Field(default=True, description="serve the operator's pages; they add 1.5 s to the start")
     log_json: bool = Field(default=False, description="log lines as JSON")
 
+    @field_validator("work")
+    @classmethod
+    def _present_place(cls, address: str) -> str:
+        """Where what a variable of an older version names lies now."""
+        return MOVED.get(address, address)
+
+    @property
+    def public_host(self) -> str | None:
+        """Host, and port where there is one, of ``public_url``."""
+        return None if self.public_url is None else self.public_url.partition("://")[2]
+
+    @property
+    def is_private(self) -> bool:
+        """Whether nobody but this machine's own people can reach the service, so that it may go without keys."""
+        return self.public_url is None and is_loopback(self.host)
+
     @property
     def url(self) -> str:
         """The database's URL in SQLAlchemy's form. PostgreSQL is told to end a session that idles inside a transaction:
@@ -80,6 +105,13 @@ class ServiceSettings(BaseSettings):
             rest += "&" if "?" in rest else "?"
             rest += f"options=-c%20idle_in_transaction_session_timeout%3D{round(self.silent_s * 1000)}"
         return f"postgresql+psycopg://{rest}"
+
+    @property
+    def place(self) -> str:
+        """Where keys and jobs are kept, as a person may read it: the data folder, or the database without password."""
+        if self.database_url is None:
+            return str(self.data.resolve())
+        return sa.make_url(self.url).render_as_string(hide_password=True).partition("?")[0]
 
     def environment(self) -> dict[str, str]:
         """The variables with which another process reads the same settings."""

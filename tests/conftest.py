@@ -6,16 +6,28 @@ from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+import hypothesis
 import pytest
+from jaxtyping import install_import_hook
 
-from rig.render.renderer import Renderer
+from tests.support.shape_checks import checked_modules
 
+install_import_hook(checked_modules(), "tests.support.shape_checks.check_types")
+
+from rig.render.renderer import Renderer  # noqa: E402 - after the hook
+
+hypothesis.settings.register_profile("eigenhead", deadline=None)  # an example may have to compile its loops first
+hypothesis.settings.load_profile("eigenhead")
+
+FAST = "not slow"  # shapes and types of every call are checked in these tests; the slow ones measure time, too
 ALLOWED_SKIPS = Path(__file__).with_name("allowed_skips.txt")
 
 
 @pytest.fixture(scope="session")
-def renderer() -> Iterator[Renderer]:
+def renderer() -> "Iterator[Renderer]":
     """The one renderer of the test session. Where EGL is missing the tests fail: `make setup` installs it."""
+    from rig.render.renderer import Renderer
+
     with Renderer.create() as shared_renderer:
         yield shared_renderer
 
@@ -76,6 +88,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if config.option.markexpr == FAST:  # before anything of the product is imported
+        install_import_hook(checked_modules(), "tests.support.shape_checks.check_types")
     if os.environ.get("CI") == "true":
         lines = ALLOWED_SKIPS.read_text(encoding="utf-8").splitlines()
         patterns = [line.split()[0] for line in lines if line.strip() and not line.startswith("#")]

@@ -103,7 +103,9 @@ def test_setup_is_quick_and_silent_where_nothing_is_to_do(tmp_path: Path) -> Non
     shutil.copytree(ROOT / "deploy", tmp_path / "deploy", ignore=shutil.ignore_patterns("firmware"))
     (tmp_path / ".venv" / "bin").mkdir(parents=True)
     (tmp_path / ".venv" / "bin" / "python").symlink_to(sys.executable)
-    stamp = 'echo "$(cat uv.lock pyproject.toml deploy/setup.sh | sha256sum) $PWD" > .venv/.ready'
+    stamp = (
+        'echo "$(cat uv.lock pyproject.toml deploy/setup.sh deploy/wheel_imports.py | sha256sum) $PWD" > .venv/.ready'
+    )
     subprocess.run(["bash", "-c", stamp], cwd=tmp_path, check=True)
     begun = time.perf_counter()
     outcome = setup(tmp_path)

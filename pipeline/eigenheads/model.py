@@ -10,7 +10,6 @@ per stored operator entry (13 MB). ``basis`` of a whole level is cached: 12 M V 
 
 import hashlib
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -22,7 +21,8 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.eigenheads.surface import boundary_vertices, refine, row_count
+from pipeline.eigenheads.data_folder import models_folder
+from pipeline.eigenheads.subdivision import boundary_vertices, refine, row_count
 from rig.errors import EigenheadError
 
 FORMAT = "eigenhead-model/1"
@@ -84,7 +84,7 @@ class HeadModel:
     landmarks: Mapping[str, int]  # 26 names to vertex indices of the full level (all lie in the cage)
     levels: Mapping[str, Level]  # full, p95, p99, cage
     figures: Mapping[str, float]  # what was measured when the model was built, e.g. generalisation_mm
-    scores: Float32[np.ndarray, "N M"]  # coefficients of the training heads; N = 0 where they are not known
+    scores: Float32[np.ndarray, "N C"]  # coefficients of the training heads; N = 0 where they are not known
     _bases: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
 
     def cage(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "V0 3"]:
@@ -138,7 +138,7 @@ class ModelParts:
     subdivisions: int
     decimated: Mapping[str, tuple[Int[np.ndarray, " K"], Int[np.ndarray, "G 3"]]]  # rows of full, faces
     figures: Mapping[str, float] = field(default_factory=dict)
-    scores: Float[np.ndarray, "N M"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    scores: Float[np.ndarray, "N C"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
 
 def assemble(parts: ModelParts, sha256: str) -> HeadModel:
@@ -268,12 +268,6 @@ def _parts(meta: dict, file: Mapping[str, np.ndarray]) -> ModelParts:
         figures=meta["figures"],
         scores=file["scores"],
     )
-
-
-def models_folder() -> Path:
-    """Where a user's own models live: ``EIGENHEAD_MODELS``, or ~/.local/share/eigenhead/models."""
-    given = os.environ.get("EIGENHEAD_MODELS")
-    return Path(given) if given else Path.home() / ".local" / "share" / "eigenhead" / "models"
 
 
 def list_models() -> dict[str, Path]:

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import alignment_search
-from pipeline.alignment_search import search_alignment
+from pipeline.alignment import silhouette_search
+from pipeline.alignment.silhouette_search import search_alignment
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, worn_silhouettes
@@ -23,10 +23,10 @@ from pipeline.fitting.contour import fit_contour
 from pipeline.settings import Settings
 from rig.errors import EigenheadError
 from rig.geometry import RigidTransform, Similarity, nearest_rotation, rotation_from_vector, vector_from_rotation
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
-from rig.studio.subject import random_look
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.subject import random_look
 
 TURN_DEG, OFF_MM = (30.0, 15.0, 15.0), 60.0  # yaw, pitch, roll; any direction
 RIGHT_DEG, RIGHT_MM = 2.0, 3.0
@@ -37,7 +37,7 @@ def alignment(
     folder: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Share of right alignments, their errors, and the seconds of the search."""
-    records = Records(folder, "alignment", key_of(model.sha256, Settings(), *CONTOUR, alignment_search))
+    records = Records(folder, "alignment", key_of(model.sha256, Settings(), *CONTOUR, silhouette_search))
     span, rows = with_modes(model, 60), []
     for seed in range(subjects):
         report(f"draw {seed}", seed / subjects)

@@ -16,9 +16,9 @@ from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
 from pipeline.fitting.contour import fit_contour
 from pipeline.settings import FittingSettings
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
 
 ARRIVED_MM = 0.3
 KINDS = {"section52": 0.8, "normal": None}  # coefficients within this, or not bounded

@@ -17,16 +17,18 @@ from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, mean_error_mm, random_subjects, worn_silhouettes
-from pipeline.fitting import objective, schedule, simplex
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.fit import Fit
-from pipeline.fitting.schedule import fit_simplex
+from pipeline.fitting.simplex import hierarchy as schedule
+from pipeline.fitting.simplex import nelder_mead as simplex
+from pipeline.fitting.simplex import xor_objective as objective
+from pipeline.fitting.simplex.hierarchy import fit_simplex
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import Silhouette
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.hair import HairStyle
-from rig.studio.layout import default_layout
+from rig.rig import Rig
+from rig.studio.scene.hair import HairStyle
+from rig.studio.scene.layout import default_layout
 
 STYLE = HairStyle(thickness_mm=16.0, over_ears=True, fringe_mm=8.0)
 UNFORGIVING_PX = 1e3

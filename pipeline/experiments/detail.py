@@ -24,31 +24,33 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
-from pipeline.eigenheads.closest import SurfaceIndex
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.surface import vertex_areas
+from pipeline.eigenheads.subdivision import vertex_areas
 from pipeline.experiments.records import Records, Row
 from pipeline.experiments.span import weighted_quantile
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.fitting.rim import find_rim, make_topology, pack_views
+from pipeline.imaging.cpu_raster import camera_depths, depth_maps
+from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
+from pipeline.multiview.visual_hull import visual_hull
 from pipeline.reconstruct import align, basis, fit_head, front_camera, without_moved_cameras
-from pipeline.segmentation import segment
 from pipeline.settings import Settings, document_from_settings
-from pipeline.texture import texture
-from pipeline.visual_hull import visual_hull
-from pipeline.zbuffer import camera_depths, depth_maps, interpolate, rasterise
+from pipeline.silhouettes.segment import segment
+from pipeline.texture.vertex_colours import texture
 from rig.camera import Camera
-from rig.capture import Capture, read_capture
-from rig.layout import Rig
+from rig.capture import Capture
+from rig.formats.capture_folder import read_capture
+from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh
-from rig.mesh_files import read_mesh
 from rig.render.renderer import Renderer
-from rig.studio.faults import Fault
-from rig.studio.layout import default_layout
-from rig.studio.preset import PRESET
-from rig.studio.simulate import simulate
-from rig.studio.subject import Subject
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import simulate
+from rig.studio.scene.subject import Subject
+from rig.studio.sensor.faults import Fault
+from rig.studio.sensor.preset import PRESET
 
 Report = Callable[[str, float], None]
 Level = Literal["span", "kernel", "photo"]

@@ -16,13 +16,15 @@ from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
-from pipeline.fitting import objective, schedule, simplex
 from pipeline.fitting.contour import fit_contour
-from pipeline.fitting.schedule import HierarchyLevel, fit_simplex
+from pipeline.fitting.simplex import hierarchy as schedule
+from pipeline.fitting.simplex import nelder_mead as simplex
+from pipeline.fitting.simplex import xor_objective as objective
+from pipeline.fitting.simplex.hierarchy import HierarchyLevel, fit_simplex
 from pipeline.settings import FittingSettings
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
 
 FULL, MIDDLE, COARSE = HierarchyLevel("full", 1.0), HierarchyLevel("p95", 0.5), HierarchyLevel("p99", 0.25)
 HIERARCHIES = {

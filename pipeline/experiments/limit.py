@@ -19,16 +19,16 @@ from scipy.spatial import KDTree
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_errors, random_subjects
 from pipeline.fitting.contour import fit_contour, schedule
-from pipeline.fitting.equations import evaluate, normal_equations
 from pipeline.fitting.fit import Fit
+from pipeline.fitting.head_problem import head_problem
 from pipeline.fitting.posterior import vertex_deviation_mm
-from pipeline.fitting.problem import PER_CAMERA, POSE, State, make_problem
+from pipeline.fitting.problem import PER_CAMERA, POSE, State, first_evidence, make_problem
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import Silhouette
-from rig.layout import Rig
 from rig.mesh import vertex_normals
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
 
 NOISES_PX, CORRELATION_PX = (0.3, 1.0), 2.0
 BAND_PX = 12.0  # the noise reaches this far: no rim sample is farther off at the end
@@ -99,8 +99,8 @@ def bound_mm(model: HeadModel, subject: Planted, clean: dict[str, Silhouette], r
     stage = replace(schedule(settings, len(model.modes))[-1], whole_head=True)
     problem = make_problem(model, subject.world_from_head, clean, rig, settings, {})
     state = State(subject.coefficients, subject.world_from_head, np.zeros((len(rig), PER_CAMERA)))
-    rim = evaluate(problem, state, stage, UNROBUST_PX, None).rim
-    matrix, _ = normal_equations(problem, state, rim, stage, UNROBUST_PX)
+    whole = head_problem(problem, first_evidence(settings), stage, UNROBUST_PX)
+    matrix = whole.equations(whole.at(state)).matrix
     kept = stage.modes + POSE
     fit = Fit("bound", subject.coefficients, subject.world_from_head, 0, "", np.linalg.inv(matrix)[:kept, :kept])
     return rms_deviation_mm(model, fit)

@@ -35,22 +35,22 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from pipeline.eigenheads.closest import SurfaceIndex
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown, soft_rasteriser
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, subjects_of_section_5_2
-from pipeline.fitting import objective
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.fit import Fit
-from pipeline.fitting.objective import SilhouetteObjective
-from pipeline.fitting.schedule import HIERARCHY, LIMIT, MU, TOLERANCE
+from pipeline.fitting.simplex import xor_objective as objective
+from pipeline.fitting.simplex.hierarchy import HIERARCHY, LIMIT, MU, TOLERANCE
+from pipeline.fitting.simplex.xor_objective import SilhouetteObjective
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.visual_hull import visual_hull
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import Silhouette
-from pipeline.visual_hull import visual_hull
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
 
 MODES = 60
 CHECKED_EVERY = 10  # moves of scipy's simplex after which its spread is looked at

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.overlays import PAPER, ImageRgb, contact_sheet, difference
-from pipeline.zbuffer import picture
+from pipeline.imaging.cpu_raster import picture
+from pipeline.results.overlays import PAPER, ImageRgb, contact_sheet, difference
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.mesh import Mesh

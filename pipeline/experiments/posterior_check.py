@@ -23,11 +23,11 @@ from pipeline.experiments.limit import CORRELATION_PX, UNROBUST_PX, settings_for
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_rows, random_subjects
 from pipeline.fitting.contour import run_stage
-from pipeline.fitting.equations import apply_step, evaluate, normal_equations
-from pipeline.fitting.problem import PER_CAMERA, POSE, Problem, Stage, State, make_problem
-from rig.layout import Rig
+from pipeline.fitting.head_problem import apply_step, head_problem, started_problem
+from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, State, first_evidence, make_problem
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
 
 NOISE_PX = 0.3
 BETA = 0.2  # of a proposal
@@ -66,10 +66,10 @@ def _row(model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, numbe
     problem = make_problem(model, subject.start, noisy, rig, settings_for(NOISE_PX), {}, levels=("p95",))
     stage = Stage("p95", len(model.modes), False, (20.0, 6.0, UNROBUST_PX), True, True, 12)
     state = State(np.zeros(0), subject.start, np.zeros((len(rig), PER_CAMERA)))
-    mode, _, _ = run_stage(problem, state, stage, lambda fraction: None)
-    outline = evaluate(problem, mode, stage, UNROBUST_PX, None).rim
-    matrix, _ = normal_equations(problem, mode, outline, stage, UNROBUST_PX)
-    covariance = np.linalg.inv(matrix)
+    evidence = first_evidence(problem.settings)
+    mode, _, _ = run_stage(problem, evidence, state, stage, lambda fraction: None)
+    whole = head_problem(problem, evidence, stage, UNROBUST_PX)
+    covariance = np.linalg.inv(whole.equations(whole.at(mode)).matrix)
     chain = run_chain(problem, mode, stage, covariance, rng)
     found, laplace = np.cov(chain.draws.T), covariance
     ratio = np.sqrt(np.diag(found) / np.diag(laplace))
@@ -88,7 +88,7 @@ def _row(model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, numbe
 
 
 def run_chain(
-    problem: Problem,
+    problem: ContourProblem,
     mode: State,
     stage: Stage,
     covariance: Float[np.ndarray, "p p"],
@@ -97,12 +97,12 @@ def run_chain(
 ) -> Chain:
     """The chain from the mode; the first ``FORGOTTEN`` draws are dropped."""
     factor = np.linalg.cholesky(covariance)
-    length = float(evaluate(problem, mode, stage, UNROBUST_PX, None).rim.length.sum())
+    whole, _ = started_problem(problem, first_evidence(problem.settings), stage, UNROBUST_PX, mode)
 
     def beyond(white: Float[np.ndarray, " p"]) -> float:
         """Negative log density at ``mode + factor @ white``, less that of N(mode, covariance)."""
         state = apply_step(mode, factor @ white, replace(stage, cameras=False))
-        return 0.5 * evaluate(problem, state, stage, UNROBUST_PX, length).cost - 0.5 * float(white @ white)
+        return 0.5 * whole.at(state).cost - 0.5 * float(white @ white)
 
     now = np.zeros(len(covariance))
     there, accepted, draws = beyond(now), 0, []

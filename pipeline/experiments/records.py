@@ -8,13 +8,29 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.fitting import clutter, contour, equations, misfit, problem, rim, rim_loops
-from rig.files import write_atomically
+from pipeline.estimation import levenberg_marquardt, terms
+from pipeline.fitting import (
+    clutter,
+    contour,
+    feature_term,
+    head_problem,
+    noise_model,
+    prior_term,
+    problem,
+    rim,
+    rim_jacobian_kernels,
+    rim_kernels,
+    rim_term,
+)
+from rig.atomic_write import write_atomically
 
 Row = dict[str, Any]
 
 # What rows of the contour solver depend on, for keys.
-CONTOUR = (contour, problem, equations, clutter, misfit, rim, rim_loops)
+CONTOUR = (
+    *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, feature_term, prior_term),
+    *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels),
+)
 
 
 class Records:

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline import agreement, drift
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import limit, markdown
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
@@ -43,16 +42,18 @@ from pipeline.experiments.subjects import (
     worn_silhouettes,
 )
 from pipeline.fitting.contour import fit_contour
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.multiview import camera_drift as drift
 from pipeline.reconstruct import without_moved_cameras
-from pipeline.segmentation import segment
 from pipeline.settings import FittingSettings, Settings
-from pipeline.silhouette import Silhouette, silhouette_from_mask
+from pipeline.silhouettes import view_consistency as agreement
+from pipeline.silhouettes.segment import segment
 from rig.capture import Capture
 from rig.geometry import RigidTransform, rotation_from_vector
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.hair import HairStyle
-from rig.studio.layout import default_layout
+from rig.rig import Rig
+from rig.studio.scene.hair import HairStyle
+from rig.studio.scene.layout import default_layout
 
 OVER_EARS = HairStyle(thickness_mm=18.0, over_ears=True)
 FRINGE = HairStyle(thickness_mm=14.0, fringe_mm=16.0)

@@ -20,13 +20,13 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
-from numba import njit
 
+from pipeline.compiled import njit
 from pipeline.eigenheads.model import HeadModel
-from pipeline.silhouette import Silhouette
+from pipeline.imaging.silhouette import Silhouette
 from rig.geometry import Similarity
-from rig.layout import Rig
 from rig.render.renderer import Renderer
+from rig.rig import Rig
 
 REACH = 3.0  # sigmas beyond which a triangle does not count: sigmoid(-9) is 1e-4
 NOISE = 0.3  # of a pixel's coverage: what a unit of the prior is weighed against

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.eigenheads.correspondence.surface_fit import SurfaceFit, fit_surface
 from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.pca import rigid_fit
-from pipeline.eigenheads.surface import vertex_areas
-from pipeline.eigenheads.surface_fit import SurfaceFit, fit_surface
-from pipeline.eigenheads.worth import of_draws
+from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.eigenheads.training.model_metrics import of_draws
 from rig.errors import InputError
+from rig.formats.mesh_file import read_mesh
 from rig.geometry import RigidTransform
-from rig.mesh_files import read_mesh
 
 Report = Callable[[str, float], None]
 

@@ -13,14 +13,14 @@ from jaxtyping import Float
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.problem import camera_information
-from pipeline.silhouette import Silhouette, silhouette_from_mask
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
-from rig.layout import Rig
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
-from rig.studio.anatomy import anatomy
-from rig.studio.clothes import shirt
-from rig.studio.hair import HairStyle, grow
+from rig.rig import Rig
+from rig.studio.scene.anatomy import anatomy
+from rig.studio.scene.clothes import shirt
+from rig.studio.scene.hair import HairStyle, grow
 
 SPREAD = 0.8  # section 5.2: Gaussian within +-0.8 standard deviations
 TURN, SHIFT_MM = 0.06, 8.0  # a seated subject: standard deviation of its pose

@@ -18,17 +18,19 @@ from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown, pictures
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, subjects_of_section_5_2
-from pipeline.fitting import objective, schedule, simplex
 from pipeline.fitting.contour import fit_contour
 from pipeline.fitting.fit import Fit
-from pipeline.fitting.schedule import fit_simplex
+from pipeline.fitting.simplex import hierarchy as schedule
+from pipeline.fitting.simplex import nelder_mead as simplex
+from pipeline.fitting.simplex import xor_objective as objective
+from pipeline.fitting.simplex.hierarchy import fit_simplex
+from pipeline.imaging.silhouette import xor_cost
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import xor_cost
 from rig.geometry import Similarity
-from rig.layout import Rig
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
-from rig.studio.layout import arrangement, default_layout
+from rig.rig import Rig
+from rig.studio.scene.layout import arrangement, default_layout
 
 Report = Callable[[str, float], None]
 STATISTICS = {"min": np.min, "max": np.max, "mean": np.mean, "median": np.median, "std": np.std}

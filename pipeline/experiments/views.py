@@ -21,14 +21,14 @@ from pipeline.experiments.limit import UNROBUST_PX, settings_for
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, face_rows, mean_error_mm, random_subjects, worn_silhouettes
 from pipeline.fitting.contour import fit_contour
-from pipeline.fitting.equations import evaluate, normal_equations
-from pipeline.fitting.problem import PER_CAMERA, POSE, Stage, State, make_problem
+from pipeline.fitting.head_problem import head_problem
+from pipeline.fitting.problem import PER_CAMERA, POSE, Stage, State, first_evidence, make_problem
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import Silhouette
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.hair import HairStyle
-from rig.studio.layout import ARRANGEMENTS_DEG, rig_from_directions
+from rig.rig import Rig
+from rig.studio.scene.hair import HairStyle
+from rig.studio.scene.layout import ARRANGEMENTS_DEG, rig_from_directions
 
 CANDIDATES_DEG = tuple((a, e) for e in range(-40, 41, 20) for a in range(-90, 91, 15))
 VIEWS = 11
@@ -113,8 +113,8 @@ def information(model: HeadModel, head: Planted, rig: Rig) -> Information:
         flat = np.zeros((k.height, k.width), np.float32)  # no residual: the head is where the contour is
         seen = {camera.name: Silhouette(flat < 0, flat)}
         problem = make_problem(model, pose, seen, Rig((camera,)), settings, {}, levels=(stage.level,))
-        outline = evaluate(problem, state, stage, UNROBUST_PX, None).rim
-        matrix, _ = normal_equations(problem, state, outline, stage, UNROBUST_PX)
+        whole = head_problem(problem, first_evidence(settings), stage, UNROBUST_PX)
+        matrix = whole.equations(whole.at(state)).matrix
         found.append(matrix - prior(model))
     return np.stack(found)
 
@@ -131,7 +131,7 @@ def face_quadratic(model: HeadModel, head: Planted) -> Float[np.ndarray, "p p"]:
 
 
 def a_optimal(
-    heads: Sequence[tuple[Information, Float[np.ndarray, "p p"]]], count: int, before: Float[np.ndarray, "p p"]
+    heads: Sequence[tuple[Information, Float[np.ndarray, "_ _"]]], count: int, before: Float[np.ndarray, "p p"]
 ) -> list[int]:
     """Indices of ``count`` views with the least mean of ``tr(G (sum I_k + prior)^-1)``: greedily, then by exchanges.
 

@@ -1,1 +1,5 @@
-"""Fitting a head to silhouettes (section 4): one solver a module, one ``Fit`` for both."""
+"""The shape from silhouettes and photographs (section 4).
+
+Enters: a head model, ``world_from_head``, silhouettes, the rig. Leaves: a ``Fit`` (coefficients, pose, covariance). The
+contour solver is the default; ``simplex`` is the paper's.
+"""

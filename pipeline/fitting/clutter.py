@@ -1,4 +1,4 @@
-"""Hair, shoulders and clothes only ever add area to a silhouette: which stretches of a rim may not speak for that."""
+"""Hair, shoulders and clothes only ever add area to a silhouette: which stretches of a rim do not count for that."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.fitting.problem import Problem
+from pipeline.fitting.problem import ContourProblem, StageEvidence
 from pipeline.fitting.rim import Rim
 
 CLUTTER_PX, CLUTTER_SIGMAS = 3.0, 3.0  # the input lies outside the model by more: hair, ears, collar
@@ -14,20 +14,21 @@ OUTSIDE_SHARE = 0.3  # weight of a rim outside the face that sticks out: a model
 CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found: its border slides with the fit
 
 
-def held_inside(problem: Problem, rim: Rim, level: str) -> Rim:
+def held_inside(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
     """The rim where cranium, ears and neck only count as far as they stick out of the input."""
-    face = face_of(problem, level)[rim.corner].all(axis=1)
+    face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
     return replace(rim, length=np.where(face, rim.length, share * rim.length))
 
 
-def face_of(problem: Problem, level: str) -> Bool[np.ndarray, " v"]:
+def face_of(problem: ContourProblem, evidence: StageEvidence, level: str) -> Bool[np.ndarray, " v"]:
     """The face region, less what is known to lie under hair."""
     region = problem.model.levels[level].face_region
-    return region & ~problem.hair[level] if level in problem.hair else region
+    hair = {} if evidence.photographs is None else evidence.photographs.hair
+    return region & ~hair[level] if level in hair else region
 
 
-def find_clutter(problem: Problem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
+def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
     """Cells of every view where the input lies outside the model by more than the threshold, and around them."""
     maps = []
     for k, (width, height) in enumerate(problem.views.size):
@@ -39,13 +40,13 @@ def find_clutter(problem: Problem, rim: Rim, threshold_px: float) -> tuple[Bool[
     return tuple(maps)
 
 
-def without_clutter(problem: Problem, rim: Rim) -> Rim:
+def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
     """The rim with no weight where the input is clutter."""
-    if problem.clutter is None:
+    if evidence.noise.clutter is None:
         return rim
     cell = (rim.pixel / CELL_PX).astype(int)
     length = rim.length.copy()
-    for k, cells in enumerate(problem.clutter):
+    for k, cells in enumerate(evidence.noise.clutter):
         here = np.flatnonzero(rim.view == k)
         length[here[cells[cell[here, 1], cell[here, 0]]]] = 0.0
     return replace(rim, length=length)

@@ -1,7 +1,7 @@
 """The contour solver: Levenberg-Marquardt on the rim (section 4.4's problem, another cost and another minimiser).
 
 In: the silhouettes' signed distances, a start pose, feature points where there are any. Out: coefficients, pose, camera
-corrections, and their covariance (equations.py has the cost and its derivatives). The robust scale shrinks step by
+corrections, and their covariance (each ``*_term`` has its equation). The robust scale shrinks step by
 step, which carries the fit over clutter from a start that is 20 px off; while it is coarse, the prior holds the shape.
 """
 
@@ -9,18 +9,30 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.equations import apply_step, evaluate, normal_equations
+from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.fitting.fit import Fit
-from pipeline.fitting.misfit import is_bare, with_misfit
-from pipeline.fitting.problem import FIRST_CORRELATION_PX, POSE, Problem, Stage, State, make_problem, start_state
+from pipeline.fitting.head_problem import started_problem
+from pipeline.fitting.noise_model import is_bare, with_misfit
+from pipeline.fitting.problem import (
+    FIRST_CORRELATION_PX,
+    POSE,
+    ContourProblem,
+    RimNoise,
+    Stage,
+    StageEvidence,
+    State,
+    first_evidence,
+    make_problem,
+    start_state,
+)
+from pipeline.fitting.rim_term import observed_rim
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import Silhouette
 from rig.geometry import Similarity
-from rig.layout import Rig
+from rig.rig import Rig
 
 TRIES = 3  # of a step, each with a hundred times the damping
 NON_MONOTONE = 4  # costs that a step may climb back to
@@ -30,7 +42,8 @@ NON_MONOTONE = 4  # costs that a step may climb back to
 class Solved:
     """A problem with its solution, from which others may go on."""
 
-    problem: Problem
+    problem: ContourProblem
+    evidence: StageEvidence
     state: State
     stage: Stage  # the last one
     evaluations: int
@@ -68,24 +81,24 @@ def solve_contour(
     """``fit_contour`` without its covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {})
     few, span, whole, *rest = schedule(settings, len(model.modes))
-    state = start_state(problem, world_from_head)
-    state, spent, reason = run_stage(problem, state, few, lambda f: report("fit", 0.2 * f))
-    state, used, reason = run_stage(problem, state, span, lambda f: report("fit", 0.2 + 0.2 * f))
-    tried, more, _ = run_stage(problem, state, whole, lambda f: report("fit", 0.4 + 0.1 * f))
+    evidence, state = first_evidence(settings), start_state(problem, world_from_head)
+    state, spent, reason = run_stage(problem, evidence, state, few, lambda f: report("fit", 0.2 * f))
+    state, used, reason = run_stage(problem, evidence, state, span, lambda f: report("fit", 0.2 + 0.2 * f))
+    tried, more, _ = run_stage(problem, evidence, state, whole, lambda f: report("fit", 0.4 + 0.1 * f))
     spent += used + more
-    bare = is_bare(problem, tried, whole, state)
+    bare = is_bare(problem, evidence, tried, whole, state)
     if bare:
         state, span = tried, whole
-    problem = with_misfit(problem, state, span)
+    evidence = with_misfit(problem, evidence, state, span)
     stage = span
     for i, stage in enumerate(rest):
         stage = replace(stage, whole_head=bare)
         state, used, reason = run_stage(
-            problem, state, stage, lambda f, i=i: report("fit", 0.5 + 0.5 * (i + f) / len(rest))
+            problem, evidence, state, stage, lambda f, i=i: report("fit", 0.5 + 0.5 * (i + f) / len(rest))
         )
         spent += used
-        problem = with_misfit(problem, state, stage)
-    return Solved(problem, state, stage, spent, reason)
+        evidence = with_misfit(problem, evidence, state, stage)
+    return Solved(problem, evidence, state, stage, spent, reason)
 
 
 def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
@@ -103,52 +116,33 @@ def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
     ]
 
 
-def run_stage(problem: Problem, state: State, stage: Stage, report: Callable[[float], None]) -> tuple[State, int, str]:
-    """Levenberg-Marquardt through the robust scales of one stage: state, evaluations, why it stopped."""
+def run_stage(
+    problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, report: Callable[[float], None]
+) -> tuple[State, int, str]:
+    """Levenberg-Marquardt through the robust scales of one stage: state, evaluations, why it stopped.
+
+    The set of rim samples changes with the state, which makes the cost slightly uneven: strict descent was seen to stop
+    at ridges 0.3 mm from the minimum, so that a step may climb back a little.
+    """
     few = state.coefficients[: stage.modes]
     state = replace(state, coefficients=np.concatenate([few, np.zeros(stage.modes - len(few))]))
+    limits = Limits(stage.steps, problem.settings.tolerance, TRIES, NON_MONOTONE)
     evaluations, reason = 0, "step limit"
     for i, scale in enumerate(stage.scales_px):
         report(i / len(stage.scales_px))
-        coarse = scale > problem.settings.robust_px
-        unit = max(problem.unit, coarse_unit(scale)) if coarse else problem.unit
-        state, used, reason = _descend(replace(problem, unit=unit), state, stage, max(scale, problem.floor_px))
-        evaluations += used
+        seen = coarsened(evidence, scale) if scale > problem.settings.robust_px else evidence
+        whole, at_start = started_problem(problem, seen, stage, max(scale, evidence.noise.floor_px), state)
+        found = minimise(whole, state, limits, at_start=at_start)
+        state, reason = found.value, found.evidence.stopped_because
+        evaluations += found.evidence.evaluations
     return state, evaluations, reason
 
 
-def _descend(problem: Problem, state: State, stage: Stage, scale_px: float) -> tuple[State, int, str]:
-    """Levenberg-Marquardt at one robust scale.
-
-    The set of rim samples changes with the state, which makes the cost slightly uneven: strict descent was seen to stop
-    at ridges 0.3 mm from the minimum. So a step may climb back to the worst of the last costs (Grippo, Lampariello and
-    Lucidi 1986), and the best state is returned.
-    """
-    damping = 1e-3
-    now = best = evaluate(problem, state, stage, scale_px, None)
-    best_state = state
-    evaluations, recent = 1, [now.cost]
-    reference = float(now.rim.length.sum())
-    for _ in range(stage.steps):
-        matrix, gradient = normal_equations(problem, state, now.rim, stage, scale_px)
-        for _ in range(TRIES):
-            damped = matrix + damping * np.diag(np.diag(matrix))
-            step = -scipy.linalg.solve(damped, gradient, assume_a="pos", check_finite=False)
-            moved = apply_step(state, step, stage)
-            then = evaluate(problem, moved, stage, scale_px, reference)
-            evaluations += 1
-            if then.cost < max(recent[-NON_MONOTONE:]):
-                break
-            damping = max(damping * 100.0, 1e-2)
-        else:
-            return best_state, evaluations, "no step lowers the cost"
-        state, now, damping = moved, then, max(damping * 0.1, 1e-7)
-        recent.append(now.cost)
-        if now.cost < best.cost:
-            best, best_state = now, state
-        if -float(gradient @ step) < problem.settings.tolerance:  # predicted fall: the step is short in its own sigma
-            return best_state, evaluations, "converged"
-    return best_state, evaluations, "step limit"
+def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
+    """The evidence while residuals of that scale are let in: half of them counts as noise."""
+    noise = evidence.noise
+    unit = max(noise.unit, coarse_unit(scale_px))
+    return StageEvidence(RimNoise(unit, noise.floor_px, noise.clutter), evidence.photographs)
 
 
 def coarse_unit(scale_px: float) -> float:
@@ -160,11 +154,11 @@ def coarse_unit(scale_px: float) -> float:
 def finish(solved: Solved) -> Fit:
     """The fit with its Laplace covariance: the inverse of the last normal matrix, cameras marginalised."""
     problem, state, stage = solved.problem, solved.state, solved.stage
-    scale = max(stage.scales_px[-1], problem.floor_px)
-    rim = evaluate(problem, state, stage, scale, None).rim
-    matrix, _ = normal_equations(problem, state, rim, stage, scale)
+    scale = max(stage.scales_px[-1], solved.evidence.noise.floor_px)
+    whole, there = started_problem(problem, solved.evidence, stage, scale, state)
     kept = stage.modes + POSE
-    covariance = np.linalg.inv(matrix)[:kept, :kept]
+    covariance = np.linalg.inv(whole.equations(there).matrix)[:kept, :kept]
+    rim = observed_rim(problem, solved.evidence, state, stage)
     names = problem.views.names
     return Fit(
         method="contour",

@@ -1,7 +1,7 @@
 """What the contour solver works on: its state, the stages of its schedule, and all that stays fixed during a fit."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -10,12 +10,11 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.rim import Topology, Views, make_topology, pack_views
-from pipeline.fitting.surface import SurfaceObservations
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import Silhouette
 from rig.camera import Camera
 from rig.geometry import Similarity, rotation_from_vector
-from rig.layout import Rig
+from rig.rig import Rig
 
 POSE = 7  # rotation, translation, log scale
 PER_CAMERA = 6  # rotation, translation
@@ -39,8 +38,8 @@ class Stage:
     modes: int
     cameras: bool  # are the cameras solved for as well?
     scales_px: tuple[float, ...]  # robust scale, step by step
-    whole_head: bool  # may rims outside the face region speak?
-    contained: bool  # may they at least speak where they stick out of the input, as no hair explains?
+    whole_head: bool  # do rims outside the face region count?
+    contained: bool  # do they at least count where they stick out of the input, as no hair explains?
     steps: int  # Levenberg-Marquardt steps at most, at each scale
 
 
@@ -73,7 +72,7 @@ class LevelBasis:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class ContourProblem:
     """Everything that stays fixed during a fit."""
 
     model: HeadModel
@@ -84,11 +83,56 @@ class Problem:
     camera_information: Float[np.ndarray, "k 6 6"]  # inverse prior covariance
     features: Observed | None
     settings: FittingSettings
-    unit: float  # l sigma^2 (px^3): what a px^2 of residual along a px of outline is divided by
-    floor_px: float = 0.0  # no robust scale below this: three standard deviations of the model's misfit
-    clutter: tuple[Bool[np.ndarray, "_ _"], ...] | None = None  # per view, in cells: where the input is hair or clothes
-    surface: SurfaceObservations | None = None  # what photographs say between the rims
-    hair: Mapping[str, Bool[np.ndarray, " v"]] = field(default_factory=dict)  # by level: whose outline is hair's
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceObservations:
+    """n observations of vertices of the full level; K cameras in the order of the solver's views."""
+
+    vertex: Int[np.ndarray, " n"]
+    basis: Float32[np.ndarray, "m n 3"]  # the model's modes at those vertices, head frame
+    mean: Float[np.ndarray, "n 3"]  # the mean head there
+    normal: Float[np.ndarray, "n 3"]  # world, unit
+    seen_at: Float[np.ndarray, "n 3"]  # world, mm: where the vertex stood
+    displacement: Float[np.ndarray, " n"]  # mm along the normal
+    information: Float[np.ndarray, " n"]  # mm^-2
+    by_camera: Float[np.ndarray, "n c"]  # c = 6 K
+    camera_shift: Float[np.ndarray, "k 6"]  # when observed
+    camera_matrix: Float[np.ndarray, "c c"]
+    camera_gradient: Float[np.ndarray, " c"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RimNoise:
+    """How far an outline may be believed. ``unit``: l sigma^2 (px^3), what a px^2 of residual along a px of outline is
+    divided by; ``floor_px``: no robust scale below this, three standard deviations of the model's misfit; ``clutter``:
+    per view, in cells, where the input is hair or clothes, None where nobody has looked."""
+
+    unit: float
+    floor_px: float
+    clutter: tuple[Bool[np.ndarray, "_ _"], ...] | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoEvidence:
+    """What photographs say between the rims, and by level which vertices' outline is hair's."""
+
+    surface: SurfaceObservations
+    hair: Mapping[str, Bool[np.ndarray, " v"]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageEvidence:
+    """What has been found out by the time a stage begins."""
+
+    noise: RimNoise
+    photographs: PhotoEvidence | None = None
+
+
+def first_evidence(settings: FittingSettings) -> StageEvidence:
+    """Before any residual has been seen: noise as stated, or that of a model that does not quite fit."""
+    noise, length = settings.contour_noise_px or FIRST_NOISE_PX, settings.contour_correlation_px
+    return StageEvidence(RimNoise(noise**2 * (length or FIRST_CORRELATION_PX), 0.0, None))
 
 
 def make_problem(
@@ -99,7 +143,7 @@ def make_problem(
     settings: FittingSettings,
     features: Mapping[str, Mapping[str, np.ndarray]],
     levels: tuple[str, ...] = ("p95", "full"),
-) -> Problem:
+) -> ContourProblem:
     """Packs what stays fixed. Raises ValueError if no silhouette is usable."""
     usable = {name: s.distance for name, s in silhouettes.items() if s.quality.usable and name in rig}
     views = pack_views(rig, usable)
@@ -107,7 +151,7 @@ def make_problem(
     topologies = {name: level_topology(model, name) for name in levels}
     depths = [camera.camera_from_world.apply(world_from_head.translation)[2] for camera in rig]
     information = [camera_information(c, z, settings.calibration_px) for c, z in zip(rig, depths, strict=True)]
-    return Problem(
+    return ContourProblem(
         model=model,
         rig=rig,
         views=views,
@@ -116,8 +160,6 @@ def make_problem(
         camera_information=np.stack(information),
         features=pack_features(model, views.names, features),
         settings=settings,
-        unit=(settings.contour_noise_px or FIRST_NOISE_PX) ** 2
-        * (settings.contour_correlation_px or FIRST_CORRELATION_PX),
     )
 
 
@@ -180,7 +222,7 @@ def landmark_basis(
     return mean, model.basis("full", len(model.modes), vertex)
 
 
-def widened(problem: Problem, model: HeadModel, levels: tuple[str, ...]) -> Problem:
+def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
     """The same problem with a model of the same mesh that has more modes, solved on ``levels``."""
     features = problem.features
     if features is not None:
@@ -190,11 +232,11 @@ def widened(problem: Problem, model: HeadModel, levels: tuple[str, ...]) -> Prob
     return replace(problem, model=model, bases=bases, features=features)
 
 
-def start_state(problem: Problem, world_from_head: Similarity) -> State:
+def start_state(problem: ContourProblem, world_from_head: Similarity) -> State:
     return State(np.zeros(0), world_from_head, np.zeros((len(problem.views.names), PER_CAMERA)))
 
 
-def moved_views(problem: Problem, state: State) -> Views:
+def moved_views(problem: ContourProblem, state: State) -> Views:
     """The views with the cameras where the state has them."""
     if not state.camera_shift.any():
         return problem.views

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
-from pipeline.fitting.rim_loops import normals_and_planes, projected_with_slopes, see, swept
-from pipeline.fitting.threads import in_threads
-from pipeline.lens import packed_lens
-from rig.layout import Rig
+from pipeline.fitting.rim_kernels import normals_and_planes, projected_with_slopes, see, swept
+from pipeline.imaging.projection import packed_lens
+from pipeline.parallel_for import in_threads
+from rig.rig import Rig
 
 SAMPLES_MOST = 6000  # rim samples of one view; a full head has about 1,000
 VIEWS_A_WORD = 64  # views that are swept together, a bit each
@@ -140,7 +140,7 @@ def _outlines(
     views: Views,
     some: slice,
     averaged: bool,
-) -> list[tuple[Int32[np.ndarray, "n 2"], Float[np.ndarray, "n 13"]]]:
+) -> list[tuple[Int32[np.ndarray, "_ 2"], Float[np.ndarray, "_ 13"]]]:
     """Of each view, at most VIEWS_A_WORD: corners, and the columns of ``Rim`` from the blend on.
 
     Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.

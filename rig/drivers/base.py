@@ -11,8 +11,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from rig.config import CameraConfig
 from rig.errors import EigenheadError
+from rig.formats.rig_toml import CameraConfig
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 
@@ -34,6 +34,7 @@ class Frame:
     sequence: int
 
 
+@runtime_checkable
 @runtime_checkable
 class Driver(Protocol):
     """One camera. Everything but ``close`` may raise DriverError; ``close`` never does and may be called twice."""
@@ -113,6 +114,6 @@ def grab_frame(driver: Driver, timeout_s: float) -> Frame:
     return Frame(driver.retrieve(), arrival.time_s, arrival.sequence)
 
 
-def upright(image: ImageRgb, rotation_deg: int) -> ImageRgb:
+def upright(image: ImageRgb, rotation_deg: int) -> UInt8[np.ndarray, "_ _ 3"]:
     """The picture turned clockwise by a multiple of 90 degrees."""
     return np.ascontiguousarray(np.rot90(image, -rotation_deg // 90)) if rotation_deg else image

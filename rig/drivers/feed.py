@@ -11,8 +11,8 @@ from collections import deque
 from dataclasses import dataclass
 from statistics import median
 
-from rig.config import CameraConfig
 from rig.drivers.base import Arrival, CameraLost, Driver, DriverError, Frame, GrabTimeout, upright
+from rig.formats.rig_toml import CameraConfig
 
 _SLICE_S = 0.2  # how long a grab may hold up closing
 _SOFTWARE_SLICE_S = 0.02  # and the command to a camera that is triggered by software

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from rig.config import CameraConfig
 from rig.drivers.aravis import AUTO_OFF, BUFFER_SUCCESS, PACKET_SOCKET_DISABLED, Aravis, AravisError, library
 from rig.drivers.base import (
     Arrival,
@@ -25,6 +24,7 @@ from rig.drivers.base import (
     GrabTimeout,
     ImageRgb,
 )
+from rig.formats.rig_toml import CameraConfig
 
 _BUFFERS = 4
 _SOURCES = {"external": b"Line1", "software": b"Software"}

@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rig.config import CameraConfig
 from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout, ImageRgb
 from rig.drivers.opencv import decode_jpeg
+from rig.formats.rig_toml import CameraConfig
 
 # Two cameras that open at once would both walk the USB bus and claim each other's interface.
 _bus = threading.Lock()

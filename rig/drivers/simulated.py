@@ -2,17 +2,17 @@
 
 ``identity`` is a head's mesh file, relative to rig.toml, and after a # the studio's camera if it has another name:
 the head sits in the default studio, and each camera photographs it at its rate. For cameras that are devices, with a
-trigger box, serve the studio (rig.studio.serve).
+trigger box, serve the studio (rig.studio.devices.serve).
 """
 
 import time
 from pathlib import Path
 
-from rig.config import CameraConfig
 from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, ImageRgb
-from rig.drivers.pace import Pace
+from rig.drivers.frame_clock import Pace
 from rig.errors import InputError
-from rig.studio.sources import ImageSource, SceneImages, scene_of_file
+from rig.formats.rig_toml import CameraConfig
+from rig.studio.devices.sources import ImageSource, SceneImages, scene_of_file
 
 _FPS = 10.0
 

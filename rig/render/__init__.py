@@ -1,1 +1,1 @@
-"""Drawing meshes into calibrated, distorted views with OpenGL on EGL; the only place that knows of OpenGL."""
+"""Drawing with OpenGL on EGL: the one room that knows moderngl."""

@@ -6,10 +6,10 @@ import moderngl
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from rig.layout import Rig
 from rig.mesh import Mesh
-from rig.render.atlas import INSTANCE_FORMAT, INSTANCE_NAMES, Page, box_points, depth_range, instances, pack
 from rig.render.context import GlContext, Owned
+from rig.render.tile_packing import INSTANCE_FORMAT, INSTANCE_NAMES, Page, box_points, depth_range, instances, pack
+from rig.rig import Rig
 
 GREY = 190
 

@@ -13,16 +13,18 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterator
-from importlib import resources
+from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
 import moderngl
 
 from rig.errors import EigenheadError
 
+SHADERS = Path(__file__).with_name("shaders")
 CLIP_PLANES = range(0x3000, 0x3006)  # GL_CLIP_DISTANCE0 and on, as many as shaders/camera.glsl writes
 
 
+@runtime_checkable
 @runtime_checkable
 class Releasable(Protocol):
     def release(self) -> None: ...
@@ -135,5 +137,5 @@ class GlContext:
 
 def shader_source(name: str) -> str:
     """The text of ``shaders/<name>``; a line ``#include <file>`` stands for that file."""
-    lines = (resources.files("rig.render") / "shaders" / name).read_text(encoding="utf-8").splitlines()
+    lines = (SHADERS / name).read_text(encoding="utf-8").splitlines()
     return "\n".join(shader_source(line.split()[1]) if line.startswith("#include") else line for line in lines)

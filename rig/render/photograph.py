@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from rig.camera import Camera
-from rig.layout import Rig
-from rig.render.atlas import INSTANCE_FORMAT, INSTANCE_NAMES, box_points, depth_range, instances, pack
 from rig.render.context import GlContext, Owned
+from rig.render.tile_packing import INSTANCE_FORMAT, INSTANCE_NAMES, box_points, depth_range, instances, pack
+from rig.rig import Rig
 
 NOISE_CELLS = 64
 VERTEX_ROW = 1024

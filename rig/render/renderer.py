@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rig.layout import Rig
 from rig.mesh import Mesh
 from rig.render.colour import UNLIT, Light, draw_colour
 from rig.render.context import GlContext
 from rig.render.depth import draw_depth
 from rig.render.photograph import Gallery, Part, draw_photographs, draw_vertex_radiance
 from rig.render.silhouettes import SilhouetteSet
+from rig.rig import Rig
 
 
 class Renderer:

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from rig.errors import InputError
-from rig.layout import Rig
-from rig.render.atlas import (
+from rig.render.context import GlContext, Owned
+from rig.render.tile_packing import (
     BLOCK_PX,
     INSTANCE_FORMAT,
     INSTANCE_NAMES,
@@ -29,7 +29,7 @@ from rig.render.atlas import (
     lens_limit,
     pack,
 )
-from rig.render.context import GlContext, Owned
+from rig.rig import Rig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ class SilhouetteSet:
         self._owned = Owned()
         self._origin = rig.centre_world()
         self._limits = [lens_limit(camera) for camera in rig]
-        self._empty_sums: list[Float[np.ndarray, "h w"]] = []
+        self._empty_sums: list[Float[np.ndarray, "_ _"]] = []
         with context.current() as gl:
             self._indices = self._owned(gl.buffer(self._faces.tobytes())) if len(faces) else None
             self._positions = self._owned(gl.buffer(reserve=max(12 * self._vertices_needed, 12)))

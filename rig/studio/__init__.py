@@ -1,0 +1,1 @@
+"""The simulated studio, which the tests and the demo photograph."""

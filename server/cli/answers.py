@@ -1,7 +1,9 @@
 """What every command shares: option types, the service's settings, a progress bar, and the answer on stdout."""
 
 import json
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,8 +11,45 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from pipeline.eigenheads.data_folder import DATA
+from rig.errors import EigenheadError, InputError
+
+# Before OpenCV is loaded, here and in workers: what it has to say of a damaged picture, an error of ours says in words.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+
+
+class CannotWrite(EigenheadError):
+    """An output that cannot be written, found before the work."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        super().__init__(f"{path} cannot be written ({error.strerror or error}); name another place with --out")
+
+
+class Overwrites(EigenheadError):
+    """An output that is there already."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path} is there already; name another place, or replace it with --overwrite")
+
+
+def _use_data(folder: Path | None) -> Path | None:
+    """``--data`` counts for all that looks for data, keys or models, in this process and in its children."""
+    if folder is not None:
+        os.environ[DATA] = str(folder.resolve())
+    return folder
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-Data = Annotated[Path | None, typer.Option(help="The service's data folder.", file_okay=False)]
+Data = Annotated[
+    Path | None,
+    typer.Option(
+        "--data",
+        help="The folder of captures, results, keys and models; by default EIGENHEAD_DATA.",
+        file_okay=False,
+        callback=_use_data,
+    ),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 Report = Callable[[str, float], None]
 
 
@@ -25,6 +64,40 @@ def service_settings(**given: Any) -> Any:
     except ValidationError as error:
         faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise typer.BadParameter(faults) from error
+
+
+def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str | None]:
+    """A callback of an option that takes one of ``choices``, which are asked for when the option is given."""
+
+    def check(value: str | None) -> str | None:
+        if value is not None and value not in choices():
+            raise typer.BadParameter(f"{value!r} is none of {', '.join(choices())}")
+        return value
+
+    return check
+
+
+@contextmanager
+def wrong_usage(option: str) -> Iterator[None]:
+    """Faults of what an option says are wrong usage: status 2."""
+    try:
+        yield
+    except InputError as error:
+        raise typer.BadParameter("; ".join(error.faults), param_hint=option) from error
+
+
+def prepare_file(path: Path, *, overwrite: bool = True) -> None:
+    """Makes the folder of an output file and tries whether it can be written, before the work that it takes.
+
+    Raises CannotWrite, and Overwrites where the file is there and shall stay."""
+    if path.exists() and not overwrite:
+        raise Overwrites(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise CannotWrite(path, error) from error
 
 
 @contextmanager
@@ -45,6 +118,11 @@ def progress_bar() -> Iterator[Report]:
 def answer(document: Any, as_json: bool, lines: list[str]) -> None:
     """One JSON object, or lines for people."""
     print(json.dumps(document, allow_nan=False) if as_json else "\n".join(lines))
+
+
+def warn(message: str) -> None:
+    """A line on standard error that stops nothing."""
+    print(f"eigenhead: {message}", file=sys.stderr)
 
 
 def fail(message: str) -> NoReturn:

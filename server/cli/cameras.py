@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, answer, progress_bar
+from server.cli.answers import Json, Overwrite, answer, one_of, prepare_file, progress_bar, wrong_usage
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -16,17 +16,20 @@ def board(
     kind: Annotated[str, typer.Option(help="checkerboard or charuco.")] = "checkerboard",
     squares: Annotated[str, typer.Option(help="COLUMNSxROWS, counted in squares.")] = "9x6",
     square_mm: Annotated[float, typer.Option(help="Side of a square.")] = 25.0,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Write a calibration board at true scale, with a ruler to check the print."""
-    from calibration.board import board_from_document, write_board, write_board_pdf
+    from calibration.board.board import board_from_document, write_board, write_board_pdf
 
     columns, _, rows = squares.partition("x")
     if not (columns.isdigit() and rows.isdigit()):
         raise typer.BadParameter(f"{squares!r} is not like 9x6", param_hint="--squares")
     document = {"kind": kind, "columns": int(columns), "rows": int(rows), "square_mm": square_mm}
-    chosen = board_from_document(document, "board")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    with wrong_usage("--kind, --squares, --square-mm"):
+        chosen = board_from_document(document, "board")
+    for path in (out, out.with_name("board.toml")):
+        prepare_file(path, overwrite=overwrite)
     write_board_pdf(chosen, out)
     write_board(chosen, out.with_name("board.toml"))
     written = {"pdf": str(out), "board": str(out.with_name("board.toml"))}
@@ -43,12 +46,13 @@ def calibrate(
     json_out: Json = False,
 ) -> None:
     """Calibrate a rig from pictures of a board."""
-    from calibration.board import read_board
-    from calibration.calibrate import CalibrationRefused, write_calibration
+    from calibration.board.board import read_board
     from calibration.calibrate import calibrate as run
     from calibration.report import write_report
-    from rig.layout import read_rig
+    from calibration.result import CalibrationRefused, write_calibration
+    from rig.formats.cameras_json import read_rig
 
+    prepare_file(out)
     known = None if previous is None else read_rig(previous)
     page = out.with_suffix(".html")
     try:
@@ -78,10 +82,11 @@ def refine(
     json_out: Json = False,
 ) -> None:
     """Refine a calibration by the silhouettes of several captures; kept only if each agrees with the others."""
-    from calibration.refinement_report import refinement_page
-    from rig.files import write_atomically
-    from rig.layout import write_rig
-    from server.refine import refine_locally
+    prepare_file(out)
+    from calibration.silhouette_refinement.report import refinement_page
+    from rig.atomic_write import write_atomically
+    from rig.formats.cameras_json import write_rig
+    from server.cli.refine import refine_locally
 
     page = out.with_suffix(".html")
     with progress_bar() as report:
@@ -102,8 +107,9 @@ def convert(
 ) -> None:
     """Turn a calibration into another program's format, or another program's into ours."""
     from rig.errors import InputError
-    from rig.layout_files import find_rig_file, read_rig_file, write_rig_file
+    from rig.formats.cameras_file import FORMATS, find_rig_file, read_rig_file, write_rig_file
 
+    one_of(lambda: FORMATS)(to)
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:
         raise InputError(str(source), ["holds no cameras.json, COLMAP model, camera_array.toml or aniposelib file"])

@@ -1,37 +1,81 @@
 """Commands that make heads: reconstruct, simulate, demo, experiments."""
 
+import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from server.cli.answers import Json, answer, progress_bar
+from server.cli.answers import (
+    Data,
+    Json,
+    Overwrite,
+    Overwrites,
+    answer,
+    one_of,
+    prepare_file,
+    progress_bar,
+    warn,
+    wrong_usage,
+)
 
 app = typer.Typer(rich_markup_mode=None)
+
+
+def _of_setting(name: str) -> Callable[[str | None], str | None]:
+    """A callback of an option that takes what a setting of the pipeline may be."""
+
+    def choices() -> tuple[str, ...]:
+        from pipeline.settings import Settings
+
+        options = get_type_hints(Settings)[name]
+        return tuple(v for option in (options, *get_args(options)) for v in get_args(option) if isinstance(v, str))
+
+    return one_of(choices)
+
+
+def _of_output(name: str) -> Callable[[str | None], str | None]:
+    """The same of a setting of the outputs."""
+
+    def choices() -> tuple[str, ...]:
+        from pipeline.settings import OutputSettings
+
+        return get_args(get_type_hints(OutputSettings)[name])
+
+    return one_of(choices)
 
 
 @app.command(epilog="Example: eigenhead reconstruct shots/anna.tar.gz --out heads/anna --method contour")
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
-    method: Annotated[str | None, typer.Option(help="contour or simplex.")] = None,
+    method: Annotated[str | None, typer.Option(help="contour or simplex.", callback=_of_setting("method"))] = None,
     model: Annotated[str | None, typer.Option(help="A model's name or file.")] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
-    detail: Annotated[str | None, typer.Option(help="span, kernel or photo.")] = None,
+    detail: Annotated[
+        str | None, typer.Option(help="span, kernel, photo or fine.", callback=_of_setting("detail"))
+    ] = None,
+    surface: Annotated[str | None, typer.Option(help="head, bust or both.", callback=_of_output("surface"))] = None,
     obj: Annotated[bool, typer.Option("--obj", help="Write head.obj too, with vertex colours.")] = False,
     atlas: Annotated[bool, typer.Option("--atlas", help="Write head_atlas.glb too, with a texture image.")] = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
+    data: Data = None,
     json_out: Json = False,
 ) -> None:
     """Reconstruct one capture without the service."""
-    from server.local import reconstruct_locally, settings_document
+    from server.cli.reconstruct_local import reconstruct_locally, settings_document
 
-    outputs = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
+    outputs: dict[str, Any] = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
+    outputs |= {"surface": surface} if surface else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
-    answer(written, json_out, [f"{out / 'head.ply'}"])
+    for warning in written["warnings"]:
+        warn(f"{warning['code']}: {warning['message']}")
+    made = [out / name for name in ("head.ply", "bust.ply") if (out / name).is_file()]
+    answer(written, json_out, [str(path) for path in made])
 
 
 @app.command(
@@ -49,13 +93,18 @@ def simulate(
     light_drift: Annotated[float | None, typer.Option(help="From plate to shot, share.", min=0, max=1)] = None,
     defocus: Annotated[float | None, typer.Option(help="Blur, pixels.", min=0)] = None,
     rolling_ms: Annotated[float | None, typer.Option(help="Readout of a rolling shutter.", min=0, max=200)] = None,
-    hair: Annotated[bool, typer.Option(help="Give the subject hair.")] = True,
+    hair: Annotated[
+        str | None,
+        typer.Option(help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, glasses."),
+    ] = None,
+    no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
     fault: Annotated[list[str] | None, typer.Option(help="KIND[:CAMERA][=AMOUNT]; may be repeated.")] = None,
     serve: Annotated[
         bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
     ] = False,
     port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
     fps: Annotated[float, typer.Option(help="--serve: of the live views.", min=0.5, max=30)] = 4.0,
+    overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
     """Take a capture with the simulated studio, and write the truth beside it; or serve the studio as real devices.
@@ -64,29 +113,47 @@ def simulate(
     given) with which the rig commands and the service work as with a real rig."""
     from dataclasses import replace
 
-    from rig.render.renderer import Renderer
-    from rig.studio.preset import PRESET
-    from server.shoot import simulate_folder
+    from rig.studio.sensor.faults import fault_from_text
+    from rig.studio.sensor.preset import PRESET
 
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
-    preset = replace(PRESET, hair=hair and PRESET.hair, **{k: v for k, v in chosen.items() if v is not None})
+    preset = replace(PRESET, hair=not no_hair, **{k: v for k, v in chosen.items() if v is not None})
+    preset = replace(preset, hairstyle=tuple(hair.split(",")) if hair else ())
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
                       faults=fault or [])  # fmt: skip
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
+    with wrong_usage("--fault"):
+        for text in fault or []:
+            fault_from_text(text)
+    _make_way(out, overwrite)
+    from rig.render.renderer import Renderer
+    from server.tasks.subjects import simulate_folder
+
     with progress_bar() as report, Renderer.create() as renderer:
         report("simulate", 0.0)
         truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer)
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
 
 
+def _make_way(out: Path, overwrite: bool) -> None:
+    """Removes an earlier simulated capture where that was asked for. Raises Overwrites and CannotWrite."""
+    there = out.exists() and (not out.is_dir() or any(out.iterdir()))
+    if there and not (overwrite and (out / "cameras.json").is_file()):
+        raise Overwrites(out)
+    prepare_file(out)
+    if there:
+        shutil.rmtree(out)
+        shutil.rmtree(out.with_name(out.name + ".truth"), ignore_errors=True)
+
+
 def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
     """Serves until Ctrl-C, which is how it ends well."""
     from contextlib import ExitStack, suppress
 
-    from server.studio import OpenStudio, serve_studio
+    from server.cli.studio import OpenStudio, serve_studio
 
     with ExitStack() as bar, suppress(KeyboardInterrupt):
         report = bar.enter_context(progress_bar())
@@ -103,26 +170,27 @@ def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
 def demo(
     out: Annotated[Path, typer.Option(help="Where the result goes.", file_okay=False)] = Path("out/demo"),
     seed: Annotated[int, typer.Option(help="Subject and noise of the simulated studio.", min=0)] = 1,
+    compare: Annotated[bool, typer.Option("--compare", help="Solve by the paper's simplex too: minutes more.")] = False,
     json_out: Json = False,
 ) -> None:
     """The main job end to end: simulated rig, capture, service, head."""
-    from server.demo import run_demo
+    from server.cli.demo import run_demo
 
     with progress_bar() as report:
-        done = run_demo(out, seed=seed, report=report)
+        done = run_demo(out, seed=seed, compare=compare, report=report)
     error = done["error_mm"]
     answer(
         done,
         json_out,
         [
             f"head           {done['ply']}",
-            f"contact sheet  {done['contact_sheet']}",
             f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
             *(
                 f"  {name:<12} {of['error_mm']['mean']:.2f} mm mean, {of['seconds']:.1f} s, {of['evaluations']} steps"
                 for name, of in done["methods"].items()
             ),
             f"time           {done['seconds']:.1f} s",
+            f"contact sheet  {done['contact_sheet']}",
         ],
     )
 
@@ -148,7 +216,7 @@ def experiments(
     json_out: Json = False,
 ) -> None:
     """Repeat the paper's experiments, and ours."""
-    from server.experiments import run_experiment
+    from pipeline.experiments.runner import run_experiment
 
     with progress_bar() as report:
         found = run_experiment(

@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, answer, progress_bar
+from server.cli.answers import Data, Json, answer, prepare_file, progress_bar
 
 model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_mode=None)
 
 
 @model_app.command("list", epilog="Example: eigenhead model list")
-def model_list(json_out: Json = False) -> None:
+def model_list(data: Data = None, json_out: Json = False) -> None:
     """List the head models at hand."""
     from pipeline.eigenheads.model import list_models
 
@@ -21,7 +21,9 @@ def model_list(json_out: Json = False) -> None:
 
 @model_app.command("info", epilog="Example: eigenhead model info --json")
 def model_info(
-    name: Annotated[str, typer.Argument(help="A model's name or file.")] = "default", json_out: Json = False
+    name: Annotated[str, typer.Argument(help="A model's name or file.")] = "default",
+    data: Data = None,
+    json_out: Json = False,
 ) -> None:
     """Say what a head model is made of."""
     from pipeline.eigenheads.info import model_info as describe
@@ -35,11 +37,13 @@ def model_info(
 def model_import(
     source: Annotated[Path, typer.Argument(help="ICT-FaceKit, statismo or Basel HDF5, or npz.", exists=True)],
     name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
+    data: Data = None,
     json_out: Json = False,
 ) -> None:
     """Make a foreign head model one of ours."""
-    from pipeline.eigenheads.imports import import_model
-    from pipeline.eigenheads.model import models_folder, save_model
+    from pipeline.eigenheads.data_folder import models_folder
+    from pipeline.eigenheads.model import save_model
+    from pipeline.eigenheads.sources.imports import import_model
 
     with progress_bar() as report:
         parts = import_model(source, name=name, report=report)
@@ -58,7 +62,8 @@ def model_build(
     json_out: Json = False,
 ) -> None:
     """Build a head model from raw scans (section 3.2)."""
-    from pipeline.eigenheads.build import build_model
+    prepare_file(out)
+    from pipeline.eigenheads.training.build import build_model
 
     with progress_bar() as report:
         built = build_model(scans, out, name=name or out.stem, on_bad="skip" if skip_bad else "stop", report=report)
@@ -77,10 +82,11 @@ def model_build(
 def model_fetch(
     name: Annotated[str, typer.Argument(help="ict-facekit.")],
     source: Annotated[str | None, typer.Option(help="Another address or folder to take it from.")] = None,
+    data: Data = None,
     json_out: Json = False,
 ) -> None:
     """Fetch a published head model, show its licence, and make it one of ours."""
-    from pipeline.eigenheads.fetch import fetch_model
+    from pipeline.eigenheads.sources.fetch import fetch_model
 
     with progress_bar() as report:
         fetched = fetch_model(name, source=source, report=report)
@@ -93,11 +99,12 @@ def model_show(
     name: Annotated[str, typer.Argument(help="A model's name or file.")] = "default",
     out: Annotated[Path, typer.Option(help="Folder for the pictures.", file_okay=False)] = Path("out/model"),
     modes: Annotated[int, typer.Option(help="How many modes to draw.", min=1)] = 5,
+    data: Data = None,
     json_out: Json = False,
 ) -> None:
     """Draw a model's modes, a correspondence, and how compact, general and specific it is (figures 2 and 3)."""
     from pipeline.eigenheads.model import load_model
-    from pipeline.eigenheads.show import show_model
+    from pipeline.eigenheads.training.figures import show_model
 
     with progress_bar() as report:
         drawn = [str(path) for path in show_model(load_model(name), out, modes=modes, report=report)]

@@ -16,8 +16,8 @@ RigFile = Annotated[Path, typer.Option("--rig", help="The rig.toml.", exists=Tru
 @rig_app.command("check", epilog="Example: eigenhead rig check --rig rig.toml")
 def rig_check(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
     """Open every camera, take a test shot, and print what to act on."""
-    from rig.config import read_rig_config
-    from rig.operate import COLUMNS, check
+    from rig.acquisition.commands import COLUMNS, check
+    from rig.formats.rig_toml import read_rig_config
 
     found = check(read_rig_config(rig))
     widths = [max(len(row[i]) for row in (COLUMNS, *found.rows)) for i in range(len(COLUMNS))]
@@ -37,8 +37,8 @@ def rig_preview(
     json_out: Json = False,
 ) -> None:
     """Write a contact sheet of what every camera sees."""
-    from rig.config import read_rig_config
-    from rig.operate import preview
+    from rig.acquisition.commands import preview
+    from rig.formats.rig_toml import read_rig_config
 
     faults = [str(fault) for fault in preview(read_rig_config(rig), out)]
     answer({"sheet": str(out), "faults": faults}, json_out, [str(out), *faults])
@@ -57,8 +57,8 @@ def rig_capture(
     from datetime import UTC, datetime
     from time import monotonic
 
-    from rig.config import read_rig_config
-    from rig.operate import capture
+    from rig.acquisition.commands import capture
+    from rig.formats.rig_toml import read_rig_config
 
     if out is not None and out_option is not None:
         raise typer.BadParameter("the capture folder is named twice", param_hint="--out")
@@ -86,8 +86,8 @@ def rig_board(
     json_out: Json = False,
 ) -> None:
     """Take shots of the calibration board with every camera."""
-    from rig.config import read_rig_config
-    from rig.operate import board_shots
+    from rig.acquisition.commands import board_shots
+    from rig.formats.rig_toml import read_rig_config
 
     document = []
     for name, cameras, faults in board_shots(read_rig_config(rig), out, shots, pause_s=pause_s):
@@ -100,8 +100,8 @@ def rig_board(
 @rig_app.command("plates", epilog="Example: eigenhead rig plates --rig rig.toml")
 def rig_plates(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
     """Take new clean plates of the empty studio."""
-    from rig.config import read_rig_config
-    from rig.operate import take_plates
+    from rig.acquisition.commands import take_plates
+    from rig.formats.rig_toml import read_rig_config
 
     taken = sorted(take_plates(read_rig_config(rig)).files)
     answer({"cameras": taken}, json_out, [f"clean plates of {len(taken)} cameras"])

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,8 +25,8 @@ def serve(
     console: Annotated[bool | None, typer.Option(help="Serve the operator's pages.")] = None,
 ) -> None:
     """Run the service, and a worker beside it."""
+    from server.http.serve import run_service
     from server.log import set_up
-    from server.serve import run_service
 
     settings = service_settings(data=data, host=host, port=port, rig=rig, console=console)
     set_up(settings.log_json)
@@ -41,7 +42,7 @@ def worker(
 ) -> None:
     """Run a worker that takes jobs from the service's queue."""
     from server.log import set_up
-    from server.worker import run_worker
+    from server.worker.worker import run_worker
 
     settings = service_settings(data=data, queue=queue, concurrency=concurrency)
     set_up(settings.log_json)
@@ -51,7 +52,7 @@ def worker(
 @app.command(epilog="Example: eigenhead doctor")
 def doctor(data: Data = None, json_out: Json = False) -> None:
     """Say what is wrong with this machine, and what to do."""
-    from server.doctor import examine
+    from server.cli.doctor import examine
 
     findings = examine(service_settings(data=data))
     width = max(len(name) for name in findings)
@@ -69,14 +70,16 @@ def keys_add(
     json_out: Json = False,
 ) -> None:
     """Make an API key; it is shown this once."""
-    from server.access import SCOPES
+    from server.services.keys import SCOPES
 
     unknown = set(scope) - set(SCOPES)
     if unknown:
         raise typer.BadParameter(f"{', '.join(sorted(unknown))}: there are {', '.join(SCOPES)}", param_hint="--scope")
     with _keys(data) as keys:
         key = keys.add(name, tuple(scope))
-    answer({"id": key.split("_")[1], "key": key}, json_out, [key])
+    where = service_settings().place
+    print(f"eigenhead: a key of the service whose data is {where}", file=sys.stderr)
+    answer({"id": key.split("_")[1], "key": key, "data": where}, json_out, [key])
 
 
 @keys_app.command("list", epilog="Example: eigenhead keys list")
@@ -84,7 +87,8 @@ def keys_list(data: Data = None, json_out: Json = False) -> None:
     """List the API keys, without their secrets."""
     with _keys(data) as keys:
         found = keys.all()
-    answer({"keys": found}, json_out, [f"{key['id']}  {key['name']}  {' '.join(key['scopes'])}" for key in found])
+    lines = [f"{key.id}  {key.name}  {' '.join(key.scopes)}" for key in found]
+    answer({"keys": [asdict(key) for key in found]}, json_out, lines)
 
 
 @keys_app.command("remove", epilog="Example: eigenhead keys remove 3f2a90b1c4d5")
@@ -96,8 +100,8 @@ def keys_remove(key_id: str, data: Data = None) -> None:
 
 @contextmanager
 def _keys(data: Path | None) -> Iterator[Any]:
-    from server.access import Keys
-    from server.database import open_database
+    from server.services.keys import Keys
+    from server.storage.database import open_database
 
     engine = open_database(service_settings(data=data))
     try:

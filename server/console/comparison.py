@@ -7,10 +7,10 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh
-from rig.mesh_files import read_mesh
-from server.problems import Problem
-from server.truth import surface_distance
+from server.errors import NotFound
+from server.services.truth import surface_distance
 
 TYPES = {"float": "<f4", "uchar": "u1", "int": "<i4", "double": "<f8", "short": "<i2", "ushort": "<u2", "uint": "<u4"}
 ROUNDS = 12  # of nearest points, where two heads do not share their vertices
@@ -23,7 +23,7 @@ def quality(result: Path) -> Float[np.ndarray, " v"]:
 
 
 def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
-    """One number a vertex from a binary little-endian PLY whose first element are the vertices. Raises a 404 problem
+    """One number a vertex from a binary little-endian PLY whose first element are the vertices. Raises NotFound
     where the file has no such property."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
@@ -36,7 +36,7 @@ def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
         elif words[0] == "property" and element == "vertex":
             fields.append((words[2], TYPES[words[1]]))
     if name not in dict(fields):
-        raise Problem(404, "not-found", f"{path.name} holds no {name!r} by vertex.")
+        raise NotFound("number by vertex", name, f"{path.name} holds others")
     return np.frombuffer(data, np.dtype(fields), count, end)[name].astype(np.float32)
 
 

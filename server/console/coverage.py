@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from calibration.board import board_from_document
-from calibration.detection import detect
-from server.child import Bench, Report
+from calibration.board.board import board_from_document
+from calibration.board.corners import detect
+from server.tasks.child import Bench, Report
 
 CELLS = (4, 3)  # of an image, across and down, that corners should fall into
 CORNERS_SHOWN = 60

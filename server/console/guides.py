@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.alignment import procrustes
-from pipeline.triangulation import NoPoint, triangulate
+from pipeline.alignment.procrustes import procrustes
+from pipeline.multiview.triangulation import NoPoint, triangulate
 from rig.camera import Camera
-from rig.layout import Rig
-from server.child import Bench, Report
+from rig.rig import Rig
+from server.tasks.child import Bench, Report
 
 Pixels = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]  # point, camera
 

@@ -13,9 +13,11 @@ from nicegui import app as pages
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
-from server.access import LOCAL, SCOPES, Caller, is_loopback
-from server.problems import Problem
-from server.service import Service
+from server.address import is_loopback
+from server.errors import Forbidden, Unknown
+from server.services.keys import LOCAL, SCOPES, Caller
+from server.services.service import Service
+from server.settings import ServiceSettings
 
 KEY_ID = "key_id"
 
@@ -32,19 +34,19 @@ def sign_in(service: Service, token: str) -> Caller | None:
 
 def caller_of(service: Service, stored: dict[str, Any]) -> Caller | None:
     """Who the browser with this user storage is; None where a key is still to be given. Blocks."""
-    keys = {key["id"]: key for key in service.keys.all()}
-    if not keys and is_loopback(service.settings.host):
+    keys = {key.id: key for key in service.keys.all()}
+    if not keys and service.settings.is_private:
         return Caller(LOCAL, frozenset(SCOPES))
     key = keys.get(stored.get(KEY_ID, ""))
-    return None if key is None else Caller(key["id"], frozenset(key["scopes"]))
+    return None if key is None else Caller(key.id, frozenset(key.scopes))
 
 
 def permit(caller: Caller | None, scope: str) -> Caller:
-    """``caller``, if it may do ``scope``. Raises a 401 or 403 problem."""
+    """``caller``, if it may do ``scope``. Raises Unknown, Forbidden."""
     if caller is None:
-        raise Problem(401, "key-missing", "An API key is needed: sign in again.")
+        raise Unknown("key-missing", "An API key is needed: sign in again.")
     if not caller.may(scope):
-        raise Problem(403, "scope-missing", f"Your key may not do that: it lacks the scope {scope!r}.")
+        raise Forbidden("scope-missing", f"Your key may not do that: it lacks the scope {scope!r}.")
     return caller
 
 
@@ -58,14 +60,17 @@ def cookie_secret(data: Path) -> str:
     return path.read_text()
 
 
-def is_foreign(scope: Scope) -> bool:
-    """Whether a page elsewhere made a browser send this: its Origin is another host than the one that it asks."""
+def is_foreign(scope: Scope, settings: ServiceSettings) -> bool:
+    """Whether a page elsewhere made a browser send this: its Origin is another host than the one that it asks, and not
+    the public one."""
     headers = Headers(scope=scope)
     origin, host = headers.get("origin"), headers.get("host", "")
-    return origin is not None and origin.partition("://")[2] != host
+    return origin is not None and origin not in (settings.public_url, f"http://{host}", f"https://{host}")
 
 
-def is_rebound(scope: Scope, host: str) -> bool:
-    """Whether a request to a service that listens on loopback alone names another host (DNS rebinding)."""
-    name = Headers(scope=scope).get("host", "").rpartition(":")
-    return is_loopback(host) and not is_loopback(name[0] or name[2])
+def is_rebound(scope: Scope, settings: ServiceSettings) -> bool:
+    """Whether a request to a service that listens on loopback alone names another host than that and the public one
+    (DNS rebinding)."""
+    host = Headers(scope=scope).get("host", "")
+    name = host.rpartition(":")
+    return is_loopback(settings.host) and host != settings.public_host and not is_loopback(name[0] or name[2])

@@ -10,11 +10,12 @@ from typing import Any, Protocol
 
 import structlog
 
-from rig.checks import blur_px, exposure
-from server.child import Child
-from server.problems import problem_from
-from server.rigs import ImageRgb, RigBackend, jpeg, reduced
-from server.service import Service
+from rig.acquisition.image_checks import blur_px, exposure
+from server.console.studio_view import frames
+from server.services.rigs import ImageRgb, RigBackend, jpeg, reduced
+from server.services.service import Service
+from server.tasks.child import Child
+from server.wire.problems import problem_from
 
 EVERY_S = 0.25  # four looks a second at most
 IDLE_S = 3.0  # without anybody who watches: then nobody looks at the cameras either
@@ -41,7 +42,7 @@ class StudioSource:
 
     def frames(self) -> list[dict[str, Any]]:
         self._looks += 1
-        return self._child.run("server.console.studio_view:frames", {"look": self._looks})
+        return self._child.remote(frames)(look=self._looks)
 
     def close(self) -> None:
         self._child.close()

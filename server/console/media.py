@@ -12,17 +12,18 @@ from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from nicegui import app as pages
 from PIL import Image
 
-from rig.capture import IMAGE_FORMATS
-from server.access import Caller
+from rig.errors import EigenheadError
+from rig.formats.images import IMAGE_FORMATS
 from server.console import comparison
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
 from server.console.page import as_problem
-from server.problems import Problem, not_found
-from server.routes.calibrations import get_report, make_calibration
-from server.routes.captures import accept_upload, get_image
-from server.routes.jobs import get_overlay, get_result
-from server.service import Service
+from server.console.silhouettes import draw
+from server.errors import Conflict, NotFound
+from server.services.keys import Caller
+from server.services.service import Service
+from server.wire.multipart import receive_board_pictures, receive_capture
+from server.wire.send_file import send_file
 
 THUMBNAIL_WIDTH = 480
 THUMBNAIL_QUALITY = 82
@@ -47,7 +48,7 @@ Reader = Annotated[tuple[Service, Caller], session("read")]
 Taker = Annotated[tuple[Service, Caller], session("capture")]
 
 
-@pages.exception_handler(Problem)
+@pages.exception_handler(EigenheadError)
 async def _answer_problem(request: Request, error: Exception) -> Response:
     return as_problem(error).response()
 
@@ -74,7 +75,7 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/{camera}.image")
 def image(who: Reader, request: Request, capture_id: str, camera: str) -> Response:
-    return get_image(who[0], who[1], request, capture_id, camera)
+    return send_file(request, who[0].captures.image(capture_id, "images", camera))
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.silhouette.png")
@@ -87,32 +88,31 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
         if not (folder / f"{name}.png").is_file():
             files = service.store.folder("captures", capture_id) / "files"
             with service.children.one() as child:
-                arguments = {"capture": str(files), "cache": str(folder.parent), "target": str(folder)}
-                child.run("server.console.silhouettes:draw", arguments)
+                child.remote(draw)(capture=str(files), cache=str(folder.parent), target=str(folder))
     return FileResponse(folder / f"{name}.png", headers=FOREVER)
 
 
 @pages.post("/console/captures")
 async def upload(who: Taker, request: Request) -> Response:
     try:
-        record, _ = await accept_upload(who[0], request)
+        record, _ = await receive_capture(who[0], request)
     except Exception as error:
         return as_problem(error).response()
     return JSONResponse({"id": record["id"]}, 201)
 
 
 @pages.post("/console/calibrations")
-async def upload_board_pictures(who: Taker, request: Request, response: Response) -> Response:
+async def upload_board_pictures(who: Taker, request: Request) -> Response:
     try:
-        made = await make_calibration(who[0], who[1], request, response)
+        made = await receive_board_pictures(who[0], request)
     except Exception as error:
         return as_problem(error).response()
-    return JSONResponse({"id": made.id}, 202)
+    return JSONResponse({"id": made["id"]}, 202)
 
 
 @pages.get("/console/jobs/{job_id}/overlays/{name}")
 def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
-    return get_overlay(who[0], who[1], request, job_id, name)
+    return send_file(request, who[0].jobs.result_file(job_id, f"overlays/{name}"))
 
 
 @pages.get("/console/jobs/{job_id}/quality.f32")
@@ -130,7 +130,7 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
     if other == "truth":
         theirs = service.store.folder("captures", job["capture_id"]) / "truth" / "head.ply"
         if not theirs.is_file():
-            raise not_found("truth of the capture", job["capture_id"])
+            raise NotFound("truth of the capture", job["capture_id"])
         return _floats(comparison.to_surface(mine, theirs))
     other_job = service.jobs.get(other)
     same = other_job["capture_id"] == job["capture_id"]
@@ -139,12 +139,12 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/{name}")
 def result_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
-    return get_result(who[0], who[1], request, job_id, name)
+    return send_file(request, who[0].jobs.result_file(job_id, name))
 
 
 @pages.get("/console/calibrations/{calibration_id}/report.html")
 def calibration_report(who: Reader, request: Request, calibration_id: str) -> Response:
-    answer = get_report(who[0], who[1], request, calibration_id)
+    answer = send_file(request, who[0].calibrations.file(calibration_id, "report.html"))
     answer.headers["Content-Security-Policy"] = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     return answer
 
@@ -169,13 +169,13 @@ def _image_name(record: dict[str, Any], camera: str) -> str:
     for name in record["inputs"]:
         if Path(name).parent.name == "images" and Path(name).stem == camera:
             return name
-    raise not_found("camera", camera)
+    raise NotFound("camera", camera)
 
 
 def _result_folder(service: Service, job_id: str) -> Path:
     state = service.jobs.state(job_id)
     if state != "succeeded":
-        raise Problem(409, "no-result", f"The job is {state}; it has no result.")
+        raise Conflict("no-result", f"The job is {state}; it has no result.")
     return service.store.folder("jobs", job_id) / "result"
 
 

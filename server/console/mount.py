@@ -16,6 +16,9 @@ from server.console.identity import cookie_secret, is_foreign, is_rebound
 from server.settings import ServiceSettings
 
 COOKIE_DAYS = 30
+REFUSED = (
+    "This page is not open to other web pages. Behind a proxy, set EIGENHEAD_PUBLIC_URL to the address you asked for."
+)
 PAGES = frozenset({"/", "/captures", "/features", "/jobs", "/result", "/calibration", "/sign-in", "/favicon.ico"})
 FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
 
@@ -52,16 +55,16 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
     pages.add_static_files("/console/static", Path(__file__).with_name("static"))
     mounted = app.router.routes.pop()
     assert isinstance(mounted, Mount)
-    app.router.routes.append(PagesMount(mounted, settings.host))
+    app.router.routes.append(PagesMount(mounted, settings))
     theme.install()
 
 
 class PagesMount(Mount):
     """The mount of the pages: it answers for their paths alone, and to nobody whom another web page sent."""
 
-    def __init__(self, mounted: Mount, host: str) -> None:
+    def __init__(self, mounted: Mount, settings: ServiceSettings) -> None:
         super().__init__(mounted.path, app=mounted.app)
-        self._host = host
+        self._settings = settings
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
         if scope["type"] in ("http", "websocket"):
@@ -71,10 +74,10 @@ class PagesMount(Mount):
         return super().matches(scope)
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if is_foreign(scope) or is_rebound(scope, self._host):
+        if is_foreign(scope, self._settings) or is_rebound(scope, self._settings):
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})
             else:
-                await PlainTextResponse("This page is not open to other web pages.", 403)(scope, receive, send)
+                await PlainTextResponse(REFUSED, 403)(scope, receive, send)
             return
         await super().handle(scope, receive, send)

@@ -14,14 +14,15 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
-from server.access import Caller
-from server.child import WorkFailed
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
 from server.console.theme import Frame, page_frame
-from server.health import readiness
-from server.problems import Problem, problem_from
-from server.service import Service
+from server.errors import Gone
+from server.services.health import readiness
+from server.services.keys import Caller
+from server.services.service import Service
+from server.tasks.child import WorkFailed
+from server.wire.problems import Problem, problem_from
 
 REFRESH_S = 0.5
 STATUS_S = 2.0
@@ -163,7 +164,7 @@ def undo(page: Page, event: dict[str, Any]) -> str:
     if removal is not None:
         permit(page.caller, removal.scope)
     if removal is None or not removals.undo(event["id"]):
-        raise Problem(410, "too-late", "It is removed already.")
+        raise Gone("too-late", "It is removed already.")
     shared.clear()
     return f"It is back: {removal.title}."
 

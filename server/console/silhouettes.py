@@ -6,11 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipeline.settings import SegmentationSettings
-from rig.capture import read_capture
-from rig.files import write_atomically
-from server.child import Bench, Report
-from server.silhouette_cache import segment_once
+from rig.atomic_write import write_atomically
+from server.tasks.child import Bench, Report
 
 WIDTH = 640
 COLOUR = (108, 178, 255)  # the accent of the pages
@@ -19,6 +16,10 @@ LINE_PX = 3
 
 def draw(bench: Bench, report: Report, *, capture: str, cache: str, target: str) -> None:
     """Writes ``target``/<camera>.png, the outline with a tint of the subject on nothing. Raises InputError."""
+    from pipeline.settings import SegmentationSettings
+    from rig.formats.capture_folder import read_capture
+    from server.storage.silhouette_cache import segment_once
+
     shot, rig = read_capture(Path(capture))
     found = segment_once(Path(cache), shot, rig, SegmentationSettings(), report=report)
     for name, silhouette in found.items():

@@ -1,65 +1,12 @@
-"""The live view of the simulated studio; runs in a child process of its own, so that a shot does not stop it.
+"""The live view of the simulated studio, asked of a child process, so that this one need not load what draws it."""
 
-The studio is drawn once. What a look costs is the sensor's noise, so that the cameras are binned as real ones are for a
-live view; one camera now and then is exposed at full size, for its sharpness.
-"""
-
-from dataclasses import replace
 from typing import Any
 
-import cv2
-import numpy as np
-
-from pipeline.eigenheads.model import load_model
-from rig.checks import blur_px, exposure
-from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
-from rig.studio.preset import PRESET
-from rig.studio.sensor import Sensor, expose
-from rig.studio.simulate import Scene, build_scene, view_light
-from server.child import Bench, Report
-from server.shoot import drawn_subject
-
-WIDTH = 320
-SHARP_EVERY = 5  # looks between two exposures at full size, which cost as much as a look
-QUALITY = 78
-QUICK = replace(PRESET, samples=1)  # the pictures are shown at a third of their size, which smooths edges enough
-SUBJECT_SEED = 1  # the same person as in the rig's own previews
+from server.tasks.child import Bench, Report
 
 
 def frames(bench: Bench, report: Report, *, look: int) -> list[dict[str, Any]]:
     """One frame a camera: name, jpeg, mean, clipped; now and then one of them has blur_px."""
-    views = bench.keep("live", _draw)
-    rng = bench.keep("noise", np.random.default_rng)
-    names = list(views)
-    sharp = names[look // SHARP_EVERY % len(names)] if look % SHARP_EVERY == 0 else None
-    return [_frame(name, view, rng, sharp=name == sharp) for name, view in views.items()]
+    from server.console import studio_drawing
 
-
-def _draw() -> dict[str, tuple[Sensor, np.ndarray, np.ndarray]]:
-    rng = np.random.default_rng(SUBJECT_SEED)
-    subject = drawn_subject(load_model(), rng)
-    with Renderer.create() as renderer:
-        scene: Scene = build_scene(subject, default_layout(), QUICK, rng, renderer=renderer)
-    found = {}
-    for name, view in scene.views.items():
-        light = view_light(view)
-        height = round(light.shape[0] * WIDTH / light.shape[1])
-        small = cv2.resize(light, (WIDTH, height), interpolation=cv2.INTER_AREA)
-        found[name] = (view.sensor, light.astype(np.float16), small)  # 11 bits hold an 8-bit picture
-    return found
-
-
-def _frame(
-    name: str, lit: tuple[Sensor, np.ndarray, np.ndarray], rng: np.random.Generator, *, sharp: bool
-) -> dict[str, Any]:
-    sensor, light, small = lit
-    picture = expose(small, sensor, rng)
-    level = exposure(picture)
-    found: dict[str, Any] = {"name": name, "mean": round(level.mean, 1), "clipped": round(level.clipped_share, 4)}
-    if sharp:
-        blur = blur_px(expose(light.astype(np.float32), sensor, rng))
-        found["blur_px"] = None if blur is None else round(blur, 2)
-    done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    assert done
-    return found | {"jpeg": data.tobytes()}
+    return studio_drawing.frames(bench, look)

@@ -14,16 +14,18 @@ import pycolmap
 from scipy.optimize import least_squares
 from scipy.sparse import coo_matrix
 
-from calibration import bundle
-from calibration.bundle import Free, Observations, State, residuals, solve, values_of, weak_prior
-from tests.calibration.synthetic import Session, session
+from calibration.adjustment.bundle import Free, free_mask, solve
+from calibration.adjustment.corner_term import CornerTerm, places
+from calibration.adjustment.lens_prior import weak_prior
+from calibration.adjustment.state import BundleState, Observations, moved_state, observations, residuals, values_of
+from tests.support.board_sessions import Session, session
 
 
-def start(source: Session, rng: np.random.Generator) -> tuple[State, Observations]:
+def start(source: Session, rng: np.random.Generator) -> tuple[BundleState, Observations]:
     """The planted state, off by 1 % in focal length, 0.3 degrees and some millimetres."""
     rig, d = source.rig, source.detections
-    seen = bundle.observations(d.views, rig.names, d.shots, d.board)
-    state = State(
+    seen = observations(d.views, rig.names, d.shots, d.board)
+    state = BundleState(
         np.stack([values_of(camera.intrinsics) for camera in rig]),
         np.stack([camera.camera_from_world.rotation for camera in rig]),
         np.stack([camera.camera_from_world.translation for camera in rig]),
@@ -32,36 +34,34 @@ def start(source: Session, rng: np.random.Generator) -> tuple[State, Observation
         np.zeros(len(rig)),
         np.zeros((len(d.shots), 6)),
     )
-    mask = bundle._free_mask(state, Free())
+    mask = free_mask(state, Free())
     step = np.zeros(len(mask))
     sizes = np.concatenate([np.tile([16, 16, 5, 5, 0.01, 0, 0, 0, 0, *[0.005] * 3, *[5.0] * 3], len(rig))])
     step[: len(sizes)] = sizes * rng.normal(size=len(sizes))
-    return bundle._moved(state, step * mask), seen
+    return moved_state(state, step * mask), seen
 
 
-def ours(state: State, seen: Observations) -> float:
+def ours(state: BundleState, seen: Observations) -> float:
     prior = weak_prior([(1024, 768)] * len(state.intrinsics))
     solution = solve(state, seen, prior, np.full(len(state.intrinsics), 0.2))
     return rms(residuals(solution.state, seen))
 
 
-def scipys(state: State, seen: Observations) -> float:
-    mask = bundle._free_mask(state, Free())
+def scipys(state: BundleState, seen: Observations) -> float:
+    mask = free_mask(state, Free())
 
-    def at(step: np.ndarray) -> State:
+    def at(step: np.ndarray) -> BundleState:
         full = np.zeros(len(mask))
         full[mask] = step
-        return bundle._moved(state, full)
+        return moved_state(state, full)
 
     def jacobian(step: np.ndarray) -> coo_matrix:
-        _, by_camera, by_board, _ = bundle._jacobians(at(step), seen)
+        here = CornerTerm(seen, np.ones(len(state.intrinsics))).at(at(step))
         count, cameras = len(seen.points), len(state.intrinsics)
-        camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
-        first = (camera * bundle.PER_CAMERA)[:, None] + np.arange(bundle.PER_CAMERA)
-        second = cameras * bundle.PER_CAMERA + (shot * bundle.PER_SHOT)[:, None] + np.arange(bundle.PER_SHOT)
-        columns = np.repeat(np.concatenate([first, second], axis=1)[:, None], 2, axis=1)
+        own = [places(c, s, cameras, len(mask)) for c, s in zip(seen.camera, seen.shot, strict=True)]
+        columns = np.repeat(np.array(own)[seen.view_of][:, None], 2, axis=1)
         rows = np.broadcast_to(np.arange(2 * count).reshape(count, 2, 1), columns.shape)
-        values = np.concatenate([by_camera, by_board], axis=2)
+        values = here.by_view()
         matrix = coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * count, len(mask)))
         return matrix.tocsr()[:, mask]
 
@@ -77,7 +77,7 @@ def scipys(state: State, seen: Observations) -> float:
     return rms(found.fun.reshape(-1, 2))
 
 
-def colmaps(source: Session, state: State, seen: Observations) -> float:
+def colmaps(source: Session, state: BundleState, seen: Observations) -> float:
     """The board's corners as constant points, one image a view, one frame a shot, one rig of all cameras. COLMAP's
     OPENCV model has no k3, which is zero in the planted lenses."""
     model = pycolmap.Reconstruction()

@@ -21,15 +21,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
 
+from rig.acquisition.commands import capture_with
+from rig.acquisition.session import RigSession
+from rig.acquisition.shot import ShotFailed
 from rig.camera import Camera, Intrinsics
-from rig.config import read_rig_config
+from rig.formats.cameras_json import write_rig
+from rig.formats.rig_toml import read_rig_config
 from rig.geometry import RigidTransform
-from rig.layout import Rig, write_rig
-from rig.operate import capture_with
-from rig.session import RigSession
-from rig.shot import ShotFailed
-from rig.studio.serve import StudioDevices
-from tests.rig.textured_studio import NAMES, FlatStudio
+from rig.rig import Rig
+from rig.studio.devices.serve import StudioDevices
+from tests.support.textured_studio import NAMES, FlatStudio
 
 
 def resident_mb() -> float:

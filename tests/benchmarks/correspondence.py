@@ -16,11 +16,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.eigenheads.closest import SurfaceIndex
-from pipeline.eigenheads.correspondence import Correspondence, Matching, correspond
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
+from pipeline.eigenheads.correspondence.correspondence import Correspondence, Matching, correspond
+from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.eigenheads.model import HeadModel, assemble, load_model, model_path, read_parts
 from pipeline.eigenheads.pca import principal_components
-from pipeline.eigenheads.scanner import Scanner, scan_head
 
 
 def without(subjects: list[int]) -> HeadModel:

@@ -19,19 +19,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.drift import find_drift
 from pipeline.eigenheads.model import load_model
-from pipeline.segmentation import segment
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.camera_drift import find_drift
 from pipeline.settings import Settings
-from pipeline.silhouette import Silhouette
+from pipeline.silhouettes.segment import segment
 from rig.geometry import RigidTransform, rotation_from_vector
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
-from rig.studio.preset import PRESET
-from rig.studio.simulate import simulate
-from server.shoot import drawn_subject
-from tests.calibration.silhouette_subjects import captures_of, disturbed
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import simulate
+from rig.studio.sensor.preset import PRESET
+from server.tasks.subjects import drawn_subject
+from tests.support.silhouette_subjects import captures_of, disturbed
 
 
 def turned(rig: Rig, name: str, turn_deg: float, rng: np.random.Generator) -> Rig:

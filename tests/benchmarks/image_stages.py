@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.eigenheads.model import load_model
-from pipeline.outputs import write_result
+from pipeline.multiview.visual_hull import visual_hull
 from pipeline.reconstruct import reconstruct
+from pipeline.results.write import write_result
 from pipeline.settings import Settings
-from pipeline.visual_hull import visual_hull
-from rig.capture import read_capture
+from rig.formats.capture_folder import read_capture
 from rig.render.renderer import Renderer
 
 

@@ -21,11 +21,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from pipeline.eigenheads.build import build_model, corresponded_cages
+from pipeline.eigenheads.correspondence.scans import Scan, write_landmarks
+from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.eigenheads.model import HeadModel, load_model, model_path, read_parts
-from pipeline.eigenheads.scanner import Scanner, scan_head
-from pipeline.eigenheads.scans import Scan, write_landmarks
-from pipeline.eigenheads.training import Training, train
+from pipeline.eigenheads.training.build import build_model, corresponded_cages
+from pipeline.eigenheads.training.training import Training, train
 from tests.benchmarks.correspondence import without
 
 SPACING_MM = 1.12  # 100,000 points

@@ -14,8 +14,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from server.truth import error_mm
-from tests.end_to_end.served_studio import command, served_studio
+from server.services.truth import error_mm
+from tests.support.served_studio import command, served_studio
 
 
 def run(folder: Path, captures: int, seed: int, *, reconstruct: bool) -> dict[str, Any]:

@@ -22,10 +22,10 @@ from typing import Any
 
 import httpx
 
-from rig.archive import pack_folder
-from tests.server.postgres import running_postgres
-from tests.server.services import RunningService, await_state, running_service, small_capture
-from tests.server.test_durability import pinned_worker
+from rig.formats.archive import pack_folder
+from tests.server.worker.test_durability import pinned_worker
+from tests.support.postgres import running_postgres
+from tests.support.services import RunningService, await_state, running_service, small_capture
 
 KEEP_JOBS = 100  # retention: without it the database grows with the jobs that it keeps
 
@@ -115,10 +115,10 @@ def lag_p99_ms(metrics: str) -> float:
 
 def heads(jobs: int, folder: Path) -> dict[str, Any]:
     """``workers`` with the pipeline; the silhouettes are found once, as for every capture."""
-    return workers(jobs, folder, work="server.work:reconstruct_capture")
+    return workers(jobs, folder, work="server.tasks.reconstruct:reconstruct_capture")
 
 
-def workers(jobs: int, folder: Path, *, work: str = "tests.server.tiny:busy") -> dict[str, Any]:
+def workers(jobs: int, folder: Path, *, work: str = "tests.support.tiny:busy") -> dict[str, Any]:
     """Work that keeps a core busy; each worker is bound to a core of its own."""
     times, real = {}, work.startswith("server.")
     for count in (1, 2):

@@ -3,11 +3,11 @@ worth to a head?
 
 ``python -m tests.benchmarks.silhouette_refinement [--seeds 3] [--captures 5] [--error-px 0.5] [--heads 2] [--rims]
 [--proposal] [--json]``. Every seed has its own subjects (heads of the model's first 60 modes with the studio's hair and
-shirts) and its own camera errors. Distances are RMS over the cameras of ``calibration.gauge.image_distance`` to the
-truth; ``no_scale`` leaves out the rig's scale, which no silhouette shows: eleven cameras that are off each for itself
-are off in scale too, and what the start has of that stays. ``sigma_px`` is what the refined rig's covariances say of
-the distance. ``--proposal``: only what all captures agree on, from disturbed cameras, with no capture held out and
-nothing decided, at an eleventh of the time.
+shirts) and its own camera errors. Distances are RMS over the cameras of ``calibration.adjustment.gauge.image_distance``
+to the truth; ``no_scale`` leaves out the rig's scale, which no silhouette shows: eleven cameras that are off each for
+itself are off in scale too, and what the start has of that stays. ``sigma_px`` is what the refined rig's covariances
+say of the distance. ``--proposal``: only what all captures agree on, from disturbed cameras, with no capture held out
+and nothing decided, at an eleventh of the time.
 
 ``head_before_mm``, ``head_after_mm``, ``head_exact_mm``: mean distance of the face's vertices from the truth, world
 frame, of further subjects fitted without per-camera terms, with the cameras as disturbed, as refined, and exact. These
@@ -24,18 +24,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from calibration.gauge import image_distance, image_metric, subject_points
-from calibration.rims import Heads
-from calibration.silhouette_refinement import PRIOR_PX, _minimise, refine
+from calibration.adjustment.gauge import image_distance, image_metric, subject_points
+from calibration.silhouette_refinement.refine import PRIOR_PX, minimise_tangencies, refine
+from calibration.silhouette_refinement.rims import Heads
 from pipeline.eigenheads.model import HeadModel, load_model, with_modes
 from pipeline.fitting.contour import fit_contour
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.settings import FittingSettings
-from pipeline.silhouette import Silhouette, silhouette_from_mask
 from rig.geometry import Similarity, rotation_from_vector
-from rig.layout import Rig
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
-from tests.calibration.silhouette_subjects import captures_of, disturbed, dressed_head, rms
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from tests.support.silhouette_subjects import captures_of, disturbed, dressed_head, rms
 
 MODES = 60
 START_DEG, START_MM = 2.0, 4.0  # of a fit
@@ -107,7 +107,7 @@ def run(
     rows = []
     off = disturbed(rig, error_px, rng)
     if proposal:
-        found = _minimise(seen, off, focal=False, prior_px=PRIOR_PX, heads=speaking)
+        found = minimise_tangencies(seen, off, focal=False, prior_px=PRIOR_PX, heads=speaking)
         return [{"seed": seed} | distances_px("start", off, rig) | distances_px("proposed", found, rig)]
     for start in (off, rig):
         began = time.perf_counter()

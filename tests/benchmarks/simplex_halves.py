@@ -16,18 +16,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.alignment import align_to_features
+from pipeline.alignment.landmarks import align_to_features
 from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from pipeline.eigenheads.model import HeadModel, load_model, with_modes
 from pipeline.fitting.contour import fit_contour
-from pipeline.fitting.schedule import fit_simplex
+from pipeline.fitting.simplex.hierarchy import fit_simplex
+from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import Settings
-from pipeline.silhouette import silhouette_from_mask
 from rig.camera import Camera, Intrinsics
 from rig.capture import Features
 from rig.geometry import Similarity, look_at, rotation_from_vector
-from rig.layout import Rig
 from rig.render.renderer import Renderer
+from rig.rig import Rig
 
 MODES = 60
 PICK_NOISE_PX = 1.5

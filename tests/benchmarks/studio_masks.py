@@ -7,7 +7,7 @@ With faults every capture is taken anew with each of them, and a view may be wro
 of another program (``RENDERED``), whose masks are known.
 
 Coverage of the subject is the truth: the contour is judged where it is one half at the resolution that a mask has, the
-overlap at the lens's own (see tests/pipeline/test_segmentation_studio.py).
+overlap at the lens's own (see tests/pipeline/silhouettes/test_segment_studio.py).
 """
 
 import argparse
@@ -16,15 +16,15 @@ import sys
 
 import numpy as np
 
-from pipeline.segmentation import segment
 from pipeline.settings import SegmentationSettings
-from rig.capture import read_capture
+from pipeline.silhouettes.segment import segment
+from rig.formats.capture_folder import read_capture
 from rig.render.renderer import Renderer
-from rig.studio.faults import fault_from_text
-from rig.studio.preset import PRESET
-from tests.pipeline.test_segmentation import true_mask
-from tests.pipeline.test_segmentation_studio import RESOLUTION_PX, coverage, iou, rms, take
-from tests.shared_data import shared
+from rig.studio.sensor.faults import fault_from_text
+from rig.studio.sensor.preset import PRESET
+from tests.pipeline.silhouettes.test_segment import true_mask
+from tests.pipeline.silhouettes.test_segment_studio import RESOLUTION_PX, coverage, iou, rms, take
+from tests.support.shared_data import shared
 
 WORST_PX, LEAST_IOU = 0.8, 0.995
 RENDERED = ("scan-a", "draw-b")

@@ -8,16 +8,17 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from pipeline.eigenheads.model import load_model
-from pipeline.segmentation import segment
+from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.visual_hull import hull_extent, visual_hull
 from pipeline.settings import SegmentationSettings, TextureSettings
-from pipeline.silhouette import Silhouette
-from pipeline.texture import texture
-from pipeline.visual_hull import hull_extent, visual_hull
-from pipeline.zbuffer import depth_maps
-from rig.capture import Capture, read_capture
-from rig.layout import Rig
+from pipeline.silhouettes.segment import segment
+from pipeline.texture.vertex_colours import texture
+from rig.capture import Capture
+from rig.formats.capture_folder import read_capture
 from rig.mesh import Mesh
-from tests.shared_data import shared
+from rig.rig import Rig
+from tests.support.shared_data import shared
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ import pytest
 
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import look_at
-from rig.layout import Rig
 from rig.render.renderer import Renderer
+from rig.rig import Rig
 
 pytestmark = pytest.mark.gl
 

@@ -6,10 +6,10 @@ import pytest
 from pipeline.eigenheads.model import load_model
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
-from rig.studio.preset import PRESET
-from rig.studio.simulate import simulate
-from rig.studio.subject import Subject
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import simulate
+from rig.studio.scene.subject import Subject
+from rig.studio.sensor.preset import PRESET
 
 pytestmark = pytest.mark.gl
 

@@ -21,21 +21,21 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.eigenheads.closest import SurfaceIndex
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import Settings, TextureSettings
-from pipeline.silhouette import Silhouette, silhouette_from_mask
-from pipeline.texture import texture
-from pipeline.zbuffer import depth_maps
+from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
+from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.mesh import Mesh
-from rig.mesh_files import linear_from_srgb, srgb_from_linear
 from rig.render.renderer import Renderer
-from rig.studio.layout import default_layout
-from rig.studio.preset import PRESET
-from rig.studio.simulate import Scene, build_scene, shoot
-from rig.studio.subject import Subject
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import Scene, build_scene, shoot
+from rig.studio.scene.subject import Subject
+from rig.studio.sensor.preset import PRESET
 
 SPREAD = 0.2  # of the exposures
 SHARES = (0.1, 0.5)  # of background in a vertex's colour

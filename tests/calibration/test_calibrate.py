@@ -7,17 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.board import read_board
-from calibration.calibrate import Calibration, CalibrationRefused, calibrate, calibrate_detections, write_calibration
-from calibration.detection import Detections, View
-from calibration.gauge import image_distance
-from calibration.pose_graph import PoseGraphError
+from calibration.adjustment.gauge import image_distance
+from calibration.adjustment.pose_graph import PoseGraphError
+from calibration.board.board import read_board
+from calibration.board.detection import Detections, View
+from calibration.calibrate import calibrate, calibrate_detections
+from calibration.result import Calibration, CalibrationRefused, write_calibration
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.layout import Rig, read_rig
-from rig.layout_files import read_rig_file
-from tests.calibration.synthetic import CHECKERBOARD, Session, session, visible
-from tests.shared_data import shared
+from rig.formats.cameras_file import read_rig_file
+from rig.formats.cameras_json import read_rig
+from rig.rig import Rig
+from tests.support.board_sessions import CHECKERBOARD, Session, session, visible
+from tests.support.shared_data import shared
 
 CAMERAS, SHOTS = 7, 20
 

@@ -9,9 +9,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from calibration.calibrate import Calibration, calibrate_detections
+from calibration.calibrate import calibrate_detections
 from calibration.report import MAGNIFIED, report_page, write_report
-from tests.calibration.synthetic import session
+from calibration.result import Calibration
+from tests.support.board_sessions import session
 
 
 @pytest.fixture(scope="module")

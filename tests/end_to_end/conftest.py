@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
-from tests.end_to_end.browser import chromium
-from tests.server.services import ROOT
+from tests.support.browser import chromium
+from tests.support.services import ROOT
 
 
 @pytest.fixture(scope="module")

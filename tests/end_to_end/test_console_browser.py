@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from rig.archive import pack_folder
-from rig.mesh_files import read_mesh
-from tests.end_to_end.browser import keep_screenshots, live_rate, violations, visit
-from tests.server.services import RunningService, running_service, small_capture
-from tests.shared_data import shared
+from rig.formats.archive import pack_folder
+from rig.formats.mesh_file import read_mesh
+from tests.support.browser import keep_screenshots, live_rate, violations, visit
+from tests.support.services import RunningService, running_service, small_capture
+from tests.support.shared_data import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -29,7 +29,9 @@ PATHS = ("/", "/captures", "/features", "/jobs", "/result", "/calibration")
 def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
     """The real work on the simulated studio."""
     data = tmp_path_factory.mktemp("studio") / "data"
-    with running_service(data, work="server.work:reconstruct_capture", poll_s="0.25", console="true") as service:
+    with running_service(
+        data, work="server.tasks.reconstruct:reconstruct_capture", poll_s="0.25", console="true"
+    ) as service:
         yield service
 
 
@@ -198,7 +200,7 @@ def pick_features(page: Page, studio: RunningService, screenshots: Path) -> None
 
 def landmark_pixels(studio: RunningService, capture: str, truth: dict) -> dict[str, dict[str, np.ndarray]]:
     from pipeline.eigenheads.landmarks import SEVEN_POINTS
-    from rig.layout import read_rig
+    from rig.formats.cameras_json import read_rig
 
     rig = read_rig(studio.data / "captures" / capture / "files" / "cameras.json")
     points = {name: np.array(truth["landmarks_world"][name]) for name in SEVEN_POINTS}

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from rig.studio.serve import DeviceFault, StudioDevices
-from tests.end_to_end.browser import chromium, keep_screenshots, live_rate, visit
-from tests.rig.board_pictures import BoardPictures
-from tests.server.services import RunningService, running_service
-from tests.shared_data import shared
+from rig.studio.devices.serve import DeviceFault, StudioDevices
+from tests.support.board_pictures import BoardPictures
+from tests.support.browser import chromium, keep_screenshots, live_rate, visit
+from tests.support.services import RunningService, running_service
+from tests.support.shared_data import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 

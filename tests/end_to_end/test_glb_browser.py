@@ -16,13 +16,13 @@ import nicegui
 import numpy as np
 import pytest
 
-from pipeline.zbuffer import picture
+from pipeline.imaging.cpu_raster import picture
 from rig.camera import Camera, Intrinsics
-from rig.capture import read_image
+from rig.formats.images import read_image
+from rig.formats.mesh_file import read_mesh
 from rig.geometry import look_at
 from rig.mesh import Mesh
-from rig.mesh_files import read_mesh
-from tests.shared_data import shared
+from tests.support.shared_data import shared
 
 pytestmark = pytest.mark.slow
 CHROMIUM = "/usr/bin/chromium"

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.capture import read_capture
-from rig.studio.layout import default_layout
-from tests.end_to_end.served_studio import command, served_studio
+from rig.formats.capture_folder import read_capture
+from rig.studio.scene.layout import default_layout
+from tests.support.served_studio import command, served_studio
 
 NAMES = tuple(f"cam{i:02}" for i in range(11))
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from rig.archive import pack_folder
-from server.client import Client
-from server.truth import error_mm
-from tests.server.services import ROOT, running_service
-from tests.shared_data import shared
+from rig.formats.archive import pack_folder
+from server.cli.client import Client
+from server.services.truth import error_mm
+from tests.support.services import ROOT, running_service
+from tests.support.shared_data import shared
 
 # A visual hull from perfect silhouettes of these captures is 1.3 mm off in the median (README beside them); a head that
 # explains the silhouettes must be closer than that.
@@ -23,7 +23,7 @@ HULL_MEDIAN_MM = 1.32
 @pytest.mark.gl
 @pytest.mark.timeout(600)
 def test_the_demo_ends_with_a_head_near_the_truth(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "server.cli", "demo", "--out", str(tmp_path / "out"), "--json"]
+    command = [sys.executable, "-m", "server.cli", "demo", "--compare", "--out", str(tmp_path / "out"), "--json"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
@@ -45,7 +45,7 @@ def test_a_foreign_capture_through_the_service_and_the_command_line_gives_the_sa
     """scan-a was rendered by a ray tracer that shares no code with the project."""
     folder, truth = shared("data/captures/scan-a"), shared("data/captures/scan-a.truth")
     pack_folder(folder, tmp_path / "scan-a.tar")
-    with running_service(tmp_path / "data", work="server.work:reconstruct_capture") as service:
+    with running_service(tmp_path / "data", work="server.tasks.reconstruct:reconstruct_capture") as service:
         with (tmp_path / "scan-a.tar").open("rb") as stream:
             accepted = httpx.post(service.url + "/v1/reconstructions", files={"file": stream}, timeout=120)
         assert accepted.status_code == 202, accepted.text

@@ -3,21 +3,16 @@
 import threading
 from typing import Any
 
-from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
-from server.calibrations import from_captures
 from server.console.coverage import advice, detect_shot, summary
 from server.console.page import Action, Page, remove_later, shared, show
 from server.console.removal import removals
-from server.problems import Problem
-from server.routes.calibrations import remove_calibration
-from server.routes.captures import take_capture
-from server.routes.rig import use_calibration
-from server.schemas import NewCapture, UseCalibration
-from server.service import Service
+from server.errors import Conflict, Unusable
+from server.services.captures import About
+from server.services.service import Service
 
 LABEL = "calibration board"
 SHOTS_LEAST = 3
@@ -37,11 +32,11 @@ class Shots:
             self.board, self.taken = board, [*self.taken, (capture, found)]
 
     def check(self, board: dict[str, Any]) -> None:
-        """Raises a 409 problem where the shots so far are of another board."""
+        """Raises Conflict where the shots so far are of another board."""
         with self._lock:
             if self.taken and board != self.board:
                 detail = f"The {len(self.taken)} shots so far are of another board. Calibrate or start over first."
-                raise Problem(409, "other-board", detail)
+                raise Conflict("other-board", detail)
 
     def drop_last(self) -> None:
         with self._lock:
@@ -93,21 +88,21 @@ def board_of(event: dict[str, Any]) -> dict[str, Any]:
 
 
 def shoot(page: Page, event: dict[str, Any]) -> str:
-    from calibration.board import board_from_document
+    from calibration.board.board import board_from_document
 
     board, service = board_of(event), page.service
     board_from_document(board)
     shots.check(board)
-    record = take_capture(service, page.caller, NewCapture.model_validate({"label": LABEL, "board": True}), Response())
-    files = service.store.folder("captures", record.id) / "files"
+    identity = service.captures.take(About(label=LABEL), board=True)["id"]
+    files = service.store.folder("captures", identity) / "files"
     with service.children.one() as child:
-        found = child.run("server.console.coverage:" + detect_shot.__name__, {"files": str(files), "board": board})
+        found = child.remote(detect_shot)(files=str(files), board=board)
     seen = sum(bool(corners) for corners in found.values())
     if not seen:
-        service.store.remove(service.store.folder("captures", record.id))
+        service.store.remove(service.store.folder("captures", identity))
         detail = "No camera saw the board; the shot was not kept. Check columns, rows and kind, and hold it in view."
-        raise Problem(422, "no-board", detail)
-    shots.add(board, record.id, found)
+        raise Unusable("no-board", detail)
+    shots.add(board, identity, found)
     shared.forget("calibration page")
     return f"Shot {len(shots.taken)}: {seen} of {len(found)} cameras see the board."
 
@@ -124,31 +119,26 @@ def start_over(page: Page, event: dict[str, Any]) -> None:
 
 def calibrate(page: Page, event: dict[str, Any]) -> str:
     if len(shots.taken) < SHOTS_LEAST:
-        raise Problem(
-            422, "too-few-shots", f"{len(shots.taken)} shots; at least {SHOTS_LEAST} are needed, 15 are good."
-        )
-    service = page.service
-    with service.store.incoming() as folder:
-        target = folder / "calibration"
-        target.mkdir()
-        from_captures(service.store, target, shots.board, [capture for capture, _ in shots.taken])
-        service.calibrations.add(target, "rig", str(event.get("label") or "")[:500])
+        detail = f"{len(shots.taken)} shots; at least {SHOTS_LEAST} are needed, 15 are good."
+        raise Unusable("too-few-shots", detail)
+    captures = [capture for capture, _ in shots.taken]
+    page.service.calibrations.add_shots(shots.board, captures, str(event.get("label") or "")[:500])
     shots.clear()
     _forget()
     return "The calibration is queued."
 
 
 def use(page: Page, event: dict[str, Any]) -> str:
-    use_calibration(page.service, page.caller, UseCalibration(calibration_id=event["id"]))
+    page.service.use_calibration(event["id"])
     _forget()
     return "Every capture from now on gets this calibration."
 
 
 def remove(page: Page, event: dict[str, Any]) -> None:
-    service, caller, identity = page.service, page.caller, event["id"]
+    service, identity = page.service, event["id"]
     found = service.calibrations.get(identity)
     title = f"calibration {found['label'] or identity[-6:]}"
-    remove_later(identity, lambda: remove_calibration(service, caller, identity), title, "capture")
+    remove_later(identity, lambda: service.calibrations.remove(identity), title, "capture")
 
 
 def _forget() -> None:

@@ -2,19 +2,16 @@
 
 from typing import Any
 
-from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model import list_models
+from rig.errors import InputError
 from server.console.page import Action, Page, remove_later, shared, show
 from server.console.removal import removals
-from server.problems import Problem
-from server.routes.captures import delete_capture, edit_capture
-from server.routes.jobs import submit_job, submit_session
-from server.routes.sessions import edit_session, erase_session, make_session
-from server.schemas import CaptureEdit, NewJob, NewSession, NewSessionJobs, SessionEdit
-from server.service import Service
+from server.services.captures import TEXT_MOST, About
+from server.services.jobs import Work
+from server.services.service import Service
 
 SHOWN = 500
 
@@ -53,59 +50,60 @@ def sessions_list(service: Service) -> list[dict[str, Any]]:
 
 
 def reconstruct(page: Page, event: dict[str, Any]) -> str:
-    wanted = {"capture_id": event["id"], **chosen_work(event)}
-    job = submit_job(page.service, page.caller, NewJob.model_validate(wanted), Response())
-    return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
+    job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
+    return f"Queued job {job['id'][-6:]}. Watch it on the page Jobs."
 
 
 def reconstruct_session(page: Page, event: dict[str, Any]) -> str:
-    wanted = NewSessionJobs.model_validate(chosen_work(event))
-    jobs = submit_session(page.service, page.caller, event["id"], wanted).jobs
+    work = chosen_work(event)
+    jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
     return f"Queued {len(jobs)} {'job' if len(jobs) == 1 else 'jobs'}. Watch them on the page Jobs."
 
 
-def chosen_work(event: dict[str, Any]) -> dict[str, Any]:
+def chosen_work(event: dict[str, Any]) -> Work:
     """Model and solver of the form; what is not chosen is the service's default."""
     settings = {"method": event["method"]} if event.get("method") else {}
-    return {"model": event.get("model") or None, "settings": settings}
+    return Work(event.get("model") or None, settings)
 
 
 def edit(page: Page, event: dict[str, Any]) -> None:
     given = {name: event[name] for name in ("label", "expression", "session") if name in event}
-    edit_capture(page.service, page.caller, event["id"], CaptureEdit.model_validate(given))
+    About.of({name: given[name] for name in given if name != "session"})
+    page.service.captures.edit(event["id"], given)
     shared.forget("captures")
 
 
 def new_session(page: Page, event: dict[str, Any]) -> str:
-    wanted = NewSession(label=event.get("label", ""), consent=event.get("consent", ""))
-    made = make_session(page.service, page.caller, wanted, Response())
+    made = page.service.sessions.add(*session_texts(event.get("label", ""), event.get("consent", "")))
     shared.forget("captures")
-    return f"Session {made.label or made.id[-6:]}: what is taken or uploaded now belongs to it."
+    return f"Session {made['label'] or made['id'][-6:]}: what is taken or uploaded now belongs to it."
 
 
 def edit_consent(page: Page, event: dict[str, Any]) -> None:
-    given = {name: event[name] for name in ("label", "consent") if name in event}
-    edit_session(page.service, page.caller, event["id"], SessionEdit.model_validate(given))
+    given = {name: str(event[name] or "") for name in ("label", "consent") if name in event}
+    session_texts(*given.values())
+    page.service.sessions.edit(event["id"], given)
     shared.forget("captures")
 
 
 def erase(page: Page, event: dict[str, Any]) -> str:
-    erase_session(page.service, page.caller, event["id"])
+    page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
     return "Erased: images, heads, jobs and all that was kept of them."
 
 
 def remove(page: Page, event: dict[str, Any]) -> None:
-    service, caller, identity = page.service, page.caller, event["id"]
-    record = service.store.capture(identity)
-    if active := service.jobs.active(capture=identity):
-        detail = "Jobs that are queued or running need this capture; cancel them first."
-        raise Problem(409, "capture-in-use", detail, [f"job {job}" for job in active])
+    service, identity = page.service, event["id"]
+    record = service.captures.check_unused(identity)
+    title = f"capture {record['label'] or identity[-6:]}"
+    remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
-    def delete() -> None:
-        delete_capture(service, caller, identity)
 
-    remove_later(identity, delete, f"capture {record['label'] or identity[-6:]}", "capture")
+def session_texts(*texts: str) -> tuple[str, ...]:
+    """Raises InputError for texts that are too long."""
+    if any(len(text) > TEXT_MOST for text in texts):
+        raise InputError("form", [f"a text is longer than {TEXT_MOST} characters"])
+    return texts
 
 
 CapturesPage.actions = {

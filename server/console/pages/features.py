@@ -6,22 +6,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.landmarks import SEVEN_POINTS
-from rig.layout import Rig
-from rig.layout_files import find_rig_file, read_rig_file
-from server.console.guides import helps, nearest_views
+from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.rig import Rig
+from server.console.guides import helps, mean_landmarks, nearest_views
 from server.console.page import Action, Page, shared, show
 from server.console.removal import removals
-from server.routes.captures import get_features, put_features
-from server.routes.jobs import submit_job
-from server.schemas import NewFeatures, NewJob
-from server.service import Service
+from server.services.jobs import Work
+from server.services.service import Service
 
 VIEWS = 4
+FORMAT = "eigenhead-features/1"
 
 
 class FeaturesPage(Page, component="features.js"):
@@ -40,7 +38,7 @@ class FeaturesPage(Page, component="features.js"):
 
     def _picking(self, capture_id: str) -> dict[str, Any]:
         if self.choice.get("of") != capture_id:
-            saved = get_features(self.service, self.caller, capture_id).points
+            saved = self.service.captures.features(capture_id)
             self.choice |= {"of": capture_id, "points": saved, "saved": saved}
         record = self.service.store.capture(capture_id)
         rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service, capture_id))
@@ -80,7 +78,7 @@ class Landmarks:
         try:
             with service.children.one() as child:
                 arguments = {"model": "default", "names": list(SEVEN_POINTS)}
-                found = child.run("server.console.guides:mean_landmarks", arguments)
+                found = child.remote(mean_landmarks)(**arguments)
             self.found = {name: np.array(point) for name, point in found.items()}
         finally:
             self._asked.release()
@@ -102,7 +100,7 @@ def place(page: Page, event: dict[str, Any]) -> None:
 
 def save(page: Page, event: dict[str, Any]) -> str:
     points = page.choice["points"]
-    put_features(page.service, page.caller, page.choice["of"], NewFeatures(points=points))
+    page.service.captures.put_features(page.choice["of"], {"format": FORMAT, "points": points})
     page.choice["saved"] = points
     return "Saved. Jobs from now on use these points."
 
@@ -110,9 +108,8 @@ def save(page: Page, event: dict[str, Any]) -> str:
 def reconstruct(page: Page, event: dict[str, Any]) -> str:
     if page.choice["points"] != page.choice["saved"]:
         save(page, event)
-    wanted = NewJob.model_validate({"capture_id": page.choice["of"]})
-    job = submit_job(page.service, page.caller, wanted, Response())
-    return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
+    job = page.service.jobs.submit(page.choice["of"], Work(), key=page.caller.key)
+    return f"Queued job {job['id'][-6:]}. Watch it on the page Jobs."
 
 
 FeaturesPage.actions = {

@@ -3,7 +3,6 @@
 import json
 from typing import Any
 
-from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
@@ -12,10 +11,8 @@ from rig.errors import InputError
 from server.console.page import Action, Page, remove_later, shared, show
 from server.console.pages.rig import read_report
 from server.console.removal import removals
-from server.jobs import FINISHED
-from server.routes.jobs import cancel_job, delete_job, restart_job
-from server.schemas import Restart
-from server.service import Service
+from server.services.jobs import FINISHED, Work
+from server.services.service import Service
 
 SHOWN = 200
 LOG_LINES = 200
@@ -89,10 +86,10 @@ def log_lines(events: list[Any]) -> list[dict[str, Any]]:
 
 
 def restart(page: Page, event: dict[str, Any]) -> str:
-    wanted = Restart(settings=chosen_settings(event), model=event.get("model") or None)
-    job = restart_job(page.service, page.caller, event["id"], Response(), wanted)
-    page.choice["job"] = job.id
-    return f"Queued job {job.id[-6:]}."
+    wanted = Work(event.get("model") or None, chosen_settings(event))
+    job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
+    page.choice["job"] = job["id"]
+    return f"Queued job {job['id'][-6:]}."
 
 
 def chosen_settings(event: dict[str, Any]) -> dict[str, Any]:
@@ -107,13 +104,13 @@ def chosen_settings(event: dict[str, Any]) -> dict[str, Any]:
 
 
 def cancel(page: Page, event: dict[str, Any]) -> None:
-    cancel_job(page.service, page.caller, event["id"])
+    page.service.cancel(event["id"])
 
 
 def delete(page: Page, event: dict[str, Any]) -> None:
-    service, caller, identity = page.service, page.caller, event["id"]
+    service, identity = page.service, event["id"]
     service.jobs.get(identity)
-    remove_later(identity, lambda: delete_job(service, caller, identity), f"job {identity[-6:]}", "submit")
+    remove_later(identity, lambda: service.jobs.delete(identity), f"job {identity[-6:]}", "submit")
 
 
 JobsPage.actions = {

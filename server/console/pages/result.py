@@ -10,7 +10,7 @@ from starlette.responses import RedirectResponse
 from server.console.page import Page, shared, show
 from server.console.pages.jobs import jobs_list
 from server.console.pages.rig import read_report
-from server.service import Service
+from server.services.service import Service
 
 THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of three.js
 MOSTLY = 0.25  # of a contour, as on the page Jobs

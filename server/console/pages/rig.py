@@ -3,17 +3,14 @@
 import json
 from typing import Any
 
-from fastapi import Response
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from server.console.media import live_view
 from server.console.page import Action, Page, shared, show
 from server.console.pages.captures import sessions_list
-from server.routes.captures import take_capture
-from server.routes.rig import take_background
-from server.schemas import NewCapture
-from server.service import Service
+from server.services.captures import About
+from server.services.service import Service
 
 
 class RigPage(Page, component="rig.js"):
@@ -79,17 +76,15 @@ def read_report(service: Service, job_id: str) -> dict[str, Any]:
 
 
 def capture(page: Page, event: dict[str, Any]) -> str:
-    about = {name: event.get(name) or "" for name in ("label", "expression")}
-    wanted = NewCapture.model_validate({**about, "session": event.get("session") or None})
-    record = take_capture(page.service, page.caller, wanted, Response())
-    return f"Captured {len(record.cameras)} pictures. They are on the page Captures."
+    record = page.service.captures.take(About.of(event))
+    return f"Captured {len(record['cameras'])} pictures. They are on the page Captures."
 
 
 def plates(page: Page, event: dict[str, Any]) -> str:
-    taken = take_background(page.service, page.caller)
-    return f"{taken.plates} clean plates of {len(taken.cameras)} cameras." + (
-        f" Note: {taken.note}." * bool(taken.note)
-    )
+    page.service.store.reserve(0, page.service.settings.free_bytes)
+    taken = page.service.rig.take_background()
+    note = f" Note: {taken['note']}." if taken["note"] else ""
+    return f"{taken['plates']} clean plates of {len(taken['cameras'])} cameras.{note}"
 
 
 RigPage.actions = {"capture": Action("capture", capture), "plates": Action("capture", plates)}

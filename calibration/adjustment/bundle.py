@@ -1,0 +1,131 @@
+"""One robust bundle adjustment over everything: intrinsics with distortion, camera poses, board poses.
+
+The project's Levenberg-Marquardt on blocks of the normal equations (``corner_term``); with eleven cameras and thirty
+shots they have 339 unknowns, which a dense Cholesky factor solves in ten milliseconds: sparse machinery would only cost
+(docs/calibration.md has the times beside scipy's and Ceres's).
+
+Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``, rho Cauchy's while outliers are sought and Huber's at the end, sigma_c
+each camera's own noise.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from calibration.adjustment import cholesky
+from calibration.adjustment.corner_term import CornerTerm
+from calibration.adjustment.lens_prior import AspectTerm, LensPrior
+from calibration.adjustment.state import (
+    INTRINSICS,
+    PER_CAMERA,
+    PER_SHOT,
+    BundleState,
+    Observations,
+    moved_state,
+    residuals,
+)
+from pipeline.estimation.levenberg_marquardt import Evidence, Limits, minimise
+from pipeline.estimation.robust import Cauchy, Huber, LeastSquares, Loss
+from pipeline.estimation.terms import Problem
+
+CAUCHY = Cauchy(2.0)  # in sigma: while outliers are sought
+HUBER = Huber(2.0)  # in sigma: 95 % of a Gaussian's 2D residuals are left as they are
+TOLERANCE = 1e-5  # predicted fall, in squared standard deviations, below which the solution stands
+STEPS_MOST = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """Which parameters move. The first camera's pose never does: it fixes the world."""
+
+    intrinsics: bool = True
+    poses: bool = True
+    boards: bool = True
+    offsets: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleSolution:
+    """Where the adjustment ended."""
+
+    state: BundleState
+    normal: Float[np.ndarray, "p p"]  # of the free parameters, at the solution, residuals in sigmas
+    free: Bool[np.ndarray, " q"]
+    evidence: Evidence
+
+    @property
+    def cost(self) -> float:
+        return self.evidence.cost
+
+    def covariance(self) -> Float[np.ndarray, "q q"]:
+        """Of all parameters, cameras (intrinsics, pose) first, then boards, then offsets; zero for what was fixed."""
+        full = np.zeros((len(self.free), len(self.free)))
+        # Scaled to a unit diagonal first: parameters span from 1e-4 (distortion) to 1e3 (mm).
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.normal), 1e-12))
+        scaled, eye = self.normal * np.outer(scale, scale), np.eye(len(scale))
+        try:
+            lower = cholesky.factor(scaled)
+        except cholesky.NotPositiveDefinite:
+            lower = cholesky.factor(scaled + 1e-9 * eye)  # what is not determined gets a variance beyond any use
+        inverse = cholesky.solve(lower, eye) * np.outer(scale, scale)
+        full[np.ix_(self.free, self.free)] = 0.5 * (inverse + inverse.T)
+        return full
+
+
+def corner_sigma(
+    state: BundleState, seen: Observations, lens_noise: Float[np.ndarray, " c"]
+) -> tuple[Float[np.ndarray, " c"], float]:
+    """Noise (px) of each camera's corners within the rig, and the part of it that all share.
+
+    A camera's own noise is known from its lens. What the joint fit leaves beyond it comes from moments that differ or a
+    board that bends: one variance for all cameras, for if each camera had its own, the fit could call one of them bad
+    and follow the others exactly."""
+    squares = (residuals(state, seen) ** 2).sum(axis=1)
+    typical = float(np.median(squares)) / 1.1774**2
+    shared = max(0.0, typical - float(np.median(lens_noise[seen.camera[seen.view_of]] ** 2)))
+    return np.sqrt(lens_noise**2 + shared), float(np.sqrt(shared))
+
+
+def solve(
+    state: BundleState,
+    seen: Observations,
+    prior: LensPrior,
+    sigma: Float[np.ndarray, " c"],
+    *,
+    free: Free | None = None,
+    loss: Loss | None = None,
+    steps: int = STEPS_MOST,
+    tick: Callable[[], None] = lambda: None,
+) -> BundleSolution:
+    """Minimises the cost from ``state``.
+
+    Args:
+        sigma: noise of a corner's coordinate by camera, px.
+        free: which parameters move; all but the time offsets by default.
+        loss: of |r|^2 / sigma^2; least squares by default.
+        tick: called before every step; what it raises ends the adjustment.
+    """
+    problem = bundle_problem(state, CornerTerm(seen, sigma, loss or LeastSquares()), prior, free or Free())
+    limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)
+    found = minimise(problem, state, limits, solve=cholesky.solve_system, watch=tick)
+    assert problem.free is not None
+    return BundleSolution(found.value, problem.equations(found.at).matrix, problem.free, found.evidence)
+
+
+def bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:
+    """The complete problem: corners, lenses, square pixels, and which parameters move."""
+    mask = free_mask(state, free)
+    return Problem((corners, prior, AspectTerm()), len(mask), moved_state, mask)
+
+
+def free_mask(state: BundleState, free: Free) -> Bool[np.ndarray, " q"]:
+    """Of all parameters, which move."""
+    cameras, shots = len(state.intrinsics), len(state.board_rotations)
+    per_camera = np.zeros((cameras, PER_CAMERA), dtype=bool)
+    per_camera[:, : len(INTRINSICS)] = free.intrinsics
+    per_camera[1:, len(INTRINSICS) :] = free.poses
+    offsets = np.full(cameras, free.offsets)
+    offsets[0] = False
+    return np.concatenate([per_camera.ravel(), np.full(shots * PER_SHOT, free.boards), offsets])

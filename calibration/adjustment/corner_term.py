@@ -1,0 +1,99 @@
+"""The bundle's main term: corners of a board as cameras see them.
+
+    r = (pi(camera_from_world @ (world_from_board @ X)) - detected) / sigma_c
+
+sigma_c each camera's own noise, under a robust loss of |r|^2. A view (one camera, one shot) touches 15 camera and 6
+board parameters and a time offset, so that the equations are assembled from 22 x 22 blocks, one a view.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from calibration.adjustment.state import (
+    DEPTH_LEAST_MM,
+    PER_CAMERA,
+    PER_SHOT,
+    BundleState,
+    Observations,
+    corner_positions,
+    residuals,
+)
+from pipeline.estimation.robust import LeastSquares, Loss
+from pipeline.estimation.terms import NormalEquations
+from rig.camera import lens_jacobians
+from rig.geometry import cross_matrix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornerTerm:
+    """``sigma_px``: noise of a coordinate, by camera."""
+
+    seen: Observations
+    sigma_px: Float[np.ndarray, " c"]
+    loss: Loss = field(default_factory=LeastSquares)
+
+    def at(self, state: BundleState) -> "CornersAt":
+        noise = self.sigma_px[self.seen.camera[self.seen.view_of]]
+        return CornersAt(self, state, residuals(state, self.seen) / noise[:, None], noise)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornersAt:
+    """All corners at one state."""
+
+    term: CornerTerm
+    state: BundleState
+    residual: Float[np.ndarray, "n 2"]  # in standard deviations
+    noise_px: Float[np.ndarray, " n"]
+
+    @property
+    def cost(self) -> float:
+        return float(self.term.loss.cost((self.residual**2).sum(axis=1)).sum())
+
+    def add_to(self, equations: NormalEquations) -> None:
+        seen, cameras = self.term.seen, len(self.state.intrinsics)
+        weight = np.sqrt(self.term.loss.weight((self.residual**2).sum(axis=1)))
+        blocks = np.concatenate([self.by_view(), self.residual[:, :, None]], axis=2)
+        blocks = (blocks * weight[:, None, None]).reshape(2 * len(self.residual), -1)
+        for view, (camera, shot) in enumerate(zip(seen.camera, seen.shot, strict=True)):
+            block = blocks[2 * seen.starts[view] : 2 * seen.starts[view + 1]]
+            product = block.T @ block
+            at = places(camera, shot, cameras, len(equations.gradient))
+            equations.matrix[np.ix_(at, at)] += product[:-1, :-1]
+            equations.gradient[at] += product[:-1, -1]
+
+    def by_view(self) -> Float[np.ndarray, "n 2 22"]:
+        """Derivatives by the parameters of the corner's own view: camera (15), board (6), time offset (1)."""
+        state, seen = self.state, self.term.seen
+        world, inside, camera = corner_positions(state, seen)
+        behind = inside[:, 2] < DEPTH_LEAST_MM
+        inside[behind] = (0.0, 0.0, 1.0)
+        by_point, by_lens = lens_jacobians(inside, state.intrinsics[camera])
+        by_world = by_point @ state.camera_rotations[camera]
+        by_board = np.concatenate([-by_world @ cross_matrix(world), by_world], axis=2)
+        by_offset = by_board @ state.velocities[seen.shot[seen.view_of]][:, :, None]
+        by_camera = [by_lens, -by_point @ cross_matrix(inside), by_point]
+        rows = np.concatenate([*by_camera, by_board, by_offset], axis=2)
+        rows[behind] = 0.0
+        rows /= self.noise_px[:, None, None]
+        return rows
+
+    def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
+        """Derivatives by all parameters, mostly zeros: for tests and other solvers."""
+        seen, rows = self.term.seen, self.by_view()
+        whole = np.zeros((*rows.shape[:2], size))
+        for view, (camera, shot) in enumerate(zip(seen.camera, seen.shot, strict=True)):
+            own = slice(seen.starts[view], seen.starts[view + 1])
+            whole[own, :, places(camera, shot, len(self.state.intrinsics), size)] = rows[own]
+        return whole
+
+
+def places(camera: int | np.integer, shot: int | np.integer, cameras: int, size: int) -> Int[np.ndarray, " 22"]:
+    """Where a view's parameters stand among all: its camera's, its board's, its camera's time offset."""
+    own, board = camera * PER_CAMERA, cameras * PER_CAMERA + shot * PER_SHOT
+    at = np.empty(PER_CAMERA + PER_SHOT + 1, int)
+    at[:PER_CAMERA], at[PER_CAMERA:-1] = np.arange(own, own + PER_CAMERA), np.arange(board, board + PER_SHOT)
+    at[-1] = size - cameras + camera
+    return at

@@ -1,0 +1,169 @@
+"""What of a rig's poses can be seen: errors of cameras, once the free choice of the world frame is taken out.
+
+A rig moved as a whole is the same rig. Two calibrations are therefore compared, and covariances stated, in the gauge
+that makes the images of the subject's region move least: with ``W`` the (6 C x 6 C, block-diagonal) sum of ``J^T J``
+over points on a sphere of the subject's size, ``J`` the derivative of a pixel by a left perturbation of
+camera_from_world, and ``A`` the (6 C x 6) motions of all cameras under a motion of the world, the projection is
+``S = I - A (A^T W A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment: A Modern
+Synthesis", section 9).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.camera import Camera, lens_jacobians
+from rig.geometry import RigidTransform, cross_matrix, rotation_from_vector
+from rig.rig import Rig
+
+SUBJECT_RADIUS_MM = 110.0
+
+
+def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 60) -> Float[np.ndarray, "n 3"]:
+    """Points spread evenly over a sphere about the point the cameras look at (a Fibonacci lattice)."""
+    index = np.arange(count) + 0.5
+    height, angle = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5)) * index
+    ring = np.sqrt(1 - height**2)
+    return rig.centre_world() + radius_mm * np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=1)
+
+
+def moved(camera: Camera, step: Float[np.ndarray, " 6"]) -> Camera:
+    """``camera`` under the left perturbation (rotation rad, translation mm): x' = R(w) x + v in the camera frame."""
+    motion = RigidTransform(rotation_from_vector(step[:3]), step[3:])
+    return replace(camera, camera_from_world=motion @ camera.camera_from_world)
+
+
+def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
+    """Derivative of the pixels by a left perturbation of camera_from_world."""
+    _, by_world = camera.project_with_jacobian(points_world)
+    by_camera = by_world @ camera.camera_from_world.rotation.T
+    points = camera.camera_from_world.apply(points_world)
+    return np.concatenate([-by_camera @ cross_matrix(points), by_camera], axis=2)
+
+
+def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c 6 6"]:
+    """Per camera, the mean squared image motion (px^2) of ``points_world`` as a quadratic form of the perturbation."""
+    metrics = []
+    for camera in rig:
+        jacobian = pose_jacobian(camera, points_world)
+        jacobian = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
+        metrics.append(np.einsum("nij,nik->jk", jacobian, jacobian) / max(1, len(jacobian)))
+    return np.stack(metrics)
+
+
+def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
+    """Left perturbations of all cameras that a motion of the world (rotation, translation, and scale) amounts to."""
+    columns = []
+    for camera in rig:
+        rotation, translation = camera.camera_from_world.rotation, camera.camera_from_world.translation
+        # camera_from_world @ motion: x' = R (W x + m) + t = (R W R^T)(x_c - t) + R m + t.
+        turn = np.concatenate([rotation, cross_matrix(translation) @ rotation])
+        shift = np.concatenate([np.zeros((3, 3)), rotation])
+        block = [turn, shift]
+        if scale:  # a larger world: points x (1 + s) are seen as before by cameras whose t grows the same
+            block.append(np.concatenate([np.zeros(3), translation])[:, None])
+        columns.append(np.concatenate(block, axis=1))
+    return np.concatenate(columns)
+
+
+def gauge_projection(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p p"]:
+    """``S`` of the module's docstring."""
+    weights = _block_diagonal(image_metric(rig, subject_points(rig)))
+    motions = world_motions(rig, scale=scale)
+    normal = motions.T @ weights @ motions
+    return np.eye(len(motions)) - motions @ np.linalg.solve(normal, motions.T @ weights)
+
+
+def _block_diagonal(blocks: Float[np.ndarray, "c 6 6"]) -> Float[np.ndarray, "p p"]:
+    count = len(blocks)
+    matrix = np.zeros((count, 6, count, 6))
+    matrix[np.arange(count), :, np.arange(count)] = blocks
+    return matrix.reshape(6 * count, 6 * count)
+
+
+def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
+    """``rig`` with its world moved (and scaled) so that its cameras see the subject's region as ``reference`` does.
+
+    The motion is found by Gauss-Newton on image distances, from the motion that brings the cameras' frames together."""
+    aligned = _brought_together(rig, reference)
+    points = subject_points(reference)
+    target = np.concatenate([reference[camera.name].project(points) for camera in rig]).ravel()
+    for _ in range(12):
+        moves = world_motions(aligned, scale=scale).reshape(len(rig), 6, -1)
+        jacobian = np.concatenate([pose_jacobian(c, points) @ m for c, m in zip(aligned, moves, strict=True)])
+        jacobian = jacobian.reshape(-1, moves.shape[2])
+        miss = target - np.concatenate([camera.project(points) for camera in aligned]).ravel()
+        good = np.isfinite(miss) & np.isfinite(jacobian).all(axis=1)
+        step = np.linalg.lstsq(jacobian[good], miss[good], rcond=None)[0]
+        aligned = _shifted(aligned, step)
+        if np.abs(step[:3]).max() < 1e-12 and np.abs(step[3:]).max() < 1e-9:
+            break
+    return aligned
+
+
+def _shifted(rig: Rig, step: np.ndarray) -> Rig:
+    """The rig with ``camera_from_world @ motion`` and, with a seventh entry, translations scaled."""
+    motion = RigidTransform(rotation_from_vector(step[:3]), step[3:6])
+    cameras = []
+    for camera in rig:
+        pose = camera.camera_from_world
+        if len(step) > 6:
+            pose = replace(pose, translation=pose.translation * (1 + step[6]))
+        cameras.append(replace(camera, camera_from_world=pose @ motion))
+    return Rig(tuple(cameras))
+
+
+def _brought_together(rig: Rig, reference: Rig) -> Rig:
+    """Mean over the cameras of camera_from_world(rig)^-1 @ camera_from_world(reference), applied to the world."""
+    moves = [camera.camera_from_world.inverse() @ reference[camera.name].camera_from_world for camera in rig]
+    u, _, vt = np.linalg.svd(np.sum([move.rotation for move in moves], axis=0))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    here = np.mean([camera.centre_world for camera in rig], axis=0)
+    there = np.mean([reference[camera.name].centre_world for camera in rig], axis=0)
+    motion = RigidTransform(rotation, here - rotation @ there)
+    return Rig(tuple(replace(camera, camera_from_world=camera.camera_from_world @ motion) for camera in rig))
+
+
+def image_distance(rig: Rig, reference: Rig, *, scale: bool = False) -> Float[np.ndarray, " c"]:
+    """Per camera, the RMS distance in pixels between where ``rig`` and ``reference`` see the subject's region, worlds
+    aligned: the size of a calibration error as a fit to silhouettes meets it. Each rig projects with its own lenses: a
+    principal point and a rotation that make up for each other are no error."""
+    points = subject_points(reference)
+    aligned = align_world(rig, reference, scale=scale)
+    misses = [camera.project(points) - reference[camera.name].project(points) for camera in aligned]
+    return np.array([np.sqrt(np.nanmean((miss**2).sum(axis=1))) for miss in misses])
+
+
+def intrinsics_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:
+    """Derivative of the pixels by fx fy cx cy k1 k2 p1 p2 k3."""
+    return lens_jacobians(camera.camera_from_world.apply(points_world), camera.intrinsics.values())[1]
+
+
+def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "6 15"]:
+    """The pose perturbation that acts on the subject's image like an error of intrinsics (first nine) and pose: what a
+    reader who takes the intrinsics for exact must allow the pose. A principal point 10 px off is almost a turn."""
+    by_pose = pose_jacobian(camera, points_world).reshape(-1, 6)
+    by_lens = intrinsics_jacobian(camera, points_world).reshape(-1, 9)
+    good = np.isfinite(by_pose).all(axis=1) & np.isfinite(by_lens).all(axis=1)
+    absorbed = np.linalg.lstsq(by_pose[good], by_lens[good], rcond=None)[0]
+    return np.concatenate([absorbed, np.eye(6)], axis=1)
+
+
+def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[np.ndarray, " c"]:
+    """Per camera, the standard deviation in pixels (2D) with which it sees the subject's region, worlds aligned, under
+    the joint covariance of all intrinsics (first nine) and poses: what ``image_distance`` to the truth will be."""
+    points, count = subject_points(rig), len(rig)
+    by_pose = [pose_jacobian(camera, points).reshape(-1, 6) for camera in rig]
+    by_lens = [intrinsics_jacobian(camera, points).reshape(-1, 9) for camera in rig]
+    values, vectors = np.linalg.eigh(covariance.reshape(15 * count, 15 * count))
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))).reshape(count, 15, -1)
+    motions = world_motions(rig).reshape(count, 6, 6)
+    images = np.concatenate([np.hstack([k, p]) @ r for k, p, r in zip(by_lens, by_pose, root, strict=True)])
+    free = np.concatenate([p @ m for p, m in zip(by_pose, motions, strict=True)])
+    lost = ~(np.isfinite(images).all(axis=1) & np.isfinite(free).all(axis=1))
+    images[lost], free[lost] = 0.0, 0.0
+    basis = np.linalg.qr(free)[0]
+    images = images - basis @ (basis.T @ images)
+    squares = (images**2).sum(axis=1).reshape(count, -1, 2).sum(axis=2)
+    return np.sqrt(squares.mean(axis=1))

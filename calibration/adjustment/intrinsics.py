@@ -1,0 +1,163 @@
+"""Lenses: the intrinsics of each camera from its own views of the board, as a start and as a verdict.
+
+Nothing here compares cameras, so shots need not be synchronised. The focal length starts from a scan (the board's pose
+follows from each candidate by IPPE: T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014);
+the bundle of ``bundle.py`` over the one camera finishes it, and its covariance says whether the views suffice.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from calibration.adjustment.bundle import CAUCHY, BundleSolution, solve
+from calibration.adjustment.lens_prior import weak_prior
+from calibration.adjustment.state import (
+    INTRINSICS,
+    BundleState,
+    intrinsics_of,
+    observations,
+    orthonormal,
+    residuals,
+    values_of,
+)
+from calibration.board.board import Board
+from calibration.board.corners import Found
+from calibration.board.detection import Detections, View
+from rig.camera import Intrinsics
+from rig.geometry import RigidTransform
+
+VIEWS_LEAST = 3  # two views of a plane determine fx, fy, cx, cy in theory; a third is the first check
+FOCAL_SHARE_MOST = 0.02  # a focal length looser than 2 % is called badly determined
+SCAN = np.geomspace(0.5, 4.5, 12)  # focal length / longer side of the image
+CORNER_SIGMA_LEAST = 0.02  # px: no detector is better, and a perfect fit must not become an infinite weight
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lens:
+    """One camera by itself. ``covariance`` is that of fx fy cx cy (px) k1 k2 p1 p2 k3."""
+
+    camera: str
+    intrinsics: Intrinsics
+    covariance: Float[np.ndarray, "9 9"]
+    rms_px: float
+    noise_px: float  # robust standard deviation of one coordinate
+    views: int
+    corners: int
+    poses: dict[str, RigidTransform]  # camera_from_board by shot
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " 9"]:
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def weakness(self) -> str | None:
+        """Why these views do not determine the lens well; None if they do."""
+        if self.views < VIEWS_LEAST:
+            return f"{self.camera}: {self.views} good views of the board; at least {VIEWS_LEAST}, better 10, are needed"
+        share = self.sigma[0] / self.intrinsics.fx
+        if share > FOCAL_SHARE_MOST:
+            return (
+                f"{self.camera}: {self.views} views leave the focal length {100 * share:.1f} % uncertain: "
+                "add views with the board tilted by 30 to 45 degrees, near and far, and in the image's corners"
+            )
+        return None
+
+
+def estimate_lenses(detections: Detections) -> dict[str, Lens]:
+    """A ``Lens`` per camera that sees the board at all."""
+    found = {camera: [v for v in detections.views if v.camera == camera] for camera in detections.sizes}
+    return {
+        camera: estimate_lens(views, detections.sizes[camera], detections.board)
+        for camera, views in found.items()
+        if views
+    }
+
+
+def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) -> Lens:
+    """Intrinsics and board poses of one camera (one or more views)."""
+    shots = [view.shot for view in views]
+    seen = observations(views, [views[0].camera], shots, board)
+    state = _start(views, size, board)
+    prior, sigma = weak_prior([size]), np.array([1.0])
+    solution = solve(state, seen, prior, sigma, loss=CAUCHY)
+    # Whole views that no pose explains (a misread grid) must not bend the lens: they are weighed down by Cauchy's rho,
+    # whose scale now becomes the camera's own noise.
+    for _ in range(2):
+        sigma = np.array([noise_of(residuals(solution.state, seen))])
+        solution = solve(solution.state, seen, prior, sigma, loss=CAUCHY)
+    state = orthonormal(solution.state)
+    return _lens(views, size, solution, state, float(sigma[0]), residuals(state, seen))
+
+
+def _lens(
+    views: Sequence[View],
+    size: tuple[int, int],
+    solution: BundleSolution,
+    state: BundleState,
+    noise: float,
+    misses: np.ndarray,
+) -> Lens:
+    squares = (misses**2).sum(axis=1)
+    good = squares < (6 * noise) ** 2
+    covariance = solution.covariance()[: len(INTRINSICS), : len(INTRINSICS)]
+    poses = {
+        view.shot: RigidTransform(rotation, translation)
+        for view, rotation, translation in zip(views, state.board_rotations, state.board_translations, strict=True)
+    }
+    rms = float(np.sqrt(squares[good].mean()))
+    intrinsics = intrinsics_of(state.intrinsics[0], size)
+    return Lens(views[0].camera, intrinsics, covariance, rms, noise, len(views), len(misses), poses)
+
+
+def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
+    """Robust standard deviation of one coordinate, px: the median of a 2D Gaussian's radius is 1.1774 sigma."""
+    if not len(misses):
+        return 1.0
+    return max(float(np.median(np.linalg.norm(misses, axis=1))) / 1.1774, CORNER_SIGMA_LEAST)
+
+
+def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> BundleState:
+    """Focal length by a scan, principal point in the middle, no distortion; boards by IPPE."""
+    width, height = size
+    best: tuple[float, Intrinsics, list[RigidTransform]] | None = None
+    for share in SCAN:
+        focal = share * max(size)
+        intrinsics = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        fits = [board_poses_of(view.found, intrinsics, board)[0] for view in views]
+        # The mean of the roots: one bad view must not choose the focal length.
+        score = float(np.mean([np.sqrt(rms) for _, rms in fits]))
+        if best is None or score < best[0]:
+            best = (score, intrinsics, [pose for pose, _ in fits])
+    assert best is not None
+    _, intrinsics, poses = best
+    return single_state(intrinsics, poses)
+
+
+def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTransform]) -> BundleState:
+    """The state of one camera at the world's origin."""
+    return BundleState(
+        values_of(intrinsics)[None],
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        np.stack([pose.rotation for pose in camera_from_boards]),
+        np.stack([pose.translation for pose in camera_from_boards]),
+        np.zeros(1),
+        np.zeros((len(camera_from_boards), 6)),
+    )
+
+
+def board_poses_of(found: Found, intrinsics: Intrinsics, board: Board) -> list[tuple[RigidTransform, float]]:
+    """camera_from_board with the RMS in pixels, best first: the two poses between which a plane's image wavers."""
+    points = board.corners()[found.ids]
+    count, turns, shifts, errors = cv2.solvePnPGeneric(
+        points, found.corners, intrinsics.matrix(), intrinsics.distortion.opencv(), flags=cv2.SOLVEPNP_IPPE
+    )
+    fits = []
+    for turn, shift, error in zip(turns[:count], shifts[:count], np.asarray(errors).ravel(), strict=False):
+        pose = RigidTransform(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift, dtype=float).ravel())
+        if np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all() and pose.translation[2] > 0:
+            fits.append((pose, float(error)))
+    return sorted(fits, key=lambda fit: fit[1]) or [(RigidTransform(np.eye(3), np.array([0.0, 0.0, 1e3])), 1e3)]

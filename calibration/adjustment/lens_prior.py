@@ -1,0 +1,103 @@
+"""What is known of lenses before, or beside, the corners: Gaussian priors of the intrinsics.
+
+The priors are weak; they only keep what the views do not determine where lenses are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.adjustment.state import INTRINSICS, PER_CAMERA, BundleState
+from pipeline.estimation.terms import NormalEquations
+
+# Standard deviations of the priors. Lenses of 15 to 85 mm full-frame equivalent span a factor 2 to either side of 1.2
+# image widths; sensors have square pixels to a percent; optical axes pass near the middle.
+FOCAL_PRIOR, ASPECT_PRIOR, CENTRE_PRIOR = 0.7, 0.01, 0.05
+LENS_PRIOR = {"k1": 0.5, "k2": 0.5, "p1": 0.01, "p2": 0.01, "k3": 0.5}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensPrior:
+    """Gaussian knowledge of the intrinsics: mean and information (inverse covariance) per camera."""
+
+    mean: Float[np.ndarray, "c 9"]
+    information: Float[np.ndarray, "c 9 9"]
+
+    def combine(self, mean: Float[np.ndarray, "c 9"], information: Float[np.ndarray, "c 9 9"]) -> "LensPrior":
+        """Two independent pieces of knowledge joined."""
+        total = self.information + information
+        pull = np.einsum("cij,cj->ci", self.information, self.mean) + np.einsum("cij,cj->ci", information, mean)
+        return LensPrior(np.linalg.solve(total, pull[:, :, None])[:, :, 0], total)
+
+    def at(self, state: BundleState) -> "LensPriorAt":
+        return LensPriorAt(self, state.intrinsics - self.mean)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensPriorAt:
+    """``LensPrior`` at a distance from its mean."""
+
+    prior: LensPrior
+    away: Float[np.ndarray, "c 9"]
+
+    @property
+    def cost(self) -> float:
+        return float(np.einsum("ci,cij,cj->", self.away, self.prior.information, self.away))
+
+    def add_to(self, equations: NormalEquations) -> None:
+        for camera, (information, away) in enumerate(zip(self.prior.information, self.away, strict=True)):
+            own = slice(camera * PER_CAMERA, camera * PER_CAMERA + len(INTRINSICS))
+            equations.matrix[own, own] += information
+            equations.gradient[own] += information @ away
+
+
+class AspectTerm:
+    """Pixels are square: ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` by camera."""
+
+    def at(self, state: BundleState) -> "AspectsAt":
+        return AspectsAt(*state.intrinsics[:, :2].T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AspectsAt:
+    """The focal lengths (px) of all cameras."""
+
+    fx: Float[np.ndarray, " c"]
+    fy: Float[np.ndarray, " c"]
+
+    @property
+    def residual(self) -> Float[np.ndarray, " c"]:
+        return 2.0 * (self.fx - self.fy) / (self.fx + self.fy) / ASPECT_PRIOR
+
+    @property
+    def cost(self) -> float:
+        return float((self.residual**2).sum())
+
+    def slopes(self) -> Float[np.ndarray, "c 2"]:
+        """By fx and fy of the camera."""
+        return np.stack([4.0 * self.fy, -4.0 * self.fx], axis=1) / ((self.fx + self.fy)[:, None] ** 2 * ASPECT_PRIOR)
+
+    def add_to(self, equations: NormalEquations) -> None:
+        for camera, (slope, residual) in enumerate(zip(self.slopes(), self.residual, strict=True)):
+            own = slice(camera * PER_CAMERA, camera * PER_CAMERA + 2)
+            equations.matrix[own, own] += np.outer(slope, slope)
+            equations.gradient[own] += slope * residual
+
+
+def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
+    """What is known of any lens before a board is seen."""
+    mean, sigma = [], []
+    for width, height in sizes:
+        long = max(width, height)
+        mean.append([1.2 * long, 1.2 * long, (width - 1) / 2, (height - 1) / 2, 0, 0, 0, 0, 0])
+        spread = [FOCAL_PRIOR * 1.2 * long] * 2 + [CENTRE_PRIOR * width, CENTRE_PRIOR * height]
+        sigma.append(spread + [LENS_PRIOR[name] for name in INTRINSICS[4:]])
+    information = np.stack([np.diag(np.array(row, dtype=float) ** -2) for row in sigma])
+    return LensPrior(np.array(mean, dtype=float), information)
+
+
+def fixed_prior(intrinsics: Float[np.ndarray, "c 9"]) -> LensPrior:
+    """For lenses that do not move: ``Free(intrinsics=False)``."""
+    return LensPrior(intrinsics, np.zeros((len(intrinsics), 9, 9)))

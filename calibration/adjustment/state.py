@@ -1,0 +1,139 @@
+"""What a bundle adjustment estimates, what it has seen, and where a state puts every corner.
+
+Poses are perturbed from the left, as ``Camera.covariance`` states them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from calibration.board.board import Board
+from calibration.board.detection import View
+from rig.camera import Camera, Distortion, Intrinsics, lens_image
+from rig.geometry import RigidTransform, nearest_rotation, rotation_from_vector
+
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+PER_CAMERA, PER_SHOT = len(INTRINSICS) + 6, 6
+BEHIND_PX = 1e3  # residual of a corner that falls behind its camera
+DEPTH_LEAST_MM = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Corners of all views, sorted by view: ``camera``, ``shot`` index the state, ``starts`` the views."""
+
+    camera: Int[np.ndarray, " v"]
+    shot: Int[np.ndarray, " v"]
+    starts: Int[np.ndarray, " v+1"]
+    points: Float[np.ndarray, "n 3"]  # board frame, mm
+    pixels: Float[np.ndarray, "n 2"]
+
+    @property
+    def view_of(self) -> Int[np.ndarray, " n"]:
+        return np.repeat(np.arange(len(self.camera)), np.diff(self.starts))
+
+    def subset(self, kept: Bool[np.ndarray, " n"]) -> "Observations":
+        """Only the corners ``kept``; views stay, possibly empty."""
+        counts = np.bincount(self.view_of[kept], minlength=len(self.camera))
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        return replace(self, starts=starts, points=self.points[kept], pixels=self.pixels[kept])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BundleState:
+    """What is estimated. ``offsets``: time offset of each camera, in shots, along ``velocities`` of the board."""
+
+    intrinsics: Float[np.ndarray, "c 9"]
+    camera_rotations: Float[np.ndarray, "c 3 3"]
+    camera_translations: Float[np.ndarray, "c 3"]
+    board_rotations: Float[np.ndarray, "s 3 3"]
+    board_translations: Float[np.ndarray, "s 3"]
+    offsets: Float[np.ndarray, " c"]
+    velocities: Float[np.ndarray, "s 6"]
+
+    def camera_pose(self, index: int) -> RigidTransform:
+        return RigidTransform(self.camera_rotations[index], self.camera_translations[index])
+
+
+def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[str], board: Board) -> Observations:
+    corners = board.corners()
+    counts = [len(view.found.ids) for view in views]
+    return Observations(
+        np.array([cameras.index(view.camera) for view in views], dtype=int),
+        np.array([shots.index(view.shot) for view in views], dtype=int),
+        np.concatenate([[0], np.cumsum(counts)]).astype(int),
+        np.concatenate([corners[view.found.ids] for view in views]),
+        np.concatenate([view.found.corners for view in views]),
+    )
+
+
+def intrinsics_of(values: Float[np.ndarray, " 9"], size: tuple[int, int]) -> Intrinsics:
+    fx, fy, cx, cy, *lens = (float(value) for value in values)
+    return Intrinsics(*size, fx, fy, cx, cy, Distortion(*lens))
+
+
+def values_of(intrinsics: Intrinsics) -> Float[np.ndarray, " 9"]:
+    k = intrinsics
+    return np.array([k.fx, k.fy, k.cx, k.cy, *k.distortion.opencv()])
+
+
+def camera_of(state: BundleState, index: int, name: str, size: tuple[int, int]) -> Camera:
+    return Camera(name, intrinsics_of(state.intrinsics[index], size), state.camera_pose(index))
+
+
+def moved_state(state: BundleState, step: Float[np.ndarray, " q"]) -> BundleState:
+    """The state after a step of all parameters: cameras (intrinsics, pose), boards, time offsets."""
+    cameras, shots = len(state.intrinsics), len(state.board_rotations)
+    per_camera = step[: cameras * PER_CAMERA].reshape(cameras, PER_CAMERA)
+    per_shot = step[cameras * PER_CAMERA : cameras * PER_CAMERA + shots * PER_SHOT].reshape(shots, PER_SHOT)
+    turns, shifts = _motions(per_camera[:, len(INTRINSICS) :])
+    board_turns, board_shifts = _motions(per_shot)
+    return replace(
+        state,
+        intrinsics=state.intrinsics + per_camera[:, : len(INTRINSICS)],
+        camera_rotations=turns @ state.camera_rotations,
+        camera_translations=(turns @ state.camera_translations[:, :, None])[:, :, 0] + shifts,
+        board_rotations=board_turns @ state.board_rotations,
+        board_translations=(board_turns @ state.board_translations[:, :, None])[:, :, 0] + board_shifts,
+        offsets=state.offsets + step[len(step) - cameras :],
+    )
+
+
+def _motions(steps: Float[np.ndarray, "n 6"]) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+    turns = np.stack([rotation_from_vector(step[:3]) for step in steps]) if len(steps) else np.zeros((0, 3, 3))
+    return turns, steps[:, 3:]
+
+
+def orthonormal(state: BundleState) -> BundleState:
+    """Takes the rounding of many small turns out of the rotations."""
+    return replace(
+        state,
+        camera_rotations=np.stack([nearest_rotation(r) for r in state.camera_rotations]),
+        board_rotations=np.stack([nearest_rotation(r) for r in state.board_rotations]),
+    )
+
+
+def corner_positions(
+    state: BundleState, seen: Observations
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """World and camera coordinates of all corners, and the camera index of each."""
+    camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
+    world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
+    if state.offsets.any():
+        motion = state.velocities[shot] * state.offsets[camera][:, None]
+        # The offsets are small: the board's motion is taken to first order.
+        world = world + np.cross(motion[:, :3], world) + motion[:, 3:]
+    inside = np.einsum("nij,nj->ni", state.camera_rotations[camera], world) + state.camera_translations[camera]
+    return world, inside, camera
+
+
+def residuals(state: BundleState, seen: Observations) -> Float[np.ndarray, "n 2"]:
+    """Projected less detected, pixels; ``BEHIND_PX`` where a corner falls behind its camera."""
+    _, inside, camera = corner_positions(state, seen)
+    behind = inside[:, 2] < DEPTH_LEAST_MM
+    inside[behind] = (0.0, 0.0, 1.0)
+    miss = lens_image(inside, state.intrinsics[camera]) - seen.pixels
+    miss[behind] = BEHIND_PX
+    return miss

@@ -1,0 +1,61 @@
+"""Were the cameras' moments the same? A time offset per camera, from how the residuals follow the board's motion.
+
+The board's velocity in a shot is taken from its poses in the shots before and after (central differences), so offsets
+are in units of the time between shots, and mean something only where the shots are frames of one recording. Offsets are
+estimated beside everything else in the bundle; the first camera's is zero.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.adjustment.bundle import HUBER, Free, solve
+from calibration.adjustment.lens_prior import LensPrior
+from calibration.adjustment.state import BundleState, Observations, residuals
+from rig.geometry import RigidTransform, vector_from_rotation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeOffsets:
+    """Offsets and standard deviations per camera in shots, and the 2D RMS (px) without and with them."""
+
+    offsets: Float[np.ndarray, " c"]
+    sigma: Float[np.ndarray, " c"]
+    rms_without_px: float
+    rms_with_px: float
+
+
+def board_velocities(state: BundleState) -> Float[np.ndarray, "s 6"]:
+    """Left perturbation of world_from_board per shot; one-sided at the ends."""
+    poses = [RigidTransform(r, t) for r, t in zip(state.board_rotations, state.board_translations, strict=True)]
+    velocities = np.zeros((len(poses), 6))
+    for i in range(len(poses)):
+        first, last = max(0, i - 1), min(len(poses) - 1, i + 1)
+        if last > first:
+            motion = poses[last] @ poses[first].inverse()
+            turn = vector_from_rotation(motion.rotation)
+            # x' = x + w x x + v about the middle pose, so v is the motion of the point that the board turns about.
+            middle = poses[i].translation
+            shift = motion.apply(middle[None])[0] - middle
+            velocities[i] = np.concatenate([turn, shift - np.cross(turn, middle)]) / (last - first)
+    return velocities
+
+
+def estimate_offsets(
+    state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"]
+) -> TimeOffsets:
+    """Adds the offsets to the bundle and solves it again, from its solution ``state``."""
+    before = _rms(state, seen)
+    state = replace(state, velocities=board_velocities(state))
+    first = solve(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER).state
+    state = replace(first, velocities=board_velocities(first))  # which follow the poses, and those moved a little
+    solution = solve(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER)
+    state = solution.state
+    cameras = len(state.intrinsics)
+    spread = np.sqrt(np.diag(solution.covariance())[-cameras:])
+    return TimeOffsets(state.offsets, spread, before, _rms(state, seen))
+
+
+def _rms(state: BundleState, seen: Observations) -> float:
+    return float(np.sqrt((residuals(state, seen) ** 2).sum(axis=1).mean()))

@@ -1,0 +1,40 @@
+"""The world frame of a rig calibrated here: x to the subject's left, y up, z towards the front camera.
+
+Up is the direction to which the cameras' image rows are perpendicular: a camera that is not rolled has its x axis
+horizontal at whatever elevation it stands. The origin is the point nearest to all optical axes.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.errors import InputError
+from rig.geometry import RigidTransform
+from rig.rig import Rig
+
+
+def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
+    """Unit vector, in the rig's present frame, that the cameras hold to be up."""
+    rights = np.stack([camera.camera_from_world.rotation[0] for camera in rig])
+    ups = -np.stack([camera.camera_from_world.rotation[1] for camera in rig])
+    values, vectors = np.linalg.eigh(rights.T @ rights)
+    mean = ups.mean(axis=0)
+    # Two small eigenvalues: all cameras look the same way round, so their rows leave a plane of candidates.
+    spread = vectors[:, :1] if values[1] > 0.05 * values[2] else vectors[:, :2]
+    up = spread @ (spread.T @ mean)
+    return up / np.linalg.norm(up)
+
+
+def in_world_frame(rig: Rig, front: str | None = None) -> Rig:
+    """The same rig in the project's world frame. ``front`` names the front camera; without it the middle one of the
+    fan is taken. Covariances are those of left perturbations and do not change. Raises InputError if it is unknown."""
+    if front is not None and front not in rig:
+        raise InputError("front camera", [f"{front!r} is no camera of the rig ({', '.join(rig.names)})"])
+    origin, up = rig.centre_world(), up_direction(rig)
+    forward = rig[front or rig.front_camera()].centre_world - origin
+    forward = forward - up * (up @ forward)
+    forward /= np.linalg.norm(forward)
+    new_from_old = np.stack([np.cross(up, forward), up, forward])
+    old_from_new = RigidTransform(new_from_old.T, origin)
+    return Rig(tuple(replace(camera, camera_from_world=camera.camera_from_world @ old_from_new) for camera in rig))

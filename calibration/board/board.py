@@ -1,0 +1,255 @@
+"""The calibration board: what is printed, and where its corners lie.
+
+Board frame: origin at the outer corner of the first square, x along a row of squares, y down its columns, z *into* the
+board (away from who looks at it), so that a camera before the board sees x to the right when y points down: the frame
+is right-handed and matches OpenCV's. The first square is black (white if ``inverted``). Corners are the inner ones,
+numbered row by row.
+"""
+
+import tomllib
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from fpdf import FPDF
+from jaxtyping import Bool, Float, Int
+
+from rig.atomic_write import write_atomically
+from rig.errors import InputError
+
+Kind = Literal["checkerboard", "charuco"]
+SQUARES_LEAST, SQUARES_MOST = 3, 60
+PAPERS_MM = {
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+}
+MARGIN_MM = 8.0  # what common printers leave blank
+FOOT_MM = 22.0  # ruler and caption
+RULER_MM = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """``columns`` and ``rows`` count squares. ``measured_*_mm`` is the printed pattern's outer size by a ruler or
+    caliper, if someone measured it: the second distance against which the scale is checked."""
+
+    kind: Kind
+    columns: int
+    rows: int
+    square_mm: float
+    marker_ratio: float = 0.75
+    dictionary: str = "DICT_4X4_1000"
+    inverted: bool = False
+    measured_width_mm: float | None = None
+    measured_height_mm: float | None = None
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Inner corners as (columns, rows), OpenCV's pattern size."""
+        return self.columns - 1, self.rows - 1
+
+    @property
+    def corner_count(self) -> int:
+        return self.grid[0] * self.grid[1]
+
+    def corners(self) -> Float[np.ndarray, "n 3"]:
+        """The inner corners in the board frame, mm, row by row."""
+        x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
+        return self.square_mm * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+    def centre(self) -> Float[np.ndarray, " 3"]:
+        return 0.5 * self.square_mm * np.array([self.columns, self.rows, 0.0])
+
+    def turns(self) -> list[Int[np.ndarray, " _"]]:
+        """Orders of the corners that no picture can tell apart from the first: ``order[i]`` is the corner that looks
+        like corner i once the board is turned. A ChArUco board has one, for its markers differ."""
+        index = np.arange(self.corner_count).reshape(self.rows - 1, self.columns - 1)
+        if self.kind == "charuco":
+            return [index.ravel()]
+        # Turned by 90 degrees the square (0, 0) lands on (columns - 1, 0), by 180 on (columns - 1, rows - 1); the
+        # colours agree where those two are of one colour, that is where the sum of their places is even.
+        orders = [index]
+        if (self.columns + self.rows) % 2 == 0:
+            orders.append(index[::-1, ::-1])
+        if self.columns == self.rows and self.columns % 2 == 1:
+            orders += [np.rot90(index), np.rot90(index, 3)]
+        return [np.ascontiguousarray(order).ravel() for order in orders]
+
+    @property
+    def is_chiral(self) -> bool:
+        """Whether a picture of the pattern differs from every picture of its mirror image: only then can a mirrored
+        camera be told from its own pictures. A checkerboard with an odd side, or a square one, is its own image."""
+        if self.kind == "charuco":
+            return True
+        return self.columns % 2 == 0 and self.rows % 2 == 0 and self.columns != self.rows
+
+    def squares(self) -> Bool[np.ndarray, "rows columns"]:
+        """True where a square is black."""
+        row, column = np.indices((self.rows, self.columns))
+        return ((row + column) % 2 == 0) ^ self.inverted
+
+    def opencv(self) -> cv2.aruco.CharucoBoard:
+        """OpenCV's own board; ChArUco only."""
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        size = (self.columns, self.rows)
+        return cv2.aruco.CharucoBoard(size, self.square_mm, self.square_mm * self.marker_ratio, dictionary)
+
+
+def read_board(path: Path) -> Board:
+    """Reads ``board.toml``. Raises InputError naming every fault."""
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(path.name, [f"cannot be read as TOML ({error})"]) from error
+    return board_from_document(document, path.name)
+
+
+def board_from_document(document: dict[str, Any], subject: str = "board.toml") -> Board:
+    """The board of decoded TOML. Raises InputError naming every fault."""
+    known = set(Board.__dataclass_fields__)
+    faults = [f"unknown key {key!r}; known are {', '.join(sorted(known))}" for key in document if key not in known]
+    faults += [f"{key} is missing" for key in ("kind", "columns", "rows", "square_mm") if key not in document]
+    kind = document.get("kind")
+    if kind not in ("checkerboard", "charuco", None):
+        faults.append(f"kind is {kind!r}, wanted 'checkerboard' or 'charuco'")
+    for key in ("columns", "rows"):
+        value = document.get(key, SQUARES_LEAST)
+        if isinstance(value, bool) or not isinstance(value, int) or not SQUARES_LEAST <= value <= SQUARES_MOST:
+            faults.append(
+                f"{key} is {value!r}, wanted a whole number of squares from {SQUARES_LEAST} to {SQUARES_MOST}"
+            )
+    ranges = {"square_mm": (0.5, 1000.0), "marker_ratio": (0.3, 0.95)}
+    ranges |= {key: (1.0, 1e5) for key in ("measured_width_mm", "measured_height_mm")}
+    for key, (least, most) in ranges.items():
+        value = document.get(key, least)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+            faults.append(f"{key} is {value!r}, wanted a number from {least:g} to {most:g}")
+    if not isinstance(document.get("inverted", False), bool):
+        faults.append(f"inverted is {document['inverted']!r}, wanted true or false")
+    faults += _dictionary_faults(document) if not faults and kind == "charuco" else []
+    if faults:
+        raise InputError(subject, faults)
+    floats = {key: float(document[key]) for key in ranges if key in document}
+    return Board(**{**document, **floats})
+
+
+def _dictionary_faults(document: dict[str, Any]) -> list[str]:
+    name = document.get("dictionary", "DICT_4X4_1000")
+    if not isinstance(name, str) or not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
+        return [f"dictionary is {name!r:.60}, wanted one of OpenCV's, such as 'DICT_4X4_1000'"]
+    held = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
+    wanted = document["columns"] * document["rows"] // 2
+    return [f"{name} holds {held} markers; the board needs {wanted}"] if held < wanted else []
+
+
+def write_board(board: Board, path: Path) -> None:
+    """Writes ``board.toml``."""
+    lines = [f'kind = "{board.kind}"', f"columns = {board.columns}  # squares", f"rows = {board.rows}"]
+    lines.append(f"square_mm = {board.square_mm!r}")
+    if board.kind == "charuco":
+        lines += [
+            f"marker_ratio = {board.marker_ratio!r}  # marker side / square side",
+            f'dictionary = "{board.dictionary}"',
+        ]
+    lines.append(f"inverted = {str(board.inverted).lower()}")
+    for key in ("measured_width_mm", "measured_height_mm"):
+        value = getattr(board, key)
+        lines.append(f"# {key} = {board.square_mm * _side(board, key):g}" if value is None else f"{key} = {value!r}")
+    if board.measured_width_mm is None:
+        lines.append("# measure the printed pattern with a ruler, outer edge to outer edge, and enter it above")
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
+
+
+def _side(board: Board, key: str) -> int:
+    return board.columns if "width" in key else board.rows
+
+
+def write_board_pdf(board: Board, path: Path) -> None:
+    """Writes the board at true scale, on the smallest paper that holds it, with a ruler to check the print."""
+    width, height = board.columns * board.square_mm, board.rows * board.square_mm
+    page = _paper(width, height)
+    pdf = FPDF(unit="mm", format=page)
+    pdf.set_creation_date(datetime(2000, 1, 1, tzinfo=UTC))  # the same board gives the same bytes
+    pdf.set_margins(0, 0, 0)
+    pdf.set_auto_page_break(False)
+    pdf.add_page()
+    left, top = (page[0] - width) / 2, max(MARGIN_MM, (page[1] - FOOT_MM - height) / 2)
+    pdf.set_fill_color(0)
+    if board.inverted:  # the detectors want a rim of the lighter colour, which is black here
+        rim = min(board.square_mm / 2, left, top)
+        pdf.rect(left - rim, top - rim, width + 2 * rim, height + 2 * rim, style="F")
+    for x, y, w, h, white in _rectangles(board):
+        pdf.set_fill_color(255 if white else 0)
+        pdf.rect(left + x, top + y, w, h, style="F")
+    _draw_foot(pdf, board, page)
+    write_atomically(path, bytes(pdf.output()))
+
+
+def _paper(width: float, height: float) -> tuple[float, float]:
+    needed = width + 2 * MARGIN_MM, height + MARGIN_MM + FOOT_MM
+    for short, long in PAPERS_MM.values():
+        for page in ((short, long), (long, short)):
+            if needed[0] <= page[0] and needed[1] <= page[1]:
+                return page
+    return max(needed[0], RULER_MM + 2 * MARGIN_MM), needed[1]
+
+
+def _rectangles(board: Board) -> list[tuple[float, float, float, float, bool]]:
+    """x, y, width, height in mm, and whether white; in the order of drawing."""
+    side = board.square_mm
+    paint = board.inverted  # white squares on black paper, or black on white
+    found = [(c * side, r * side, side, side, paint) for r, c in zip(*np.nonzero(board.squares() ^ paint), strict=True)]
+    if board.kind == "charuco":
+        for number, corners in enumerate(board.opencv().getObjPoints()):
+            x, y = np.asarray(corners)[:, :2].min(axis=0)
+            found += _marker(board, number, float(x), float(y))
+    return found
+
+
+def _marker(board: Board, number: int, x: float, y: float) -> list[tuple[float, float, float, float, bool]]:
+    dictionary = board.opencv().getDictionary()
+    cells = dictionary.markerSize + 2
+    black = cv2.aruco.generateImageMarker(dictionary, number, cells, borderBits=1) == 0
+    cell = board.square_mm * board.marker_ratio / cells
+    runs = []
+    # Runs along rows and along columns overlap, so that no viewer shows hairlines between neighbouring cells.
+    for row, first, last in _runs(black):
+        runs.append((x + first * cell, y + row * cell, (last - first) * cell, cell, board.inverted))
+    for column, first, last in _runs(black.T):
+        runs.append((x + column * cell, y + first * cell, cell, (last - first) * cell, board.inverted))
+    return runs
+
+
+def _runs(cells: Bool[np.ndarray, "n n"]) -> list[tuple[int, int, int]]:
+    """(line, first, behind the last) of every run of True."""
+    padded = np.pad(cells, ((0, 0), (1, 1))).astype(np.int8)
+    steps = np.diff(padded, axis=1)
+    starts, ends = np.argwhere(steps == 1), np.argwhere(steps == -1)
+    return [(int(line), int(first), int(last)) for (line, first), (_, last) in zip(starts, ends, strict=True)]
+
+
+def _draw_foot(pdf: FPDF, board: Board, page: tuple[float, float]) -> None:
+    left, base = max(MARGIN_MM, (page[0] - RULER_MM) / 2), page[1] - MARGIN_MM - 2.0
+    pdf.set_fill_color(0)
+    for millimetre in range(RULER_MM + 1):
+        length = 5.0 if millimetre % 10 == 0 else 3.5 if millimetre % 5 == 0 else 2.0
+        pdf.rect(left + millimetre - 0.05, base - length, 0.1, length, style="F")
+    pdf.set_font("Helvetica", size=6)
+    for centimetre in range(0, RULER_MM + 1, 10):
+        pdf.text(left + centimetre - 1.2, base + 2.5, str(centimetre))
+    kind = f"{board.kind}, {board.columns} x {board.rows} squares of {board.square_mm:g} mm"
+    if board.kind == "charuco":
+        kind += f", {board.dictionary}, marker ratio {board.marker_ratio:g}"
+    pdf.set_font("Helvetica", size=7)
+    pdf.text(left, base - 9.5, kind)
+    pdf.text(
+        left,
+        base - 6.5,
+        "Print at 100 % (no scaling). The ruler must measure 100 mm; glue the sheet to a flat, stiff plate.",
+    )

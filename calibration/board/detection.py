@@ -1,0 +1,183 @@
+"""Finding the board in pictures, in parallel, remembered by content. ``corners`` looks at one picture."""
+
+import contextlib
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from calibration.board.board import Board
+from calibration.board.corners import Found, detect
+from calibration.board.missing import explain
+from rig.atomic_write import write_atomically
+from rig.errors import EigenheadError, InputError
+from rig.formats.cameras_json import name_fault
+
+VERSION = 1  # of the detector: part of the cache's key
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+
+
+EXPLAINED = 4  # pictures of a blind camera that are looked at twice
+
+
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one camera saw of the board in one shot."""
+
+    camera: str
+    shot: str
+    found: Found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """All finds. ``sizes``: (width, height) per camera, in the order of the cameras; ``missed``: (camera, shot) without
+    a find; ``notes`` say, per camera, what was wrong with pictures that hold another pattern."""
+
+    board: Board
+    sizes: dict[str, tuple[int, int]]
+    shots: tuple[str, ...]
+    views: tuple[View, ...]
+    missed: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def corner_count(self) -> int:
+        return sum(len(view.found.ids) for view in self.views)
+
+
+class WrongBoard(EigenheadError):
+    """The pictures do not show the board that was described."""
+
+    def __init__(self, notes: Iterable[str]) -> None:
+        super().__init__("the pictures do not show the board of board.toml: " + "; ".join(notes))
+
+
+def ignore_progress(stage: str, fraction: float) -> None:
+    """The progress hook of callers that want none."""
+
+
+def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
+    """``IMAGES/<camera>/<shot>.<ext>`` as {camera: {shot: path}}. Raises InputError naming every fault."""
+    if not folder.is_dir():
+        raise InputError(str(folder), ["is no folder; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)"])
+    faults, cameras = [], {}
+    for inner in sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
+        paths = sorted(path for path in inner.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+        if not paths:
+            continue
+        fault = name_fault(inner.name)
+        shots = {path.stem: path for path in paths}
+        faults += [f"camera {fault}"] if fault else []
+        faults += [f"{inner.name} holds two pictures of one shot"] if len(shots) < len(paths) else []
+        cameras[inner.name] = shots
+    if not cameras:
+        faults.append("holds no pictures; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)")
+    if faults:
+        raise InputError(str(folder.name), faults)
+    return cameras
+
+
+def detect_folder(
+    folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Report = ignore_progress
+) -> Detections:
+    """Finds the board in every picture of ``folder``. Raises InputError on damaged input, WrongBoard where no picture
+    shows the board and some show another. ``cache`` is a folder in which finds are kept by the pictures' content."""
+    pictures = list_pictures(folder)
+    tasks = [(camera, shot, path) for camera, shots in pictures.items() for shot, path in shots.items()]
+    results: list[tuple[tuple[int, int], Found | None] | str] = []
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(_detect_file, path, board, cache) for _, _, path in tasks]
+        try:
+            for done, future in enumerate(futures, start=1):
+                results.append(future.result())
+                report("detection", done / len(futures))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    faults = [
+        f"{c}/{path.name} {result}"
+        for (c, _, path), result in zip(tasks, results, strict=True)
+        if isinstance(result, str)
+    ]
+    sizes: dict[str, tuple[int, int]] = {}
+    views, missed = [], []
+    for (camera, shot, path), result in zip(tasks, results, strict=True):
+        if isinstance(result, str):
+            continue
+        size, found = result
+        if sizes.setdefault(camera, size) != size:
+            faults.append(f"{camera}/{path.name} is {size[0]} x {size[1]}, the camera's first is {sizes[camera]}")
+        if found is None:
+            missed.append((camera, shot))
+        else:
+            views.append(View(camera, shot, found))
+    if faults:
+        raise InputError(folder.name, faults)
+    shots = tuple(sorted({shot for _, shot, _ in tasks}))
+    notes = _explain_missing(pictures, sizes, views, board)
+    if notes and not views:
+        raise WrongBoard(notes)
+    return Detections(board, sizes, shots, tuple(views), tuple(missed), tuple(notes))
+
+
+def _detect_file(path: Path, board: Board, cache: Path | None) -> tuple[tuple[int, int], Found | None] | str:
+    """(size, find), or what is wrong with the file."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        return f"cannot be read ({error.strerror or error})"
+    grey = _decode(data)
+    if grey is None:
+        return "is no picture that can be decoded"
+    size = (grey.shape[1], grey.shape[0])
+    if cache is None:
+        return size, detect(grey, board)
+    key = hashlib.sha256(f"{VERSION} {cv2.__version__} {board!r} ".encode() + data).hexdigest()
+    kept = cache / f"{key}.npz"
+    with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # absent or damaged: detect again
+        return size, _from_cache(kept)
+    found = detect(grey, board)
+    buffer = io.BytesIO()
+    np.savez(buffer, **({} if found is None else {"ids": found.ids, "corners": found.corners, "rise": found.rise_px}))
+    write_atomically(kept, buffer.getvalue())
+    return size, found
+
+
+def _decode(data: bytes) -> UInt8[np.ndarray, "h w"] | None:
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None
+
+
+def _from_cache(path: Path) -> Found | None:
+    with np.load(path) as kept:
+        return Found(kept["ids"], kept["corners"], float(kept["rise"])) if "ids" in kept else None
+
+
+def _explain_missing(
+    pictures: dict[str, dict[str, Path]], sizes: dict[str, tuple[int, int]], views: list[View], board: Board
+) -> list[str]:
+    """For each camera that never sees the board: what its pictures show instead, where that can be told."""
+    notes = []
+    seen = {view.camera for view in views}
+    for camera in (camera for camera in sizes if camera not in seen):
+        paths = list(pictures[camera].values())
+        for path in paths[:: max(1, len(paths) // EXPLAINED)][:EXPLAINED]:
+            grey = _decode(path.read_bytes())
+            reason = explain(grey, board) if grey is not None else None
+            if reason:
+                notes.append(f"{camera}/{path.name}: {reason}")
+                break
+    return notes

@@ -1,0 +1,204 @@
+"""Checks that a low reprojection error does not imply. A calibration that fails one is refused, with what to do."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+
+from calibration.adjustment.bundle import HUBER, Free, solve
+from calibration.adjustment.gauge import align_world, image_distance
+from calibration.adjustment.lens_prior import LensPrior, fixed_prior
+from calibration.adjustment.state import BundleState, Observations, residuals
+from calibration.board.board import Board
+from rig.rig import Rig
+
+HELD_OUT_EVERY = 5  # every fifth shot is held out once
+HELD_OUT_RATIO, HELD_OUT_LEAST_PX = 1.5, 0.3
+SCALE_SHARE = 0.005  # a ruler on a printed board is read to 0.5 mm in 200
+FOCAL_CHANGE = 0.02
+LOOSE_PX = 2.0  # a camera whose pose is looser than this, seen at the subject, is not calibrated
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """``passed`` is None where there was nothing to check against; ``advice`` says what to do on failure."""
+
+    name: str
+    passed: bool | None
+    detail: str
+    advice: str = ""
+
+
+def check_cheirality(state: BundleState, seen: Observations, board: Board) -> Check:
+    """Every corner lies before its camera, every board shows its face, and the rotations are proper."""
+    camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
+    world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
+    points = np.einsum("nij,nj->ni", state.camera_rotations[camera], world) + state.camera_translations[camera]
+    normals = np.einsum("nij,nj->ni", state.camera_rotations[camera], state.board_rotations[shot][:, :, 2])
+    behind = int((points[:, 2] <= 0).sum())
+    backs = len(np.unique(seen.view_of[(normals * points).sum(axis=1) <= 0]))
+    rotations = np.concatenate([state.camera_rotations, state.board_rotations])
+    proper = bool((np.linalg.det(rotations) > 0).all())
+    told = "mirrored pictures would show" if board.is_chiral else "a wholly mirrored rig would not show with this board"
+    detail = f"{behind} corners behind a camera, {backs} views of the board's back; {told}"
+    advice = "take the shots again; if pictures are mirrored in a camera or its software, turn that off"
+    return Check("cheirality", behind == 0 and backs == 0 and proper, detail, advice)
+
+
+def check_held_out(
+    state: BundleState,
+    seen: Observations,
+    prior: LensPrior,
+    sigma: Float[np.ndarray, " c"],
+    free: Free,
+    tick: Callable[[], None] = lambda: None,
+) -> Check:
+    """Cameras estimated without every fifth shot must see those shots' boards as well as the others'."""
+    several = np.flatnonzero(np.bincount(seen.shot, minlength=len(state.board_rotations)) >= 2)
+    held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
+    if len(held) < 2 or len(several) - len(held) < 4:
+        return Check("held-out shots", None, f"{len(several)} shots with two cameras are too few to hold some out")
+    out = np.isin(seen.shot[seen.view_of], held)
+    trained = solve(state, seen.subset(~out), prior, sigma, free=free, loss=HUBER, tick=tick, steps=25).state
+    boards = replace(free, intrinsics=False, poses=False, offsets=False)
+    rest = seen.subset(out)
+    tested = solve(trained, rest, fixed_prior(trained.intrinsics), sigma, free=boards, loss=HUBER, tick=tick).state
+    inside, outside = (
+        float(np.sqrt((residuals(s, o) ** 2).sum(axis=1).mean())) for s, o in ((state, seen), (tested, rest))
+    )
+    detail = f"{outside:.2f} px in {len(held)} held-out shots, {inside:.2f} px in all"
+    passed = outside < max(HELD_OUT_RATIO * inside, inside + HELD_OUT_LEAST_PX)
+    return Check(
+        "held-out shots", passed, detail, "take more shots: the board near and far, tilted, all over each picture"
+    )
+
+
+def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
+    """The square size against a second distance on the print, and the print's height against its width as the cameras
+    see it."""
+    pairs = [
+        ("width", board.measured_width_mm, board.columns),
+        ("height", board.measured_height_mm, board.rows),
+    ]
+    ratios = {name: value / (count * board.square_mm) for name, value, count in pairs if value is not None}
+    off = [
+        f"{name} is {100 * (ratio - 1):+.2f} % off" for name, ratio in ratios.items() if abs(ratio - 1) > SCALE_SHARE
+    ]
+    skewed = abs(aspect - 1) > max(SCALE_SHARE, 5 * aspect_sigma)
+    detail = f"squares are {aspect:.4f} +- {aspect_sigma:.4f} times as high as wide"
+    detail += "; " + "; ".join(off) if off else ""
+    if not ratios:
+        detail += "; enter measured_width_mm in board.toml to check the scale itself"
+    advice = "measure the printed board, correct square_mm, or print again at 100 %"
+    return Check("scale", not off and not skewed, detail, advice)
+
+
+def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
+    """Every camera's pose is known to a fraction of a pixel at the subject."""
+    loose = [name for name, value in zip(rig.names, pose_sigma_px, strict=True) if not value < LOOSE_PX]
+    worst = int(np.argmax(pose_sigma_px))
+    detail = f"poses to {pose_sigma_px.max():.2f} px at the subject (worst: {rig.names[worst]})"
+    advice = f"take more shots that {', '.join(loose)} and its neighbours see at once" if loose else ""
+    return Check("determined", not loose, detail, advice)
+
+
+def check_against_previous(rig: Rig, previous: Rig | None) -> list[Check]:
+    """Names, handedness, scale and lenses against the last calibration, as far as cameras are shared."""
+    names = [name for name in rig.names if previous is not None and name in previous]
+    if previous is None or len(names) < 3:
+        return [
+            Check("known layout", None, "no earlier calibration to compare with"),
+            Check("lens stability", None, "no earlier calibration to compare with"),
+        ]
+    now, then = rig.subset(names), Rig(tuple(previous[name] for name in names if name in rig))
+    now = Rig(tuple(now[name] for name in names))
+    return [_check_layout(now, then), _check_lenses(now, then)]
+
+
+def _check_layout(now: Rig, then: Rig) -> Check:
+    order, cost, identity = _assignment(now, then)
+    here, there = (np.stack([camera.centre_world for camera in rig]) for rig in (now, then))
+    plain, mirrored = _procrustes(here, there, False), _procrustes(here, there, True)
+    spread = float(np.sqrt(((there - there.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    if mirrored < 0.2 * min(plain, cost) and plain > 0.05 * spread:
+        advice = "turn off mirroring in the cameras or their software, and take the shots again"
+        return Check("known layout", False, "the rig is the mirror image of the earlier one", advice)
+    if cost < 0.5 * identity and any(i != j for i, j in enumerate(order)):
+        swaps = [f"{now.names[i]} stands where {then.names[j]} stood" for i, j in enumerate(order) if i != j]
+        return Check(
+            "known layout", False, "; ".join(swaps), "correct the camera names, or drop the earlier calibration"
+        )
+    ratio = float(np.linalg.norm(here - here.mean(axis=0)) / np.linalg.norm(there - there.mean(axis=0)))
+    distances = image_distance(now, then)
+    moved = [f"{name} by {px:.1f} px" for name, px in zip(now.names, distances, strict=True) if px > 3.0]
+    detail = f"{ratio:.4f} times the earlier size; " + (
+        f"moved since: {', '.join(moved)}" if moved else "no camera moved"
+    )
+    # Cameras move, all of them in step with a scale they do not: that is a board of another size.
+    rescaled = image_distance(now, then, scale=True)
+    same_shape = float(np.median(rescaled)) < 0.3 * float(np.median(distances))
+    passed = not (abs(ratio - 1) > SCALE_SHARE and same_shape)
+    return Check(
+        "known layout", passed, detail, "the rig's size changed but not its shape: check square_mm of board.toml"
+    )
+
+
+def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
+    """Which earlier camera each camera stands for by its pose, the mean distance (mm) then, and the one by names."""
+    here, there = (np.stack([camera.centre_world for camera in rig]) for rig in (now, then))
+    best: tuple[list[int], float] | None = None
+    for camera, other in ((c, o) for c in now for o in then):
+        motion = camera.camera_from_world.inverse() @ other.camera_from_world  # now's world from then's
+        distance = np.linalg.norm(here[:, None] - motion.apply(there)[None], axis=2)
+        rows, columns = linear_sum_assignment(distance)
+        cost = float(distance[rows, columns].mean())
+        if best is None or cost < best[1]:
+            best = (columns.tolist(), cost)
+    assert best is not None
+    aligned = align_world(now, then)
+    named = np.stack([camera.centre_world for camera in aligned])
+    return best[0], best[1], float(np.linalg.norm(named - there, axis=1).mean())
+
+
+def _procrustes(here: Float[np.ndarray, "c 3"], there: Float[np.ndarray, "c 3"], mirrored: bool) -> float:
+    """RMS distance (mm) after the best motion, with a reflection if ``mirrored``."""
+    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    sign = np.linalg.det(u @ vt) * (-1.0 if mirrored else 1.0)
+    return float(np.sqrt(((a @ (u @ np.diag([1.0, 1.0, sign]) @ vt) - b) ** 2).sum(axis=1).mean()))
+
+
+def _check_lenses(now: Rig, then: Rig) -> Check:
+    changes = {
+        camera.name: camera.intrinsics.fx / then[camera.name].intrinsics.fx - 1
+        for camera in now
+        if camera.intrinsics.width == then[camera.name].intrinsics.width
+    }
+    off = [f"{name} by {100 * change:+.1f} %" for name, change in changes.items() if abs(change) > FOCAL_CHANGE]
+    largest = max((abs(change) for change in changes.values()), default=0.0)
+    detail = f"focal lengths changed: {', '.join(off)}" if off else f"focal lengths within {100 * largest:.2f} %"
+    advice = "was a lens zoomed or exchanged? If so calibrate without the earlier calibration; else add tilted views"
+    return Check("lens stability", not off, detail, advice)
+
+
+def measure_aspect(
+    state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
+) -> tuple[float, float]:
+    """Height of the board's squares over their width as the cameras see it, and its standard deviation: three solutions
+    with the board stretched, and the parabola through their costs."""
+    step = 0.003
+    costs = []
+    for stretch in (-step, 0.0, step):
+        stretched = replace(seen, points=seen.points * [1.0, 1.0 + stretch, 1.0])
+        costs.append(solve(state, stretched, prior, sigma, free=free, loss=HUBER, steps=12).cost)
+    low, middle, high = costs
+    curvature = (low - 2 * middle + high) / step**2
+    if curvature <= 0:
+        return 1.0, float("inf")
+    return 1.0 + 0.5 * (low - high) / (low - 2 * middle + high) * step, float(np.sqrt(2.0 / curvature))
+
+
+def failed(checks: Sequence[Check]) -> list[Check]:
+    return [check for check in checks if check.passed is False]

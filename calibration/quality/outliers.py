@@ -1,0 +1,184 @@
+"""Views and shots that the rest of the rig contradicts, and why: each is named, none silently weighed away."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.adjustment.intrinsics import Lens
+from calibration.adjustment.state import BundleState, Observations, intrinsics_of, residuals
+from calibration.board.board import Board
+from calibration.board.detection import Detections, View
+from rig.camera import Camera
+from rig.geometry import RigidTransform
+
+# A view is out if its RMS is this many times the median view's: with Gaussian corners the ratio passes 1.5 once in 1e4
+# views; moments that differ between cameras spread it to 5.
+VIEW_RATIO, VIEW_LEAST_PX = 7.0, 1.0
+CORNER_SIGMAS = 5.0
+BLUR_SQUARES, BLUR_PX = 0.2, 4.0  # wider than both: the edge's place depends on how the board moved in the exposure
+MATCH_RATIO = 3.0  # an explanation must bring a view this much closer than it was
+
+
+@dataclass(frozen=True, slots=True)
+class Dropped:
+    """What was left out, of which camera (None: all of the shot), and why."""
+
+    shot: str
+    camera: str | None
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.shot}{f' of {self.camera}' if self.camera else ''}: {self.reason}"
+
+
+def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
+    """Leaves out views whose edges are wider than corners can be trusted across."""
+    kept, dropped = [], []
+    for view in detections.views:
+        side = square_side_px(view, detections.board)
+        if view.found.rise_px > max(BLUR_PX, BLUR_SQUARES * side):
+            width = "wider than the pattern" if np.isinf(view.found.rise_px) else f"{view.found.rise_px:.0f} px wide"
+            dropped.append(Dropped(view.shot, view.camera, f"blurred, edges are {width}: hold the board still"))
+        else:
+            kept.append(view)
+    return replace(detections, views=tuple(kept)), dropped
+
+
+def square_side_px(view: View, board: Board) -> float:
+    """Typical side of a square in the picture."""
+    columns = board.grid[0]
+    place = dict(zip(view.found.ids.tolist(), view.found.corners, strict=True))
+    sides = [
+        float(np.linalg.norm(place[i + step] - corner))
+        for i, corner in place.items()
+        for step in (1, columns)
+        if i + step in place and (step > 1 or (i + 1) % columns)
+    ]
+    return float(np.median(sides)) if sides else 0.0
+
+
+def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detections, list[Dropped]]:
+    """Leaves out views that no pose of a flat board explains with their own camera's lens."""
+    kept, dropped = [], []
+    for view in detections.views:
+        lens = lenses[view.camera]
+        rms = miss(
+            view, Camera("", lens.intrinsics, RigidTransform.identity()), lens.poses[view.shot], detections.board
+        )
+        if rms > max(VIEW_RATIO * lens.noise_px, VIEW_LEAST_PX):
+            dropped.append(
+                Dropped(view.shot, view.camera, f"corners are {rms:.1f} px off a flat board: misread or bent")
+            )
+        else:
+            kept.append(view)
+    return replace(detections, views=tuple(kept)), dropped
+
+
+def view_rms(state: BundleState, seen: Observations) -> Float[np.ndarray, " v"]:
+    squares = (residuals(state, seen) ** 2).sum(axis=1)
+    counts = np.bincount(seen.view_of, minlength=len(seen.camera))
+    return np.sqrt(np.bincount(seen.view_of, squares, minlength=len(seen.camera)) / np.maximum(counts, 1))
+
+
+def bad_views(state: BundleState, seen: Observations) -> np.ndarray:
+    """True per view that the joint solution does not explain. A robust solution lets one camera of a shot keep the
+    board and the rest of the shot fail; what is wrong with such a shot is for ``explain_shot`` to say."""
+    rms = view_rms(state, seen)
+    return rms > max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
+
+
+def explain_shot(
+    shot: str,
+    views: Sequence[View],
+    bad: Sequence[View],
+    detections: Detections,
+    state: BundleState,
+    names: Sequence[str],
+    boards: dict[str, RigidTransform],
+    noise_px: float,
+) -> list[Dropped]:
+    """What to leave out of a shot in which ``bad`` views contradict the rig, and why."""
+    cameras = {
+        name: Camera(name, intrinsics_of(state.intrinsics[i], detections.sizes[name]), state.camera_pose(i))
+        for i, name in enumerate(names)
+    }
+    scale = board_scale(views, cameras, detections.board, boards[shot])
+    if scale is not None:
+        size, rms = scale
+        if abs(size - 1) > 0.01 and rms < max(MATCH_RATIO * noise_px, VIEW_LEAST_PX):
+            real = size * detections.board.square_mm
+            reason = f"its squares measure {real:.1f} mm, not {detections.board.square_mm:g}: another board"
+            return [Dropped(shot, None, reason)]
+    if len(bad) > len(views) / 2:
+        return [Dropped(shot, None, "its cameras disagree where the board is: it moved between their moments")]
+    return [Dropped(shot, view.camera, _why(view, cameras, detections, boards, noise_px)) for view in bad]
+
+
+def _why(
+    view: View, cameras: dict[str, Camera], detections: Detections, boards: dict[str, RigidTransform], noise_px: float
+) -> str:
+    """Whether the picture fits under another camera's name, or in another shot."""
+    limit = max(10 * noise_px, 3.0)
+    for name, camera in cameras.items():
+        alike = name != view.camera and detections.sizes[name] == detections.sizes[view.camera]
+        if alike and miss(view, camera, boards[view.shot], detections.board) < limit:
+            return f"it is a picture of {name}'s: names are swapped"
+    for shot, pose in boards.items():
+        if shot != view.shot and miss(view, cameras[view.camera], pose, detections.board) < limit:
+            return f"it is the picture of {shot}: shot names are mixed up"
+    return "it contradicts the other cameras: was it taken at another moment, or the camera moved?"
+
+
+def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Board) -> float:
+    """RMS distance in pixels between the corners and where they should be, in the best turn of the board."""
+    values = []
+    for turn in board.turns():
+        points = world_from_board.apply(board.corners()[turn[view.found.ids]])
+        apart = camera.project(points) - view.found.corners
+        values.append(float(np.sqrt((apart**2).sum(axis=1).mean())) if np.isfinite(apart).all() else np.inf)
+    return min(values)
+
+
+def board_scale(
+    views: Sequence[View], cameras: dict[str, Camera], board: Board, start: RigidTransform
+) -> tuple[float, float] | None:
+    """The size of a shot's board, as a multiple of the described one, that its cameras agree on, and the RMS (px) they
+    then have; None where fewer than two see it."""
+    if len({view.camera for view in views}) < 2:
+        return None
+    triples = [(cameras[v.camera], board.corners()[v.found.ids], v.found.corners) for v in views]
+    shared = _triangulated(triples, [v.found.ids for v in views])
+    if shared is None:
+        return None
+    ids, points = shared
+    flat = board.corners()[ids]
+    spread = np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum())
+    size = float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()) / spread)
+    u, _, vt = np.linalg.svd((flat - flat.mean(axis=0)).T @ (points - points.mean(axis=0)))
+    rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
+    place = RigidTransform(rotation, points.mean(axis=0) - size * rotation @ flat.mean(axis=0))
+    misses = [camera.project(place.apply(size * own)) - pixels for camera, own, pixels in triples]
+    squares = np.concatenate([(m**2).sum(axis=1) for m in misses])
+    return size, float(np.sqrt(squares.mean())) if np.isfinite(squares).all() else np.inf
+
+
+def _triangulated(
+    triples: Sequence[tuple[Camera, np.ndarray, np.ndarray]], ids: Sequence[np.ndarray]
+) -> tuple[np.ndarray, Float[np.ndarray, "n 3"]] | None:
+    """Corners that two or more cameras see, as the points nearest to their rays."""
+    counts = np.bincount(np.concatenate(ids))
+    wanted = np.flatnonzero(counts >= 2)
+    if len(wanted) < 4:
+        return None
+    normal = np.zeros((len(counts), 3, 3))
+    right = np.zeros((len(counts), 3))
+    for (camera, _, pixels), numbers in zip(triples, ids, strict=True):
+        rays = camera.rays_world(pixels)
+        if not np.isfinite(rays).all():
+            return None
+        off_axis = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        normal[numbers] += off_axis
+        right[numbers] += off_axis @ camera.centre_world
+    return wanted, np.linalg.solve(normal[wanted], right[wanted][:, :, None])[:, :, 0]

@@ -1,0 +1,118 @@
+"""What a calibration is: the rig with its covariances, and the figures and checks that speak for it."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.adjustment.intrinsics import Lens
+from calibration.adjustment.state import INTRINSICS
+from calibration.adjustment.timing import TimeOffsets
+from calibration.board.board import Board
+from calibration.quality.checks import (
+    Check,
+)
+from calibration.quality.outliers import Dropped
+from rig.atomic_write import write_atomically
+from rig.errors import EigenheadError
+from rig.formats.cameras_json import document_from_rig
+from rig.rig import Rig
+
+
+class CalibrationRefused(EigenheadError):
+    """The pictures were understood, but what they give is not to be used. ``calibration`` is there for the report."""
+
+    def __init__(self, reasons: Iterable[str], calibration: "Calibration | None" = None) -> None:
+        self.reasons = tuple(reasons)
+        self.calibration = calibration
+        super().__init__("the calibration is refused: " + "; ".join(self.reasons))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """A calibrated rig with its evidence.
+
+    ``rig`` has per-camera pose covariances in the gauge of ``calibration.adjustment.gauge``; ``pose_covariance`` is the
+    joint one of all cameras' left perturbations (rad, mm) in that gauge, with what the uncertainty of the lenses adds
+    to it; ``pose_sigma_px`` its size at the subject; ``intrinsics_sigma`` per camera that of fx fy cx cy k1 k2 p1 p2
+    k3. ``misses`` per view: the used corners' numbers, pixels, and projected less detected (px)."""
+
+    rig: Rig
+    board: Board
+    front: str
+    pose_covariance: Float[np.ndarray, "p p"]
+    intrinsics_sigma: dict[str, Float[np.ndarray, " 9"]]
+    pose_sigma_px: dict[str, float]
+    misses: dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    detected: int
+    lenses: dict[str, Lens]
+    sync_px: float
+    offsets: TimeOffsets | None
+    offsets_used: bool
+    dropped: tuple[Dropped, ...]
+    checks: tuple[Check, ...]
+    warnings: tuple[str, ...]
+
+    def figures(self) -> dict[str, Any]:
+        """The numbers of ``calibrate --json``."""
+        everything = np.concatenate([miss for _, _, miss in self.misses.values()])
+        cameras = {}
+        for camera in self.rig:
+            own = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
+            cameras[camera.name] = {
+                "rms_px": _rms(np.concatenate(own)),
+                "alone_rms_px": self.lenses[camera.name].rms_px,
+                "views": len(own),
+                "corners": int(sum(len(miss) for miss in own)),
+                "pose_sigma_px": self.pose_sigma_px[camera.name],
+                "focal_sigma_px": float(self.intrinsics_sigma[camera.name][0]),
+            }
+        return {
+            "rms_px": _rms(everything),
+            "used_share": len(everything) / self.detected,
+            "corners": len(everything),
+            "sync_px": self.sync_px,
+            "cameras": cameras,
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Everything but the residuals, as JSON."""
+        names = self.rig.names
+        offsets = None
+        if self.offsets is not None:
+            offsets = {
+                "used": self.offsets_used,
+                "unit": "shots",
+                "cameras": dict(zip(names, self.offsets.offsets.tolist(), strict=True)),
+                "sigma": dict(zip(names, self.offsets.sigma.tolist(), strict=True)),
+                "rms_without_px": self.offsets.rms_without_px,
+                "rms_with_px": self.offsets.rms_with_px,
+            }
+        sigma = {
+            name: dict(zip(INTRINSICS, values.tolist(), strict=True)) for name, values in self.intrinsics_sigma.items()
+        }
+        return {
+            "figures": self.figures(),
+            "front": self.front,
+            "checks": [
+                {"name": c.name, "passed": c.passed, "detail": c.detail, "advice": c.advice} for c in self.checks
+            ],
+            "dropped": [{"shot": d.shot, "camera": d.camera, "reason": d.reason} for d in self.dropped],
+            "warnings": list(self.warnings),
+            "time_offsets": offsets,
+            "intrinsics_sigma": sigma,
+            "rig": document_from_rig(self.rig),
+        }
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Writes ``cameras.json`` with covariances."""
+    write_atomically(path, json.dumps(document_from_rig(calibration.rig), indent=1).encode())
+
+
+def _rms(misses: Float[np.ndarray, "n 2"]) -> float:
+    return float(np.sqrt((misses**2).sum(axis=1).mean()))

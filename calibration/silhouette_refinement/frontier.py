@@ -1,0 +1,130 @@
+"""Frontier points: places where an epipolar plane touches the subject, seen on the silhouettes of two cameras.
+
+Where the angle of a contour's rays about the line through both centres has a local extreme, the plane of that angle
+touches the subject there, and, unless something hides it, the other contour has an extreme of the same angle. The outer
+two of a pair are ``pipeline.multiview.camera_drift``'s; a head with hair and shoulders has several more. Only convex
+ones count: where two parts of an outline cross (a T-junction) the contour has a concave corner that is no point of the
+subject. With no bound on their angles many could be paired, so this needs cameras good to about ``GATE_PX``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.tangency import BORDER_PX, Tangency, on_contour
+from rig.camera import Camera
+from rig.rig import Rig
+
+GATE_PX = 2.5  # how far two extremes of one frontier point may be apart
+REACH = 15  # contour pixels to either side over which an extreme must be one
+PROMINENCE_PX = 0.3  # by how much: an outline straighter than a radius of 400 px has no place on it
+SMOOTH_PX = 1.0  # along the contour: shifts a bend of radius r by 1 / (2 r) px
+INSIDE_PX = 4.0  # this far behind a convex extreme the subject is met
+LONGEST_SPAN = 2.0  # rad: an epipole in or near the silhouette
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contour:
+    """The longest closed outline of a silhouette, in order: sub-pixel places, rays in the world, and what is whole."""
+
+    camera: Camera
+    mask: Bool[np.ndarray, "h w"]
+    pixels: Float[np.ndarray, "n 2"]
+    rays: Float[np.ndarray, "n 3"]
+    whole: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, camera: Camera, silhouette: Silhouette) -> "Contour":
+        found, _ = cv2.findContours(silhouette.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        chain = max(found, key=len).reshape(-1, 2).astype(float)
+        pixels = gaussian_filter1d(on_contour(chain, silhouette.distance), SMOOTH_PX, axis=0, mode="wrap")
+        far = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
+        margin = np.minimum(chain, far - chain).min(axis=1)
+        whole = -maximum_filter1d(-margin, 2 * REACH + 1, mode="wrap") >= BORDER_PX
+        return cls(camera, silhouette.mask, pixels, camera.rays_world(pixels), whole)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Extremes:
+    """Local extremes of one contour's angle; ``side`` is +1 for maxima."""
+
+    angle: Float[np.ndarray, " e"]
+    side: Float[np.ndarray, " e"]
+    pixels: Float[np.ndarray, "e 2"]
+    slopes: Float[np.ndarray, "e 2"]
+
+
+def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: float = GATE_PX) -> list[Tangency]:
+    """Every pair's frontier points that both contours show, and show unmistakably. ``rig``: usable cameras only."""
+    contours = [Contour.of(camera, silhouettes[camera.name]) for camera in rig]
+    found = []
+    for one, two in combinations(contours, 2):
+        found += _pair(one, two, gate_px)
+    return found
+
+
+def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
+    base = two.camera.centre_world - one.camera.centre_world
+    axis = base / np.linalg.norm(base)
+    towards = one.rays.mean(axis=0) + two.rays.mean(axis=0)
+    u = towards - axis * (towards @ axis)
+    u /= np.linalg.norm(u)
+    v = np.cross(axis, u)
+    angles = [np.arctan2(contour.rays @ v, contour.rays @ u) for contour in (one, two)]
+    if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
+        return []
+    first, second = (_extremes(c, angle, u, v) for c, angle in zip((one, two), angles, strict=True))
+    if not len(first.angle) or not len(second.angle):
+        return []
+    steep = np.linalg.norm(first.slopes, axis=1)[:, None], np.linalg.norm(second.slopes, axis=1)[None, :]
+    apart = np.abs(first.angle[:, None] - second.angle[None, :]) / np.hypot(*steep) * np.sqrt(2.0)
+    apart[first.side[:, None] != second.side[None, :]] = np.inf
+    found = []
+    for i, j in zip(*np.nonzero(apart < gate_px), strict=True):
+        rivals = np.concatenate([np.delete(apart[i], j), np.delete(apart[:, j], i)])
+        if len(rivals) and rivals.min() < 2.0 * gate_px:
+            continue
+        slopes, steepness = (first.slopes[i], second.slopes[j]), (float(steep[0][i, 0]), float(steep[1][0, j]))
+        difference = float(first.angle[i] - second.angle[j])
+        found.append(
+            Tangency(
+                (one.camera.name, two.camera.name),
+                (first.pixels[i], second.pixels[j]),
+                steepness,
+                (slopes[0] / steepness[0], slopes[1] / steepness[1]),
+                (difference / steepness[0], -difference / steepness[1]),
+            )
+        )
+    return found
+
+
+def _extremes(contour: Contour, angle: Float[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> _Extremes:
+    tops = maximum_filter1d(angle, 2 * REACH + 1, mode="wrap") == angle
+    bottoms = maximum_filter1d(-angle, 2 * REACH + 1, mode="wrap") == -angle
+    at = np.flatnonzero((tops | bottoms) & contour.whole)
+    side = np.where(tops[at], 1.0, -1.0)
+    pixels = contour.pixels[at]
+    slopes = _angle_slopes(contour.camera, pixels, u, v)
+    steep = np.linalg.norm(slopes, axis=1)
+    ends = np.maximum(side * angle[at - REACH], side * angle[(at + REACH) % len(angle)])
+    behind = pixels - INSIDE_PX * (side / np.maximum(steep, 1e-12))[:, None] * slopes
+    height, width = contour.mask.shape
+    x, y = np.rint(np.clip(behind, 0, [width - 1, height - 1])).astype(int).T
+    good = (steep > 1e-9) & (side * angle[at] - ends > PROMINENCE_PX * steep) & contour.mask[y, x]
+    return _Extremes(angle[at][good], side[good], pixels[good], slopes[good])
+
+
+def _angle_slopes(
+    camera: Camera, pixels: Float[np.ndarray, "e 2"], u: np.ndarray, v: np.ndarray
+) -> Float[np.ndarray, "e 2"]:
+    """Change of a ray's angle in the pencil of epipolar planes per pixel."""
+    shifts = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    rays = camera.rays_world((pixels[:, None] + shifts).reshape(-1, 2))
+    angle = np.arctan2(rays @ v, rays @ u).reshape(-1, 4)
+    return np.stack([angle[:, 0] - angle[:, 1], angle[:, 2] - angle[:, 3]], axis=1) / 2.0

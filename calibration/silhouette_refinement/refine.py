@@ -1,0 +1,299 @@
+"""Extrinsics from silhouettes of any subject: epipolar tangency over several captures, no model of the subject.
+
+The residual and its derivative by the cameras are ``tangency_term``'s. Each step of Levenberg-Marquardt finds the
+tangencies anew: the first uses the outer ones of ``pipeline.multiview.tangency``, which cannot be confused, the others
+all frontier points. With a head model, the rims of the fitted heads join in at the end
+(``calibration.silhouette_refinement.rims``). The calibration's covariance is the prior; the gauge is that of
+``calibration.adjustment.gauge``. Silhouettes do not see a rig's scale, so that stays the board's.
+
+Enters: silhouettes of several captures, and the rig. Leaves: the rig, refined if captures held out agree.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float, Int
+
+from calibration.adjustment.gauge import align_world, gauge_projection, image_distance
+from calibration.silhouette_refinement.frontier import find_frontier
+from calibration.silhouette_refinement.rims import Heads, rim_equations
+from calibration.silhouette_refinement.tangency_term import (
+    ROBUST_SIGMAS,
+    PackedTangencies,
+    TangencyTerm,
+    corrected,
+    per_camera,
+    tangency_residuals,
+)
+from pipeline.estimation.levenberg_marquardt import DAMPING_LEAST, Limits, Solution, minimise
+from pipeline.estimation.robust import GemanMcClure
+from pipeline.estimation.terms import NormalEquations, Problem, Quadratic, Term
+from pipeline.fitting.problem import camera_information
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.tangency import Tangency, find_tangencies
+from rig.errors import EigenheadError
+from rig.rig import Rig
+
+PRIOR_PX = 0.2  # of a camera that states no covariance
+FOCAL_SPREAD = 1e-3  # of the logarithm: what a board leaves open
+NOISE_LEAST_PX = 0.07  # a contour of a binary mask is not better
+OUTER_STEPS = 1  # with outer tangents alone, which cannot be confused
+STEPS, RIM_STEPS = 6, 2
+# One step to a set of tangencies, and hardly damped: the calibration is near, its covariance holds the rest.
+ONE_STEP = Limits(steps=1, first_damping=DAMPING_LEAST)
+SETTLED_PX = 1e-2
+FOLDS = 5
+GAIN_SIGMAS = 2.0  # by how many of its standard deviations the held-out residuals must shrink
+
+
+class TooFewCaptures(EigenheadError):
+    """Nothing would be left to refine from."""
+
+    def __init__(self, captures: int) -> None:
+        super().__init__(
+            f"silhouette refinement got {captures} captures, of which some are held out as a check: "
+            "take at least 2, better 5, of different subjects or head poses"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Tangency residuals (px), each with the two cameras that it is of."""
+
+    cameras: tuple[tuple[str, str], ...]
+    px: Float[np.ndarray, " n"]
+
+    def of(self, camera: str) -> Float[np.ndarray, " k"]:
+        """Those that a camera takes part in."""
+        return self.px[[camera in pair for pair in self.cameras]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """What came of it. ``before``: residuals of all captures at the start; ``after``: of each capture where the others
+    alone put the cameras; ``before_px`` and ``after_px`` their robust RMS with the noise ``noise_px``. ``change_px``:
+    RMS motion (2D) per camera of the subject's region, worlds aligned, from the start to ``proposed``, the rig that all
+    captures agree on and that ``rig`` is only where ``kept``."""
+
+    rig: Rig
+    proposed: Rig
+    before: Residuals
+    after: Residuals
+    before_px: float
+    after_px: float
+    noise_px: float
+    kept: bool
+    reason: str
+    change_px: Mapping[str, float]
+
+
+def refine(
+    captures: Sequence[Mapping[str, Silhouette]],
+    rig: Rig,
+    *,
+    focal: bool = False,
+    prior_px: float = PRIOR_PX,
+    heads: Heads | None = None,
+    report: Callable[[str, float], None] = lambda stage, fraction: None,
+) -> Refinement:
+    """Refines extrinsics, and with ``focal`` focal lengths, from all captures; kept if they agree when each is held out
+    in its turn (several at a time where there are more than ``FOLDS``).
+
+    ``prior_px``: standard deviation in the image of a camera without a covariance. ``heads``: a model whose rims speak
+    as well, once the tangencies have settled. Raises TooFewCaptures.
+    """
+    if len(captures) < 2:
+        raise TooFewCaptures(len(captures))
+    folds = min(FOLDS, len(captures))
+    proposed = minimise_tangencies(captures, rig, focal=focal, prior_px=prior_px, heads=heads)
+    report("refine", 1 / (folds + 1))
+    parts = []
+    for fold in range(folds):
+        others = [i for i in range(len(captures)) if i % folds != fold]
+        their = None if heads is None else heads.subset(others)
+        without = minimise_tangencies([captures[i] for i in others], rig, focal=focal, prior_px=prior_px, heads=their)
+        held_out = captures[fold::folds]
+        parts.append((residuals(held_out, rig), residuals(held_out, without)))
+        report("refine", (fold + 2) / (folds + 1))
+    before, after = (_joined(side) for side in zip(*parts, strict=True))
+    noise = _noise(after.px)
+    gain, deviation = _gain(before.px, after.px, noise)
+    before_px, after_px = robust_rms(before.px, noise), robust_rms(after.px, noise)
+    kept = gain > GAIN_SIGMAS * deviation
+    words = "shrink" if kept else "do not shrink"
+    reason = (
+        f"tangency residuals of the {len(captures)} captures, each held out in its turn, {words}: "
+        f"{before_px:.2f} to {after_px:.2f} px over {len(after.px)} equations, "
+        f"{gain / max(deviation, 1e-9):.1f} standard deviations"
+    )
+    return Refinement(
+        rig=proposed if kept else rig,
+        proposed=proposed,
+        before=before,
+        after=after,
+        before_px=before_px,
+        after_px=after_px,
+        noise_px=noise,
+        kept=kept,
+        reason=reason,
+        change_px=dict(zip(rig.names, image_distance(proposed, rig).tolist(), strict=True)),
+    )
+
+
+def _joined(parts: Sequence[Residuals]) -> Residuals:
+    cameras = tuple(pair for part in parts for pair in part.cameras)
+    return Residuals(cameras, np.concatenate([part.px for part in parts]))
+
+
+def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig) -> Residuals:
+    """Residuals of all captures' outer tangencies: the same ones whatever the rig, so that two rigs compare."""
+    found = [_tangencies(capture, rig, outer=True) for capture in captures]
+    misses = [tangency_residuals(PackedTangencies.of(tangencies, rig), rig) for tangencies in found]
+    return Residuals(tuple(t.cameras for tangencies in found for t in tangencies), np.concatenate(misses))
+
+
+def robust_rms(misses: Float[np.ndarray, " n"], noise_px: float) -> float:
+    """RMS where a residual beyond three standard deviations counts ever less (Geman-McClure)."""
+    return float(np.sqrt(np.mean(_forgiven(misses, noise_px)))) if len(misses) else float("nan")
+
+
+def _forgiven(misses: Float[np.ndarray, " n"], noise_px: float) -> Float[np.ndarray, " n"]:
+    return noise_px**2 * GemanMcClure(ROBUST_SIGMAS).cost((misses / noise_px) ** 2)
+
+
+def _noise(misses: Float[np.ndarray, " n"]) -> float:
+    return max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(misses)))) if len(misses) else NOISE_LEAST_PX
+
+
+def _gain(before: np.ndarray, after: np.ndarray, noise: float) -> tuple[float, float]:
+    """By how much the mean robust cost falls, and the standard deviation of that."""
+    one, two = _forgiven(before, noise), _forgiven(after, noise)
+    if len(one) != len(two):  # a tangency at the image's border came or went
+        spread = np.hypot(one.std() / np.sqrt(max(1, len(one))), two.std() / np.sqrt(max(1, len(two))))
+        return float(one.mean() - two.mean()), float(spread)
+    fall = one - two
+    return float(fall.mean()), float(fall.std() / np.sqrt(max(1, len(fall))))
+
+
+def minimise_tangencies(
+    captures: Sequence[Mapping[str, Silhouette]],
+    start: Rig,
+    *,
+    focal: bool,
+    prior_px: float,
+    heads: Heads | None,
+) -> Rig:
+    """The cameras of least tangency cost over all captures, with the start as prior; then of that and the rims of the
+    heads. The result's covariances are those of the last step, in the subject's gauge."""
+    here = _Refining(captures, start, focal, prior_px)
+    correction = here.prior.centre
+    solution = None
+    for k in range(STEPS):
+        outer = k < OUTER_STEPS
+        term = here.tangency_term(correction, outer=outer)
+        solution = here.step(correction, (term,))
+        motion_px = term.at(solution.value).residual - term.at(correction).residual
+        correction = solution.value
+        if not outer and term.noise_px * np.sqrt(np.mean(motion_px**2)) < SETTLED_PX:
+            break
+    for _ in range(RIM_STEPS if heads is not None else 0):
+        assert heads is not None
+        terms = (here.tangency_term(correction, outer=False), *here.rim_terms(correction, heads))
+        solution = here.step(correction, terms)
+        correction = solution.value
+    assert solution is not None
+    equations = NormalEquations.empty(len(correction))
+    solution.at.add_to(equations)
+    covariance = here.projection @ np.linalg.inv(equations.matrix) @ here.projection.T
+    return _with_covariances(align_world(here.rig(correction), start), covariance, focal=focal)
+
+
+class _Refining:
+    """What stays the same while the tangencies of a refinement are found again and again."""
+
+    def __init__(self, captures: Sequence[Mapping[str, Silhouette]], start: Rig, focal: bool, prior_px: float) -> None:
+        self.captures, self.start, self.focal = captures, start, focal
+        self.projection = _projection(start, focal=focal)
+        information = gauge_free(_prior(start, focal=focal, prior_px=prior_px), self.projection)
+        self.prior = Quadratic.prior(information, np.zeros(len(information)))
+
+    def rig(self, correction: Float[np.ndarray, " p"]) -> Rig:
+        return corrected(self.start, correction, focal=self.focal)
+
+    def step(
+        self, correction: Float[np.ndarray, " p"], terms: tuple[Term[Float[np.ndarray, " p"]], ...]
+    ) -> Solution[Float[np.ndarray, " p"]]:
+        """One step on ``terms`` and the prior."""
+        return minimise(Problem((*terms, self.prior), len(correction), np.add), correction, ONE_STEP)
+
+    def tangency_term(self, correction: Float[np.ndarray, " p"], *, outer: bool) -> TangencyTerm:
+        """The tangencies of all captures as the corrected cameras find them, and their robust noise."""
+        rig = self.rig(correction)
+        found = [t for capture in self.captures for t in _tangencies(capture, rig, outer=outer)]
+        seen = PackedTangencies.of(found, rig)
+        return TangencyTerm(seen, self.start, self.focal, _noise(tangency_residuals(seen, rig)))
+
+    def rim_terms(self, correction: Float[np.ndarray, " p"], heads: Heads) -> list[Quadratic]:
+        """What the rim of each capture's head says of the cameras."""
+        rig, poses = self.rig(correction), _pose_places(self.start, focal=self.focal)
+        terms = []
+        for capture, place in zip(self.captures, heads.starts, strict=True):
+            matrix, gradient = np.zeros((len(correction),) * 2), np.zeros(len(correction))
+            matrix[np.ix_(poses, poses)], gradient[poses] = rim_equations(capture, rig, heads, place)
+            terms.append(Quadratic(matrix, correction, -gradient))
+        return terms
+
+
+def _with_covariances(rig: Rig, covariance: Float[np.ndarray, "p p"], *, focal: bool) -> Rig:
+    size = per_camera(focal=focal)
+    blocks = [covariance[size * k : size * k + 6, size * k : size * k + 6] for k in range(len(rig))]
+    return Rig(tuple(replace(c, covariance=0.5 * (b + b.T)) for c, b in zip(rig, blocks, strict=True)))
+
+
+def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, *, outer: bool) -> list[Tangency]:
+    usable = rig.subset(name for name in rig.names if name in capture and capture[name].quality.usable)
+    return find_tangencies(capture, usable) if outer else find_frontier(capture, usable)
+
+
+def _pose_places(rig: Rig, *, focal: bool) -> Int[np.ndarray, " q"]:
+    """Where the six pose parameters of every camera stand among all parameters."""
+    return np.concatenate([per_camera(focal=focal) * k + np.arange(6) for k in range(len(rig))])
+
+
+def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"]:
+    """Information of the start: the board's covariance per camera, and of the focal length's logarithm."""
+    centre = rig.centre_world()[None]
+    blocks = []
+    for camera in rig:
+        depth = float(camera.camera_from_world.apply(centre)[0, 2])
+        block = np.zeros((per_camera(focal=focal),) * 2)
+        block[:6, :6] = camera_information(camera, depth, prior_px)
+        block[6:, 6:] = FOCAL_SPREAD**-2
+        blocks.append(block)
+    return np.asarray(scipy.linalg.block_diag(*blocks))
+
+
+def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """Information of N(0, information^-1) about what ``projection`` leaves, whatever the world's own motion; and, since
+    no image determines that, a prior that keeps it at zero.
+
+    With S the projection, I - S = A B of rank 6, and M the information: the least of (x - A t)^T M (x - A t) over all
+    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A rig moved as a whole then costs nothing, as it costs
+    the tangencies nothing, and ``(I - S)^T M (I - S)`` fixes the frame without pulling at anything that can be seen.
+    """
+    world = np.eye(len(projection)) - projection
+    motions = scipy.linalg.orth(world, rcond=1e-9)
+    pulled = information @ motions
+    free = information - pulled @ np.linalg.solve(motions.T @ pulled, pulled.T)
+    whole = free + world.T @ information @ world
+    return 0.5 * (whole + whole.T)
+
+
+def _projection(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
+    """Takes the world's own motion out of a step."""
+    poses = _pose_places(rig, focal=focal)
+    matrix = np.eye(per_camera(focal=focal) * len(rig))
+    matrix[np.ix_(poses, poses)] = gauge_projection(rig)
+    return matrix

@@ -1,0 +1,145 @@
+"""The residual of a frontier point that two cameras see, and its derivative by both cameras.
+
+A plane through two camera centres that touches the subject touches both silhouettes, at the images of one frontier
+point (Ramanathan, Steinbach and Girod 2000; Wong and Cipolla 2001). With centres c and rays d at the two tangent
+pixels, base b = c2 - c1, the planes differ by the angle
+
+    delta = |b| b . (d1 x d2) / (|b x d1| |b x d2|)
+
+and, divided by the change of angle per pixel in both images, the residual is the distance in pixels of either contour
+that it would take, were both equally noisy. At a tangent point the contour runs along the plane, so to first order the
+pixels stay where they are as a camera moves: with x' = R(w) x + v in camera 1's frame,
+
+    d delta ~ w . (R1 (d2 x b)) x R1 d1 + v . R1 (d1 x d2)         and likewise, signs swapped, for camera 2.
+
+A focal length (its logarithm) turns the rays: its derivative is taken by central differences.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from calibration.adjustment.gauge import moved
+from pipeline.estimation.robust import GemanMcClure
+from pipeline.estimation.terms import Residuals
+from pipeline.multiview.tangency import Tangency
+from rig.camera import Camera
+from rig.rig import Rig
+
+ROBUST_SIGMAS = 3.0
+ZOOM_STEP = 1e-4  # of a focal length's logarithm: rays are smooth in it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedTangencies:
+    """n tangencies of a rig: indices of both cameras, tangent pixels, and the change of angle per pixel of both
+    together (rad / px)."""
+
+    cameras: Int[np.ndarray, "n 2"]
+    pixels: Float[np.ndarray, "n 2 2"]
+    steepness: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, tangencies: Sequence[Tangency], rig: Rig) -> "PackedTangencies":
+        index = {name: k for k, name in enumerate(rig.names)}
+        return cls(
+            np.array([[index[name] for name in t.cameras] for t in tangencies], int).reshape(-1, 2),
+            np.array([t.pixels for t in tangencies], float).reshape(-1, 2, 2),
+            np.array([np.hypot(*t.steepness) for t in tangencies], float),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TangencyTerm:
+    """Geman and McClure's cost of tangency residuals over the corrections of all cameras.
+
+    The value is the correction of every camera of ``start``, one after the other: a left perturbation (rad, mm) and,
+    with ``focal``, the change of the focal length's logarithm.
+    """
+
+    seen: PackedTangencies
+    start: Rig
+    focal: bool
+    noise_px: float
+
+    def at(self, correction: Float[np.ndarray, " p"]) -> Residuals:
+        rig = corrected(self.start, correction, focal=self.focal)
+        residual_px = tangency_residuals(self.seen, rig)
+        return Residuals(
+            residual_px[:, None] / self.noise_px,
+            lambda: tangency_jacobian(self.seen, rig, focal=self.focal)[:, None] / self.noise_px,
+            GemanMcClure(ROBUST_SIGMAS),
+        )
+
+
+def per_camera(*, focal: bool) -> int:
+    """Unknowns of a camera: rotation, translation and, if asked for, focal length."""
+    return 7 if focal else 6
+
+
+def corrected(rig: Rig, correction: Float[np.ndarray, " p"], *, focal: bool) -> Rig:
+    """The rig with every camera moved, and with ``focal`` zoomed, by its part of the correction."""
+    cameras = []
+    for camera, step in zip(rig, correction.reshape(len(rig), -1), strict=True):
+        cameras.append(zoomed(moved(camera, step[:6]), float(step[6])) if focal else moved(camera, step))
+    return Rig(tuple(cameras))
+
+
+def zoomed(camera: Camera, log_scale: float) -> Camera:
+    """The camera with both focal lengths scaled."""
+    lens, scale = camera.intrinsics, float(np.exp(log_scale))
+    return replace(camera, intrinsics=replace(lens, fx=lens.fx * scale, fy=lens.fy * scale))
+
+
+def tangency_residuals(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, " n"]:
+    """The module's residual (px)."""
+    base, rays = _bases(seen, rig), _rays(seen, rig)
+    across = np.cross(rays[:, 0], rays[:, 1])
+    return _gain(seen, base, rays) * (base * across).sum(axis=1)
+
+
+def tangency_jacobian(seen: PackedTangencies, rig: Rig, *, focal: bool) -> Float[np.ndarray, "n p"]:
+    """d(residual) / d(corrections of all cameras), px per rad, mm and logarithm; the gain is taken as constant."""
+    size, count = per_camera(focal=focal), len(seen.cameras)
+    base, rays = _bases(seen, rig), _rays(seen, rig)
+    gain = _gain(seen, base, rays)[:, None]
+    across = np.cross(rays[:, 0], rays[:, 1])
+    turns = np.stack([camera.camera_from_world.rotation for camera in rig])
+    rows = np.zeros((count, len(rig), size))
+    for side, by_ray, by_centre in ((0, np.cross(rays[:, 1], base), across), (1, np.cross(base, rays[:, 0]), -across)):
+        camera = seen.cameras[:, side]
+        by_ray_inside, ray_inside, by_centre_inside = (
+            np.einsum("nij,nj->ni", turns[camera], vector) for vector in (by_ray, rays[:, side], by_centre)
+        )
+        rows[np.arange(count), camera, :3] = gain * np.cross(by_ray_inside, ray_inside)
+        rows[np.arange(count), camera, 3:6] = gain * by_centre_inside
+        if focal:
+            wider, narrower = (_rays(seen, Rig(tuple(zoomed(c, s * ZOOM_STEP) for c in rig))) for s in (1.0, -1.0))
+            widening = (wider[:, side] - narrower[:, side]) / (2.0 * ZOOM_STEP)
+            rows[np.arange(count), camera, 6] = gain[:, 0] * (by_ray * widening).sum(axis=1)
+    return rows.reshape(count, -1)
+
+
+def _bases(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 3"]:
+    """From the first camera's centre to the second's (mm)."""
+    centres = np.stack([camera.centre_world for camera in rig])
+    return centres[seen.cameras[:, 1]] - centres[seen.cameras[:, 0]]
+
+
+def _rays(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 2 3"]:
+    """Unit rays, in the world, through both tangent pixels."""
+    rays = np.empty((*seen.cameras.shape, 3))
+    for k, camera in enumerate(rig):
+        here = seen.cameras == k
+        rays[here] = camera.rays_world(seen.pixels[here])
+    return rays
+
+
+def _gain(
+    seen: PackedTangencies, base: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2 3"]
+) -> Float[np.ndarray, " n"]:
+    """Pixels per unit of the triple product, both contours equally noisy."""
+    planes = [np.linalg.norm(np.cross(base, rays[:, side]), axis=1) for side in (0, 1)]
+    return np.linalg.norm(base, axis=1) / (planes[0] * planes[1] * seen.steepness)

@@ -1,0 +1,68 @@
+"""Feature points (section 4.2): from pixels picked in a few images to points in the world.
+
+A picked point may be wrong in one view (right and left confused, a finger slipped). With three views or more the view
+that contradicts the others is found and left out; with two, the point itself is. Whatever is left out is said.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import chdtri
+
+from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangulate
+from rig.capture import Features
+from rig.rig import Rig
+
+CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point in 10,000 is lost without need
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocatedFeatures:
+    """World points by landmark name, and a sentence for everything that was left out."""
+
+    points: Mapping[str, TriangulatedPoint]
+    remarks: tuple[str, ...] = ()
+
+
+def locate_features(features: Features, rig: Rig, *, noise_px: float) -> LocatedFeatures:
+    """Triangulates every landmark seen in two views or more. Raises nothing: a point that fails is a remark."""
+    points, remarks = {}, []
+    for name, pixels in features.items():
+        known = {camera: pixel for camera, pixel in pixels.items() if camera in rig}
+        if len(known) < 2:
+            remarks.append(f"feature {name} is picked in {len(known)} view, two are needed: left out")
+            continue
+        try:
+            point, dropped = _consistent(known, rig, noise_px)
+        except NoPoint as error:
+            remarks.append(f"feature {name} is left out: {error}")
+            continue
+        if point is None:
+            remarks.append(f"feature {name} is left out: its views contradict each other")
+            continue
+        if dropped is not None:
+            remarks.append(f"feature {name} in {dropped} contradicts the other views: that view is left out")
+        points[name] = point
+    return LocatedFeatures(points, tuple(remarks))
+
+
+def _consistent(
+    pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, noise_px: float
+) -> tuple[TriangulatedPoint | None, str | None]:
+    """The point from all views; or from all but one, and that one's name; or nothing."""
+    point = triangulate(pixels, rig, noise_px=noise_px)
+    if _agrees(point, noise_px):
+        return point, None
+    if len(pixels) == 2:
+        return None, None
+    without = {
+        name: triangulate({k: v for k, v in pixels.items() if k != name}, rig, noise_px=noise_px) for name in pixels
+    }
+    dropped = min(without, key=lambda name: without[name].misfit(noise_px))
+    return (without[dropped], dropped) if _agrees(without[dropped], noise_px) else (None, None)
+
+
+def _agrees(point: TriangulatedPoint, noise_px: float) -> bool:
+    return point.misfit(noise_px) < float(chdtri(2 * len(point.residuals_px) - 3, CONTRADICTION))

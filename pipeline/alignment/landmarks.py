@@ -1,0 +1,158 @@
+"""Alignment from feature points (section 4.2): the similarity ``T(x) = s (R x + t')`` that takes the head to the world.
+
+Enters: picked points, the rig, the model. Leaves: world_from_head, with what each point says against it.
+
+Step 1 is the paper's: full ordinary Procrustes, the minimum of eq. (3), from the mean head's landmarks to the
+triangulated points. Two departures:
+- A gross outlier among the points (right and left confused) must not turn the head. Every triple of points is tried;
+  the alignment that the points contradict least decides which of them stay.
+- Eq. (3) trusts all points alike and takes the subject for the mean head. Step 2 weighs each residual with the
+  covariance of the triangulated point and with the model's own covariance of its landmarks: a wide jaw is expected to
+  vary with the cheeks, not to turn the head. The paper's alignment is ``FeatureAlignment.procrustes``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.alignment.feature_points import locate_features
+from pipeline.alignment.procrustes import generalised_procrustes, procrustes
+from pipeline.eigenheads.model import HeadModel
+from pipeline.multiview.triangulation import TriangulatedPoint
+from pipeline.settings import AlignmentSettings
+from rig.capture import Features
+from rig.errors import EigenheadError
+from rig.geometry import RigidTransform, Similarity
+from rig.rig import Rig
+
+POINTS_LEAST = 3
+TRIANGLE_LEAST_MM = 5.0  # rms distance from the best line; less leaves the turn about that line to the noise
+OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points is lost (chi-square, 3 degrees)
+
+
+class TooFewFeatures(EigenheadError):
+    """Feature points that determine no alignment."""
+
+    def __init__(self, usable: Mapping[str, TriangulatedPoint], why: str, remarks: tuple[str, ...]) -> None:
+        counts = ", ".join(f"{name} in {len(point.residuals_px)} views" for name, point in usable.items()) or "none"
+        told = "".join(f"; {remark}" for remark in remarks)
+        super().__init__(
+            f"the feature points determine no alignment: {why}. At least {POINTS_LEAST} landmarks of the model "
+            f"that are not on a line are needed, each in 2 views; usable are: {counts}{told}. Pick more points, "
+            "or remove features.json to let the silhouettes decide"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureAlignment:
+    """``world_from_head``, the paper's ``procrustes`` of the same points, and the evidence.
+
+    ``residuals_mm``: distance of every point from the mean head's landmark, outliers too; ``used`` says which spoke.
+    """
+
+    world_from_head: Similarity
+    procrustes: Similarity
+    points: Mapping[str, TriangulatedPoint]
+    residuals_mm: Mapping[str, float]
+    used: Mapping[str, bool]
+    remarks: tuple[str, ...]
+
+
+def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> Similarity:
+    """world_from_head of ``feature_alignment``. Raises TooFewFeatures."""
+    return feature_alignment(model, features, rig, settings).world_from_head
+
+
+def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> FeatureAlignment:
+    """Alignment to picked points: outliers found, eq. (3) minimised, then weighed. Raises TooFewFeatures."""
+    located = locate_features(features, rig, noise_px=settings.feature_noise_px)
+    unknown = [
+        f"feature {name} is no landmark of model {model.name}" for name in located.points if name not in model.landmarks
+    ]
+    points = {name: point for name, point in located.points.items() if name in model.landmarks}
+    remarks = (*located.remarks, *unknown)
+    if len(points) < POINTS_LEAST:
+        raise TooFewFeatures(points, f"{len(points)} points are usable", remarks)
+    names = list(points)
+    target = np.stack([point.position_world for point in points.values()])
+    source, spread = landmark_statistics(model, names, settings.landmark_noise_mm)
+    noise = np.stack([point.covariance for point in points.values()])
+    expected = np.sqrt((_own_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
+    kept = consensus(source, target, expected)
+    if kept is None:
+        raise TooFewFeatures(points, "they lie on one line", remarks)
+    procrustes_only = procrustes(source[kept], target[kept])
+    rows = np.flatnonzero(np.repeat(kept, 3))
+    aligned = generalised_procrustes(
+        source[kept], target[kept], spread[np.ix_(rows, rows)], noise[kept], start=procrustes_only
+    )
+    distances = np.linalg.norm(target - aligned.apply(source), axis=1)
+    remarks += tuple(
+        f"feature {name} lies {distance:.0f} mm off what the other points say: left out"
+        for name, distance, keep in zip(names, distances, kept, strict=True)
+        if not keep
+    )
+    residuals = dict(zip(names, distances.tolist(), strict=True))
+    used = dict(zip(names, kept.tolist(), strict=True))
+    return FeatureAlignment(aligned, procrustes_only, points, residuals, used, remarks)
+
+
+def landmark_statistics(
+    model: HeadModel, names: list[str], noise_mm: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "p p"]]:
+    """The mean head's landmarks (head frame, mm) and their covariance over the population (mm^2, p = 3 n).
+
+    ``noise_mm`` is what a person's idea of a landmark and the model's differ by.
+    """
+    vertices = np.array([model.landmarks[name] for name in names])
+    modes = model.basis("full", len(model.modes), vertices).reshape(len(model.modes), -1).astype(float)
+    mean = model.levels["full"].operator[vertices] @ model.mean.astype(float)
+    return mean, modes.T @ modes + noise_mm**2 * np.eye(modes.shape[1])
+
+
+def consensus(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], expected_mm: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"] | None:
+    """Which points belong together; None where no triple of them spans a triangle.
+
+    Of the rigid alignments through every triple, the one with the least truncated sum of squared residuals wins; points
+    within OUTLIER_SIGMAS of the alignment of all that agree are kept. 26 points make 2,600 triples: 0.3 s.
+    """
+    best, agreed = np.inf, None
+    for triple in combinations(range(len(source)), POINTS_LEAST):
+        chosen = list(triple)
+        if min(flatness(source[chosen]), flatness(target[chosen])) < TRIANGLE_LEAST_MM:
+            continue
+        fitted = _rigid(source[chosen], target[chosen])
+        squared = ((target - fitted.apply(source)) ** 2).sum(axis=1) / expected_mm**2
+        cost = float(np.minimum(squared, OUTLIER_SIGMAS**2).sum())
+        if cost < best:
+            best, agreed = cost, squared < OUTLIER_SIGMAS**2
+            agreed[chosen] = True
+    for _ in range(3) if agreed is not None else ():
+        fitted = _rigid(source[agreed], target[agreed])
+        near = ((target - fitted.apply(source)) ** 2).sum(axis=1) < (OUTLIER_SIGMAS * expected_mm) ** 2
+        if near.sum() >= POINTS_LEAST and flatness(source[near]) >= TRIANGLE_LEAST_MM:
+            agreed = near
+    return agreed
+
+
+def _rigid(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> RigidTransform:
+    # Scale stays 1 here: three points fit too well when they may also shrink.
+    fitted = procrustes(source, target)
+    return RigidTransform(fitted.rotation, target.mean(axis=0) - fitted.rotation @ source.mean(axis=0))
+
+
+def flatness(points: Float[np.ndarray, "n 3"]) -> float:
+    """Rms distance (mm) of points from the line that fits them best."""
+    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(np.hypot(singular[1], singular[2]) / np.sqrt(len(points)))
+
+
+def _own_blocks(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "n 3 3"]:
+    count = len(covariance) // 3
+    blocks = covariance.reshape(count, 3, count, 3)
+    return blocks[np.arange(count), :, np.arange(count), :]

@@ -1,0 +1,197 @@
+"""Compiled loops, kept by content: what one process compiled, every later process of this machine finds.
+
+``njit`` here is Numba's, with another place for what it compiles. Numba's own cache (an index for each function, beside
+the sources) begins anew in every checkout, does not see that a loop in another file changed that it calls, loses or
+mixes entries where two processes write one index at once, and takes a job down where the disk is full or a file is
+damaged. Here each compiled function is one file in ``cache_folder()/kernels``, written atomically and named by the
+sha256 of all that it follows from: the byte code and constants of the function and of all that it calls, the types of
+its arguments, the processor, and the versions of Python, Numba and LLVM.
+
+Numba has no public interface for that. What is used of its inside: ``Dispatcher._cache`` (an object with
+``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``.
+"""
+
+import hashlib
+import logging
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import config, serialize
+from numba.core.compiler import CompileResult
+from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
+
+from rig.atomic_write import write_atomically
+
+DIGEST_BYTES = 32
+
+log = logging.getLogger("eigenhead")
+
+
+def cache_folder() -> Path:
+    """Where this machine keeps what can be made again: EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else
+    ~/.cache/eigenhead. It need not exist."""
+    given = os.environ.get("EIGENHEAD_CACHE")
+    if given:
+        return Path(given)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eigenhead"
+
+
+def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.njit`` that keeps what it compiles in ``cache_folder()``.
+
+    Args:
+        cache: whether to keep it.
+        options: of ``numba.njit``.
+    """
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(**options)(function)
+        if cache and isinstance(dispatcher, Dispatcher):  # with NUMBA_DISABLE_JIT it is the function itself
+            dispatcher._cache = KeptFunction(dispatcher)  # type: ignore[assignment]
+        return dispatcher
+
+    return compiled
+
+
+class KeptFunction:
+    """What Numba asks for a function that it is to compile, and tells of one that it did."""
+
+    def __init__(self, dispatcher: Dispatcher) -> None:
+        self._dispatcher = dispatcher
+        self._digest = ""
+
+    @property
+    def cache_path(self) -> str:
+        return str(cache_folder() / "kernels")
+
+    def file(self, signature: Any) -> Path:
+        """Where the function compiled for these argument types is or would be."""
+        if not self._digest:  # late: a function may call one that its module defines further down
+            self._digest = function_digest(self._dispatcher)
+        told = f"{self._digest} {signature!r} {_machine()}"
+        function = self._dispatcher.py_func
+        name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
+        return Path(self.cache_path) / f"{name}-{hashlib.sha256(told.encode()).hexdigest()}"
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """The compiled function, or None where none is kept, or a damaged one."""
+        target_context.refresh()
+        try:
+            data = self.file(signature).read_bytes()
+        except OSError:
+            return None
+        if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
+            return None
+        return CompileResult._rebuild(target_context, *pickle.loads(data[DIGEST_BYTES:]))
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Keeps a compiled function; where that is not possible it says so, once, and goes on."""
+        if any(not lifted.can_cache for lifted in result.lifted) or result.library.has_dynamic_globals:
+            return
+        data = serialize.dumps(result._reduce())
+        try:
+            write_atomically(self.file(signature), hashlib.sha256(data).digest() + data)
+        except OSError as error:
+            say_not_kept("compiled kernels", error)
+
+    def flush(self) -> None:
+        """Nothing: a file that the code no longer leads to is not found."""
+
+
+@cache
+def _warned() -> set[str]:
+    return set()
+
+
+def say_not_kept(what: str, error: OSError) -> None:
+    """One line for each kind of thing that could not be written to the cache folder."""
+    if what not in _warned():
+        _warned().add(what)
+        log.warning(
+            "%s are not kept in %s (%s): they are made anew each time; EIGENHEAD_CACHE names another folder",
+            what,
+            cache_folder(),
+            error.strerror or error,
+        )
+
+
+@cache
+def _machine() -> str:
+    """What a compiled function follows from besides its source: versions and the processor's features."""
+    options: Any = config
+    target: Any = cpu_target.target_context
+    versions = (numba.__version__, llvmlite.__version__, sys.implementation.cache_tag)
+    return repr((versions, options.OPT, options.BOUNDSCHECK, target.codegen().magic_tuple()))
+
+
+def function_digest(dispatcher: Dispatcher) -> str:
+    """Sha256 of all that the compiled function follows from in the sources."""
+    digest = hashlib.sha256()
+    for part in _function_parts(dispatcher, set()):
+        digest.update(part)
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def _function_parts(dispatcher: Dispatcher, seen: set[int]) -> Iterator[bytes]:
+    function = dispatcher.py_func
+    yield f"{function.__module__}.{function.__qualname__} {sorted(dispatcher.targetoptions.items())!r}".encode()
+    if id(dispatcher) in seen:
+        return
+    seen.add(id(dispatcher))
+    yield repr(function.__defaults__).encode()
+    names = list(_code_names(function.__code__))
+    yield from _code_parts(function.__code__)
+    for cell in function.__closure__ or ():
+        yield from _value_parts(cell.cell_contents, names, seen)
+    for name in names:
+        if name in function.__globals__:
+            yield name.encode()
+            yield from _value_parts(function.__globals__[name], names, seen)
+
+
+def _code_names(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _code_names(constant)
+
+
+def _code_parts(code: CodeType) -> Iterator[bytes]:
+    yield code.co_code
+    yield repr((code.co_names, code.co_varnames, code.co_argcount)).encode()
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _code_parts(constant)
+        else:
+            yield repr(sorted(constant, key=repr) if isinstance(constant, frozenset) else constant).encode()
+
+
+def _value_parts(value: Any, names: list[str], seen: set[int]) -> Iterator[bytes]:
+    """What a compiled function takes over from a global name: a value, or another function."""
+    if isinstance(value, Dispatcher):
+        yield from _function_parts(value, seen)
+    elif isinstance(value, ModuleType):
+        yield value.__name__.encode()
+        if id(value) in seen:
+            return
+        seen.add(id(value))
+        if value.__name__.partition(".")[0] == __name__.partition(".")[0]:
+            for name in names:
+                yield from _value_parts(getattr(value, name, None), names, seen)
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype} {value.shape}".encode() + value.tobytes()
+    elif isinstance(value, FunctionType | type):
+        yield f"{value.__module__}.{value.__qualname__}".encode()
+    else:
+        yield repr(value).encode()

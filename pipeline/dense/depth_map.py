@@ -1,0 +1,39 @@
+"""What one photograph, matched with its neighbours, says of the surface: depth, normal and how far to trust them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from rig.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """The surface that one camera sees, on the pixels of a pinhole crop about the subject.
+
+    ``camera`` has no distortion; its name and pose are those of the rig's camera. A pixel is known where its deviation
+    is finite; elsewhere depth, normal and ``views`` are 0.
+    """
+
+    camera: Camera
+    depth_mm: Float32[np.ndarray, "h w"]  # z in the camera frame
+    normal: Float32[np.ndarray, "h w 3"]  # unit, world frame, towards the camera
+    deviation_mm: Float32[np.ndarray, "h w"]  # standard deviation along the ray; inf where nothing is known
+    views: UInt8[np.ndarray, "h w"]  # that agree on the place, this one counted
+    mask: Float32[np.ndarray, "h w"]  # the subject's coverage, 0 to 1
+    colour: UInt8[np.ndarray, "h w 3"]  # the photograph, RGB
+
+    @property
+    def known(self) -> Bool[np.ndarray, "h w"]:
+        """Where the photographs say how far the surface is."""
+        return np.isfinite(self.deviation_mm)
+
+
+def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
+    """The known pixels as points of the world frame, mm, row by row."""
+    k, pose = depth_map.camera.intrinsics, depth_map.camera.camera_from_world
+    row, column = np.nonzero(depth_map.known)
+    z = depth_map.depth_mm[row, column].astype(float)
+    points = np.stack([(column - k.cx) / k.fx * z, (row - k.cy) / k.fy * z, z], axis=1)
+    return pose.inverse().apply(points)

@@ -1,0 +1,81 @@
+"""Depth, normal and deviation in every view, from the photographs.
+
+Enters: photographs, silhouettes, the rig and the head fitted so far. Leaves: a ``DepthMap`` a usable view. Every view
+is matched with its neighbours by windows that lie on slanted planes (Bleyer, Rhemann and Rother, *PatchMatch stereo*,
+2011, https://doi.org/10.5244/C.25.14, have planes and their propagation), coarse to fine. Unlike there nothing is drawn
+at random: silhouettes and head bound the search (``room``), an even sweep with paths of least cost finds the place
+(``search``), and from there least squares slides windows to a fraction of a pixel and says what it knows
+(``refinement``; Goesele et al., *Multi-view stereo for community photo collections*, 2007,
+https://doi.org/10.1109/ICCV.2007.4408933). What no other view confirms is not told (``agreement``).
+
+The result depends on nothing but what enters: views are refined each for itself, and compared when all are done.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.dense.agreement import depth_maps
+from pipeline.dense.crops import make_crops
+from pipeline.dense.depth_map import DepthMap
+from pipeline.dense.neighbours import choose_neighbours
+from pipeline.dense.refinement import doubled, refined
+from pipeline.dense.room import find_rooms
+from pipeline.dense.search import first_fields
+from pipeline.dense.stack import stack_crops
+from pipeline.dense.window import square_pattern
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.visual_hull import hull_extent
+from pipeline.settings import DenseSettings
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+Report = Callable[[str, float], None]
+FIRST, LEAST = 2, 3  # levels of the search and of its bounds: quarter and eighth of the photographs' size
+STEPS_PX = {2: (1, 3), 1: (1,), 0: ()}  # how far planes are taken over from, by level
+ROUNDS = {2: 2, 1: 2, 0: 1}  # of least squares
+DONE = {2: 0.4, 1: 0.6, 0: 0.95}  # share of the work
+
+
+def estimate_depth(
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    head_world: Mesh | None,
+    settings: DenseSettings,
+    *,
+    report: Report,
+) -> tuple[DepthMap, ...]:
+    """What each photograph, matched with its neighbours, says of the surface.
+
+    Args:
+        images: RGB, by camera name.
+        silhouettes: by camera name; a view whose silhouette is not usable takes no part.
+        head_world: the head fitted so far (world, mm), which bounds the search from behind; None where there is none.
+        report: told ``"dense"`` and the share that is done; may raise to stop.
+
+    Returns:
+        A map a view that takes part, in the order of the rig; fewer than two views know nothing.
+    """
+    extent = hull_extent(silhouettes, rig)
+    report("dense", 0.0)
+    crops = make_crops(images, silhouettes, rig, pixel_mm=settings.pixel_mm, at_world=extent[0])
+    if not crops:
+        return ()
+    neighbours = choose_neighbours([crop.camera for crop in crops], extent[0], settings)
+    pattern = square_pattern(2)
+    stack = stack_crops(crops, FIRST)
+    rooms = find_rooms(crops, stack_crops(crops, LEAST), stack, head_world, extent, settings)
+    report("dense", 0.1)
+    fields = first_fields(stack, rooms, neighbours, pattern, settings)
+    report("dense", 0.3)
+    for level in range(FIRST, -1, -1):
+        if level < FIRST:
+            stack = stack_crops(crops, level)
+            fields = doubled(fields, stack, settings)
+        fields = refined(fields, stack, neighbours, pattern, settings, steps_px=STEPS_PX[level], rounds=ROUNDS[level])
+        report("dense", DONE[level])
+    found = depth_maps(crops, stack, fields, settings)
+    report("dense", 1.0)
+    return found

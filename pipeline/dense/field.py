@@ -1,0 +1,17 @@
+"""The surface as one view has it so far: a plane a pixel, and how much is known of its depth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Field:
+    """Depth (mm of camera z, 0 where there is no surface) and slopes (mm a pixel, by x and y) of a view's pixels."""
+
+    depth: Float32[np.ndarray, "h w"]
+    slopes: Float32[np.ndarray, "h w 2"]
+    information: Float32[np.ndarray, "h w"]  # 1 / mm^2 of the depth
+    relief_mm: Float32[np.ndarray, "h w"]  # RMS of the depths about a pixel from the plane through them
+    likeness: Float32[np.ndarray, "h w"]  # mean correlation of the views that show the place alike; 0: none

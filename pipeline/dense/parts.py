@@ -1,0 +1,290 @@
+"""What every pixel of the subject shows: skin, hair or clothes (issue 16, item 4), learned from the capture itself.
+
+What the middle of the fitted face shows is skin. What lies beside the head above the chin is hair unless it looks like
+that skin, as a bald crown does; what lies below is clothes unless it looks like skin. From those starts expectation and
+maximisation (Dempster, Laird and Rubin 1977) learn how the parts of this capture look, as histograms of colour and fine
+structure over all views, cameras' gains taken out; place on the head is the prior; a filter that
+keeps to the photograph's edges makes neighbours agree (He, Sun and Tang 2010, guided image filtering,
+https://doi.org/10.1007/978-3-642-15549-9_1).
+
+A cap is told from hair only where it looks like the clothes below; both hide skin alike.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from pipeline.dense.part_cells import Cells, grey_of, head_guide, make_cells
+from pipeline.imaging.silhouette import Silhouette
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+SKIN, HAIR, CLOTHES = 0, 1, 2
+
+RED_BINS, BLUE_BINS, LIGHT_BINS, DETAIL_BINS = 36, 40, 20, 20
+RED_RANGE, BLUE_RANGE = (-0.8, 1.4), (-1.4, 1.0)  # of log ratios to green
+LIGHT_RANGE, DETAIL_RANGE = (-4.7, 0.4), (-4.7, -0.9)
+CHROMA_BLUR, LIGHT_BLUR, DETAIL_BLUR = 0.9, 1.6, 1.2  # bins; light falls off within each part
+SHADE_SHARE, SHADE_BLUR = 0.4, 4.0  # of a part's looks: its colours in light that only others of them have; bins
+OUTLIER = 0.02  # share of what belongs to no part
+BEARD_PRIOR = (0.8, 0.17)  # of skin and hair on the lower face
+CONFIDENT = 0.8  # only cells so probable teach how their part looks: others would pull all parts together
+LEAST_THERE = 1e-3  # share of a part's sure places that do not look like skin: a bald head has no hair
+SKIN_RATIO = 0.15  # looks that skin has so much less often than the whole subject are half not skin's
+OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a part of its own would fill evenly
+FLOOR = 0.02  # of a part's looks that its histogram has not shown
+
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class PartSettings:
+    """Chosen on studio captures and two captures rendered by another program."""
+
+    cell_mm: float = 2.2  # of the grid that parts are told on: four pixels of the usual rig
+    steps: int = 4  # of expectation and maximisation
+    strength: float = 0.7  # of what a cell looks like: colour and structure of neighbours are not independent
+    smooth_mm: float = 9.0  # over which neighbours agree
+    edge: float = 0.05  # contrast (0 to 1, as displayed) that ends such a neighbourhood
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartMap:
+    """One view. ``probability`` of skin, hair and clothes on the photograph's own grid; what is missing to one is
+    unknown, all of it outside the subject."""
+
+    camera: str
+    probability: Float32[np.ndarray, "h w 3"]
+
+
+def classify_parts(
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    head_world: Mesh,
+    face_region: Bool[np.ndarray, " v"],
+    landmarks_world: Mapping[str, Float[np.ndarray, " 3"]],
+    settings: PartSettings,
+    *,
+    report: Report,
+) -> dict[str, PartMap]:
+    """What the pixels of every usable view with a photograph show.
+
+    Args:
+        images: sRGB photographs by camera.
+        silhouettes: The subject's, by camera; views that are not usable are left out.
+        rig: The calibrated cameras.
+        head_world: The fitted bare head (mm).
+        face_region: Its vertices from ear to ear and from the lower forehead to under the chin.
+        landmarks_world: Its 26 landmarks (mm).
+        settings: Grid, smoothness and priors.
+        report: Told of progress.
+
+    Returns:
+        A map for each view that took part.
+    """
+    masks = {n: s.mask for n, s in silhouettes.items() if s.quality.usable and n in images and n in rig.names}
+    used = rig.subset(name for name in rig.names if name in masks)
+    report("parts", 0.0)
+    head = head_guide(head_world, face_region, landmarks_world)
+    cells = make_cells(images, masks, used, head, settings.cell_mm)
+    if not cells:
+        return {}
+    inside = [view.inside > 0.5 for view in cells]
+
+    def gathered(maps: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([each[mask] for each, mask in zip(maps, inside, strict=True)])
+
+    place = gathered([place_prior(view) for view in cells])
+    looks = gathered([bins(view) for view in cells])
+    start, beard = gathered([starts(view) for view in cells]), gathered([beard_zone(view) for view in cells])
+    report("parts", 0.4)
+    share = posterior(learn(looks, place, start, beard, settings), place)
+    report("parts", 0.6)
+    rows = np.split(share, np.cumsum([np.count_nonzero(mask) for mask in inside])[:-1])
+
+    def one(view: Cells, mask: Bool[np.ndarray, "r c"], own: Float32[np.ndarray, "n 3"]) -> PartMap:
+        name = view.camera.name
+        return PartMap(name, finished(view, mask, own, images[name], masks[name], settings))
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # OpenCV and numpy release the interpreter lock
+        found = list(pool.map(one, cells, inside, rows))
+    report("parts", 1.0)
+    return {each.camera: each for each in found}
+
+
+def bins(view: Cells) -> Int[np.ndarray, "r c 2"]:
+    """Bin of colour and of fine structure of every cell."""
+    red, blue, light = np.moveaxis(view.colour, 2, 0)
+    a, b = _bin(red, RED_RANGE, RED_BINS), _bin(blue, BLUE_RANGE, BLUE_BINS)
+    colour = (a * BLUE_BINS + b) * LIGHT_BINS + _bin(light, LIGHT_RANGE, LIGHT_BINS)
+    return np.stack([colour, _bin(view.detail, DETAIL_RANGE, DETAIL_BINS)], axis=-1)
+
+
+def _bin(values: Float32[np.ndarray, "r c"], span: tuple[float, float], count: int) -> Int[np.ndarray, "r c"]:
+    return np.clip(((values - span[0]) * (count / (span[1] - span[0]))).astype(np.int64), 0, count - 1)
+
+
+def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
+    """Cells that by their place can hardly be anything but skin, hair or clothes (1, else 0).
+
+    Skin: cheeks and nose. Hair:
+    the cranium far from the face, and what lies beside the head above the ears. Clothes: what lies well below the chin
+    and beside the neck.
+    """
+    skin = view.cheek > 0.5
+    beside = ~view.on_head & (view.outside_mm > 3.0)
+    hair = (beside | (view.into_face_mm < -45.0)) & (view.above_chin_mm > 70.0)
+    clothes = beside & (view.above_chin_mm < -50.0)
+    return np.stack([skin, hair, clothes], axis=-1).astype(np.float32)
+
+
+def beard_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
+    """Jaw, chin and upper lip."""
+    low = (view.above_chin_mm > -20.0) & (view.above_chin_mm < 50.0)
+    return view.on_head & low & (view.into_face_mm > -15.0)
+
+
+def place_prior(view: Cells) -> Float32[np.ndarray, "r c 4"]:
+    """Probability of each part, and of none, by place alone."""
+    face = _ramp(view.into_face_mm, -25.0, 15.0)
+    upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
+    skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
+    skin_below = np.where(view.on_head, 0.70, 0.2)
+    hair_below = np.where(view.on_head, 0.10, 0.2)
+    skin = upper * skin_above + (1.0 - upper) * skin_below
+    hair = (1.0 - skin) * (upper * 0.93 + (1.0 - upper) * hair_below / (1.0 - skin_below))
+    beard = beard_zone(view)
+    skin, hair = np.where(beard, BEARD_PRIOR[SKIN], skin), np.where(beard, BEARD_PRIOR[HAIR], hair)
+    named = np.maximum(skin, 0.985 * view.feature)
+    hair, skin = hair * (1.0 - named) / (1.0 - skin), named
+    part = np.stack([skin, hair, 1.0 - skin - hair], axis=-1)
+    other = OUTLIER * (1.0 - 0.98 * view.feature[:, :, None])  # lips look like no other skin
+    return np.concatenate([(1.0 - other) * part, other], axis=-1).astype(np.float32)
+
+
+def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float32[np.ndarray, "r c"]:
+    t = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def learn(
+    looks: Int[np.ndarray, "n 2"],
+    prior: Float32[np.ndarray, "n 4"],
+    start: Float32[np.ndarray, "n 3"],
+    beard: Bool[np.ndarray, " n"],
+    settings: PartSettings,
+) -> Float32[np.ndarray, "n 4"]:
+    """Log likelihood of every cell's looks under skin, hair, clothes and the outlier, and of there being such a part.
+
+    Starts from the cells of each part that are sure by their place, less those of hair and clothes that look like skin.
+    """
+    colour, detail = looks.T
+    everything = colour_looks(colour, np.ones(len(colour), np.float32))
+    ratio = (colour_looks(colour, start[:, SKIN]) / everything)[colour]
+    otherwise = (SKIN_RATIO / (SKIN_RATIO + ratio)) ** 2
+    share = start.copy()
+    share[:, HAIR] = np.maximum(share[:, HAIR], beard) * otherwise
+    share[:, CLOTHES] *= otherwise
+    there = np.log(_there(otherwise, start, beard))
+    logs = np.empty((len(colour), 4), np.float32)
+    logs[:, 3] = settings.strength * -np.log(OUTLIER_BINS)
+    for step in range(settings.steps):
+        for part in (SKIN, HAIR, CLOTHES):
+            like = colour_looks(colour, share[:, part])[colour] * detail_looks(detail, share[:, part])[detail]
+            logs[:, part] = settings.strength * np.log(like) + there[part]
+        if step < settings.steps - 1:
+            share = posterior(logs, prior)
+            share[share < CONFIDENT] = 0.0
+    return logs
+
+
+def _there(
+    otherwise: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], beard: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, " 3"]:
+    """Is there hair, are there clothes? The share of their sure places that look otherwise than skin; a beard is hair,
+    too."""
+    shares = [float(otherwise[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, beard)]
+    return np.maximum([1.0, max(shares[HAIR], shares[3]), shares[CLOTHES]], LEAST_THERE)
+
+
+def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
+    """Probability of each part; what is missing to one is the outlier's."""
+    share = prior * np.exp(logs - logs.max(axis=1, keepdims=True))
+    return share[:, :3] / share.sum(axis=1, keepdims=True)
+
+
+def colour_looks(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " b"]:
+    """Probability of every bin of colour, smoothed, nowhere zero."""
+    shape = (RED_BINS, BLUE_BINS, LIGHT_BINS)
+    counts = np.bincount(colour, weight, np.prod(shape)).astype(np.float32)
+    counts = counts.reshape(RED_BINS, BLUE_BINS * LIGHT_BINS)
+    counts = cv2.GaussianBlur(counts, (1, 7), sigmaX=0.1, sigmaY=CHROMA_BLUR).reshape(shape)
+    for slab in counts:
+        slab[:] = cv2.GaussianBlur(slab, (0, 0), sigmaX=LIGHT_BLUR, sigmaY=CHROMA_BLUR)
+    light = cv2.GaussianBlur(counts.sum(axis=(0, 1))[None], (0, 0), sigmaX=SHADE_BLUR, sigmaY=0.1)[0]
+    shaded = counts.sum(axis=2, keepdims=True) * (light / max(light.sum(), 1e-9))
+    return _proper(((1.0 - SHADE_SHARE) * counts + SHADE_SHARE * shaded).ravel().astype(float))
+
+
+def detail_looks(detail: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
+    """Probability of every bin of fine structure, smoothed, nowhere zero."""
+    counts = np.bincount(detail, weight, DETAIL_BINS).astype(np.float32)[None]
+    return _proper(cv2.GaussianBlur(counts, (0, 0), sigmaX=DETAIL_BLUR, sigmaY=0.1).ravel().astype(float))
+
+
+def _proper(counts: Float[np.ndarray, " b"]) -> Float[np.ndarray, " b"]:
+    even = 1.0 / len(counts)
+    return (1.0 - FLOOR) * counts / max(counts.sum(), 1.0) + FLOOR * even
+
+
+def finished(
+    view: Cells,
+    inside: Bool[np.ndarray, "r c"],
+    share: Float32[np.ndarray, "n 3"],
+    image: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    settings: PartSettings,
+) -> Float32[np.ndarray, "h w 3"]:
+    """The cells' probabilities made smooth up to edges of the photograph, on its own grid."""
+    grid = np.zeros((*inside.shape, 3), np.float32)
+    grid[inside] = share
+    radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
+    slope, offset = guided(view.grey, grid, inside.astype(np.float32), radius, settings.edge)
+    whole = (inside.shape[1] * view.size_px, inside.shape[0] * view.size_px)
+    slope, offset = (cv2.resize(each, whole, interpolation=cv2.INTER_LINEAR) for each in (slope, offset))
+    over = (0, mask.shape[0] - whole[1], 0, mask.shape[1] - whole[0])
+    slope, offset = (cv2.copyMakeBorder(each, *over, cv2.BORDER_REPLICATE) for each in (slope, offset))
+    smooth = np.clip(slope * grey_of(image)[:, :, None] + offset, 0.0, 1.0) * mask[:, :, None]
+    return smooth / np.maximum(smooth.sum(axis=2, keepdims=True), 1.0)
+
+
+def guided(
+    guide: Float32[np.ndarray, "r c"],
+    values: Float32[np.ndarray, "r c p"],
+    weight: Float32[np.ndarray, "r c"],
+    radius: int,
+    edge: float,
+) -> tuple[Float32[np.ndarray, "r c p"], Float32[np.ndarray, "r c p"]]:
+    """Slope and offset of the guided filter: ``slope guide + offset`` are the smooth values (eqs. 5, 6 and 8 there).
+
+    ``weight`` is 0 where values are unknown; ``edge`` the contrast of the guide that ends a neighbourhood.
+    """
+
+    def mean(field: np.ndarray) -> np.ndarray:
+        return cv2.blur(field, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_CONSTANT)
+
+    known = np.maximum(mean(weight), 1e-6)
+    middle = mean(guide * weight) / known
+    spread = mean(guide * guide * weight) / known - middle * middle
+    seen = values * weight[:, :, None]
+    level = mean(seen) / known[:, :, None]
+    shared = mean(seen * guide[:, :, None]) / known[:, :, None] - level * middle[:, :, None]
+    slope = shared / (spread + edge * edge)[:, :, None]
+    offset = level - slope * middle[:, :, None]
+    slope, offset = (mean(each * weight[:, :, None]) / known[:, :, None] for each in (slope, offset))
+    return slope, offset

@@ -1,0 +1,100 @@
+"""From one size of the photographs to the next: planes doubled, taken over from neighbours, and slid to their place.
+
+What the smaller size knew is carried along with a share of its information, and no more than the relief about a pixel
+allows: its windows see shading that smaller ones do not, and miss what is smaller than they are.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Int
+
+from pipeline.dense.crops import UNSEEN_MOST_PX
+from pipeline.dense.field import Field
+from pipeline.dense.field_kernels import double, fit_planes
+from pipeline.dense.refine_kernels import propagate, slide
+from pipeline.dense.stack import SHADES, Stack
+from pipeline.parallel_for import in_threads
+from pipeline.settings import DenseSettings
+
+STEEPEST = 3.0  # slope against the image plane: 72 degrees
+RADIUS_PX = 2  # of the neighbourhood that a plane is laid through
+LEAST_INFORMATION = 1e-4  # 1 / mm^2: a standard deviation of 100 mm
+MOST_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
+
+
+def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> list[Field]:
+    """The fields at twice the size, the size of ``stack``."""
+    found: list[Field] = [None] * len(fields)  # type: ignore[list-item]
+
+    def work(first: int, last: int) -> None:
+        for view in range(first, last):
+            field, distance = fields[view], stack.image(stack.distance_px, view)
+            live = (distance < 0.5) & (distance > UNSEEN_MOST_PX)
+            depth, slopes = np.empty(live.shape, np.float32), np.empty((*live.shape, 2), np.float32)
+            double(field.depth, field.slopes, live, depth, slopes)
+            relief = (settings.relief_factor * field.relief_mm) ** 2
+            known = settings.carried * field.information / (1.0 + field.information * relief)
+            information = cv2.resize(known, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+            zero = np.zeros_like(depth)
+            found[view] = Field(depth, slopes, information, zero, zero)
+
+    in_threads(len(fields), work)
+    return found
+
+
+def refined(
+    fields: Sequence[Field],
+    stack: Stack,
+    neighbours: Sequence[Int[np.ndarray, " _"]],
+    pattern: Float32[np.ndarray, "2 s"],
+    settings: DenseSettings,
+    *,
+    steps_px: Sequence[int],
+    rounds: int,
+) -> list[Field]:
+    """The fields after planes of neighbours ``steps_px`` away were tried (odd; empty: none), and ``rounds`` slides."""
+    found: list[Field] = [None] * len(fields)  # type: ignore[list-item]
+
+    def work(first: int, last: int) -> None:
+        for view in range(first, last):
+            found[view] = _refined(fields[view], stack, view, neighbours[view], pattern, settings, steps_px, rounds)
+
+    in_threads(len(fields), work)
+    return found
+
+
+def _refined(
+    field: Field,
+    stack: Stack,
+    view: int,
+    neighbours: Int[np.ndarray, " m"],
+    pattern: Float32[np.ndarray, "2 s"],
+    settings: DenseSettings,
+    steps_px: Sequence[int],
+    rounds: int,
+) -> Field:
+    sight = (
+        int(stack.offset[view]), float(stack.noise[view]), stack.ways(view, neighbours), stack.pairs,
+        stack.distance_px, pattern, settings.contrast_levels * SHADES,
+    )  # fmt: skip
+    depth, slopes = field.depth.copy(), field.slopes.copy()
+    if steps_px:
+        cost = np.full(depth.shape, -1.0, np.float32)
+        for parity in (0, 1):
+            propagate(*sight, parity, np.array(steps_px), depth, slopes, cost)
+    live = depth > 0.0
+    pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
+    before, known = depth, field.information + LEAST_INFORMATION
+    information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
+    for _ in range(rounds):
+        place, seen, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
+        slide(*sight, MOST_SLIDE_PX, depth, slopes, place, seen, likeness)
+        seen = seen / (settings.match_factor**2 + settings.match_floor_mm**2 * seen)
+        information = seen + known
+        joined = np.where(live, (seen * place + known * before) / information, 0.0).astype(np.float32)
+        depth, flatter, relief = np.empty_like(joined), np.empty_like(slopes), np.empty_like(joined)
+        fit_planes(joined, slopes, information, RADIUS_PX, pixel_mm, STEEPEST * pixel_mm, depth, flatter, relief)
+        slopes = flatter
+    return Field(depth, slopes, information.astype(np.float32), relief, likeness)

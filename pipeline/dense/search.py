@@ -1,0 +1,61 @@
+"""The first depth: every ray is tried at even steps through its room, and neighbouring rays agree on a path."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float32, Int
+
+from pipeline.dense.field import Field
+from pipeline.dense.room import Room
+from pipeline.dense.stack import SHADES, Stack
+from pipeline.dense.sweep_kernels import aggregate, sweep_view
+from pipeline.parallel_for import in_threads
+from pipeline.settings import DenseSettings
+
+# Costs are 1 minus a correlation. A step of one label is a slope that the room's bounds do not have; a wider step is an
+# edge, which two or three pixels of clear texture pay for.
+STEP_COST, EDGE_COST = np.float32(0.05), np.float32(0.4)
+
+
+def first_fields(
+    stack: Stack,
+    rooms: Sequence[Room],
+    neighbours: Sequence[Int[np.ndarray, " _"]],
+    pattern: Float32[np.ndarray, "2 s"],
+    settings: DenseSettings,
+) -> list[Field]:
+    """The fields of all views by a sweep through their rooms; their information is 0.
+
+    Args:
+        neighbours: of each view, those that it is compared with.
+        pattern: samples of a window, across and down from its middle, px.
+    """
+    fields: list[Field] = [None] * len(stack)  # type: ignore[list-item]
+
+    def work(first: int, last: int) -> None:
+        for view in range(first, last):
+            cost = np.empty((*rooms[view].near.shape, settings.labels), np.float32)
+            sweep_view(
+                int(stack.offset[view]), float(stack.noise[view]), stack.ways(view, neighbours[view]), stack.pairs,
+                stack.distance_px, pattern, settings.contrast_levels * SHADES, rooms[view].near, rooms[view].far,
+                rooms[view].slopes, cost,
+            )  # fmt: skip
+            fields[view] = _cheapest(cost, rooms[view])
+
+    in_threads(len(stack), work)
+    return fields
+
+
+def _cheapest(cost: Float32[np.ndarray, "h w d"], room: Room) -> Field:
+    """The label of the cheapest paths, and within it the least of the pixel's own costs: paths are no likeness."""
+    paths = np.empty_like(cost)
+    aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)
+    labels = cost.shape[2]
+    best = np.clip(paths.argmin(axis=2), 1, labels - 2)
+    before, at, after = (np.take_along_axis(cost, best[:, :, None] + j, axis=2)[:, :, 0] for j in (-1, 0, 1))
+    within = np.clip(0.5 * (before - after) / np.maximum(before + after - 2.0 * at, 1e-6), -0.5, 0.5)
+    share = (best + within) / (labels - 1)
+    depth = np.where(room.far > 0.0, room.near + share * (room.far - room.near), 0.0).astype(np.float32)
+    slopes = room.slopes[:, :, :2] + share[:, :, None] * (room.slopes[:, :, 2:] - room.slopes[:, :, :2])
+    zero = np.zeros_like(depth)
+    return Field(depth, slopes.astype(np.float32), zero, zero, zero)

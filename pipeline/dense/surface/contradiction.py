@@ -1,0 +1,76 @@
+"""Outlines that the depth of other views contradicts: a mask that leaves out what two of them see solid is wrong there.
+
+A surface lies inside every silhouette, hidden or not. Where points of two views fall outside a third one's, that one's
+outline says nothing any more, so that one bad mask cuts no hole through what the others know.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.compiled import njit
+from pipeline.dense.surface.view_stack import ViewStack
+from pipeline.dense.surface.vote_kernels import nearest_pixel, project
+from pipeline.parallel_for import in_threads
+
+BLOCK = 4  # pixels along the side of what is decided at once
+STRIDE = 3  # every third pixel of every third row stands for the others
+CLEAR_PX = 2.5  # a point nearer to the outline is ordinary: blur, hair, calibration
+SURE_MM = 1.0  # points with a larger deviation do not count
+VIEWS_LEAST = 2  # that see something solid
+SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
+
+
+def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
+    """The views without the outlines that others contradict, and by view the share of its crop that was."""
+    shares = np.zeros(len(views.cameras))
+    pixels = views.pixels.copy()
+
+    def one(first: int, last: int) -> None:
+        for v in range(first, last):
+            height, width = views.sizes[v]
+            blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
+            _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
+            wrong = cv2.dilate((np.bitwise_count(blocks) >= VIEWS_LEAST).view(np.uint8), np.ones((3, 3), np.uint8))
+            shares[v] = wrong.mean()
+            if wrong.any():
+                whole = np.kron(wrong, np.ones((BLOCK, BLOCK), np.uint8))[:height, :width].ravel()
+                own = pixels[views.starts[v] : views.starts[v] + height * width]
+                own[whole > 0, 5] = SILENT_PX
+
+    in_threads(len(views.cameras), one)
+    return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mark(
+    target: int,
+    cameras: np.ndarray,
+    sizes: np.ndarray,
+    starts: np.ndarray,
+    pixels: np.ndarray,
+    blocks: np.ndarray,
+    width: int,
+) -> None:
+    """Sets the bit of each view that has a sure point in a block outside of the target's outline."""
+    place = np.empty(3)
+    for v in range(len(cameras)):
+        if v == target:
+            continue
+        p, bit = cameras[v], np.uint64(1) << np.uint64(v % 64)
+        for row in range(0, sizes[v, 0], STRIDE):
+            for column in range(0, sizes[v, 1], STRIDE):
+                at = starts[v] + row * sizes[v, 1] + column
+                if not pixels[at, 4] < SURE_MM:
+                    continue
+                depth = pixels[at, 0]
+                x, y = (column - p[14]) / p[12] * depth, (row - p[15]) / p[13] * depth
+                for axis in range(3):  # the rotation's inverse, from the camera's centre
+                    place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[16 + axis]
+                ahead, at_column, at_row = project(cameras[target], place)
+                if ahead <= 1.0:
+                    continue
+                near, beyond = nearest_pixel(at_column, at_row, sizes[target])
+                there = starts[target] + near
+                if beyond == 0.0 and pixels[there, 6] < 0.0 and pixels[there, 5] > CLEAR_PX:
+                    blocks[near // width // BLOCK, near % width // BLOCK] |= bit

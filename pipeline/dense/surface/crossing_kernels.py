@@ -1,0 +1,91 @@
+"""Triangles of a mesh that cross each other (compiled).
+
+Triangles are sorted into cubic cells by their centroids; a cell is as wide as the widest triangle, so that those which
+meet lie in neighbouring cells. Two cross if an edge of one goes through the other (strictly: touching is no crossing).
+"""
+
+import numpy as np
+
+from pipeline.compiled import njit
+
+
+@njit(cache=True, nogil=True)
+def crossing_triangles(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    order: np.ndarray,
+    keys: np.ndarray,
+    spans: np.ndarray,
+    active: np.ndarray,
+    crossing: np.ndarray,
+) -> None:
+    """Marks triangles that cross another, for pairs of which one is ``active``.
+
+    ``order`` sorts the triangles by ``keys`` (given sorted): the rank of their cell in a box of ``spans`` cells, whose
+    outermost cells are empty.
+    """
+    boxes = np.empty((len(faces), 6))
+    for f in range(len(faces)):
+        for axis in range(3):
+            a, b, c = vertices[faces[f, 0], axis], vertices[faces[f, 1], axis], vertices[faces[f, 2], axis]
+            boxes[f, axis], boxes[f, 3 + axis] = min(min(a, b), c), max(max(a, b), c)
+    ranges, cell = np.empty((9, 2), np.int64), -1
+    for position in range(len(order)):
+        f = order[position]
+        if not active[f]:
+            continue
+        if keys[position] != cell:
+            cell = keys[position]
+            for column in range(9):
+                low = cell + ((column // 3 - 1) * spans[1] + column % 3 - 1) * spans[2] - 1
+                ranges[column, 0] = np.searchsorted(keys, low)
+                ranges[column, 1] = np.searchsorted(keys, low + 3)
+        for column in range(9):
+            for at in range(ranges[column, 0], ranges[column, 1]):
+                g = order[at]
+                if (active[g] and g <= f) or not _boxes_meet(boxes, f, g):
+                    continue
+                if _cross(vertices, faces[f], faces[g]):
+                    crossing[f] = crossing[g] = True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _boxes_meet(boxes: np.ndarray, f: int, g: int) -> bool:
+    apart = False
+    for axis in range(3):
+        apart |= boxes[f, axis] > boxes[g, 3 + axis] or boxes[g, axis] > boxes[f, 3 + axis]
+    return not apart
+
+
+@njit(cache=True, nogil=True)
+def _cross(vertices: np.ndarray, f: np.ndarray, g: np.ndarray) -> bool:
+    shared = 0
+    for a in range(3):
+        for b in range(3):
+            shared += f[a] == g[b]
+    if shared >= 2:  # neighbours over an edge
+        return False
+    for k in range(3):
+        if _pierces(vertices, f[k], f[(k + 1) % 3], g) or _pierces(vertices, g[k], g[(k + 1) % 3], f):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _pierces(vertices: np.ndarray, p: int, q: int, face: np.ndarray) -> bool:
+    a, b, c = face[0], face[1], face[2]
+    if p in (a, b, c) or q in (a, b, c):  # an edge that ends in a corner does not go through the face
+        return False
+    if _side(vertices, a, b, c, p) * _side(vertices, a, b, c, q) >= 0:
+        return False
+    one, two, three = _side(vertices, p, q, a, b), _side(vertices, p, q, b, c), _side(vertices, p, q, c, a)
+    return (one > 0 and two > 0 and three > 0) or (one < 0 and two < 0 and three < 0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _side(v: np.ndarray, a: int, b: int, c: int, d: int) -> float:
+    """Six times the signed volume of a tetrahedron."""
+    bx, by, bz = v[b, 0] - v[a, 0], v[b, 1] - v[a, 1], v[b, 2] - v[a, 2]
+    cx, cy, cz = v[c, 0] - v[a, 0], v[c, 1] - v[a, 1], v[c, 2] - v[a, 2]
+    dx, dy, dz = v[d, 0] - v[a, 0], v[d, 1] - v[a, 1], v[d, 2] - v[a, 2]
+    return bx * (cy * dz - cz * dy) + by * (cz * dx - cx * dz) + bz * (cx * dy - cy * dx)

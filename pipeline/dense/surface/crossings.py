@@ -1,0 +1,48 @@
+"""A mesh that does not cross itself: vertices go back, where it does, towards places where it cannot."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.dense.surface.crossing_kernels import crossing_triangles
+from rig.mesh import Mesh
+
+ROUNDS_MOST = 40
+HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of it, and take their neighbours along
+
+
+def crossing_faces(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
+) -> Bool[np.ndarray, " f"]:
+    """Triangles that cross another one, among pairs of which one is ``active`` (all of them, if None)."""
+    corners = vertices[faces]
+    low = corners.min(axis=1)
+    wide = max(float((corners.max(axis=1) - low).max()), 1e-9)
+    cell = np.floor((corners.mean(axis=1) - low.min(axis=0)) / wide).astype(np.int64) + 1
+    spans = cell.max(axis=0) + 2
+    keys = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+    order = np.argsort(keys, kind="stable")
+    crossing = np.zeros(len(faces), bool)
+    chosen = np.ones(len(faces), bool) if active is None else active
+    crossing_triangles(vertices, faces, order, keys[order], spans, chosen, crossing)
+    return crossing
+
+
+def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh, int]:
+    """The mesh without self-intersections, and how many of its vertices moved; with all vertices in their ``safe``
+    places it has none."""
+    vertices, faces = mesh.vertices.copy(), mesh.faces
+    moved = np.zeros(len(vertices), bool)
+    active: Bool[np.ndarray, " f"] | None = None
+    for done in range(ROUNDS_MOST):
+        crossing = crossing_faces(vertices, faces, active)
+        if not crossing.any():
+            break
+        back = np.zeros(len(vertices), bool)
+        back[faces[crossing]] = True
+        for _ in range(max(0, done - HALVINGS + 1)):
+            back[faces[back[faces].any(axis=1)]] = True
+        share = 0.5 if done < HALVINGS else 0.0
+        vertices[back] = safe[back] + share * (vertices[back] - safe[back])
+        moved |= back
+        active = np.asarray(back[faces].any(axis=1))
+    return Mesh(vertices, faces), int(moved.sum())

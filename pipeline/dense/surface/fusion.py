@@ -1,0 +1,132 @@
+"""All that the cameras see, as one closed surface.
+
+Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
+for each vertex. A signed distance is found on a grid (``signed_distance``), its zero level made a mesh
+(``net_kernels``), the vertices are drawn to the depth maps themselves (``refinement``) and taken back where the
+mesh would cross itself (``crossings``).
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.dense.depth_map import DepthMap
+from pipeline.dense.surface.contradiction import silence_contradicted
+from pipeline.dense.surface.crossings import without_crossings
+from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
+from pipeline.dense.surface.parts_by_place import parts_by_place
+from pipeline.dense.surface.quality import deviation_mm
+from pipeline.dense.surface.refinement import refine_vertices
+from pipeline.dense.surface.signed_distance import Level, solve
+from pipeline.dense.surface.view_stack import stack_views
+from pipeline.diagnostics import ReportWarning
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.settings import BustSettings
+from rig.errors import EigenheadError
+from rig.mesh import Mesh, face_normals
+from rig.rig import Rig
+
+Report = Callable[[str, float], None]
+
+TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
+VIEWS_LEAST = 3
+CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and others see solid
+
+
+class NoSurface(EigenheadError):
+    """Photographs that do not tell where the surface is."""
+
+    def __init__(self, views: int) -> None:
+        super().__init__(
+            f"{views} of the photographs say how far the surface is, {VIEWS_LEAST} are needed: take more views "
+            "that overlap, or sharper ones"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BustSurface:
+    """The whole visible surface: closed, two-manifold, wound outwards, one piece, without self-intersections."""
+
+    mesh_world: Mesh
+    deviation_mm: Float[np.ndarray, " v"]  # standard deviation along the normal
+    part: UInt8[np.ndarray, " v"]  # 0 unseen, 1 skin, 2 hair, 3 clothes
+    views: UInt8[np.ndarray, " v"]  # whose depth agrees with the place
+    warnings: tuple[ReportWarning, ...] = ()
+
+    @property
+    def seen(self) -> Bool[np.ndarray, " v"]:
+        """Vertices that some photograph measures."""
+        return self.views > 0
+
+
+def fuse(
+    depth_maps: Sequence[DepthMap],
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    head_world: Mesh | None,
+    settings: BustSettings,
+    *,
+    report: Report,
+) -> BustSurface:
+    """The closed surface that the views agree on.
+
+    Args:
+        depth_maps: one a view; those that know nothing are left out.
+        silhouettes: by camera, at least of the depth maps' cameras.
+        rig: the cameras as calibrated, world frame.
+        head_world: the fitted head, closed but for its neck (mm); None where there is none.
+        settings: spacing of the vertices.
+        report: called with the stage's progress.
+
+    Raises:
+        NoSurface: fewer than three views know any depth.
+    """
+    maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
+    if len(maps) < VIEWS_LEAST:
+        raise NoSurface(len(maps))
+    views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
+    report("bust", 0.1)
+    level = solve(maps, views, head_world, settings.spacing_mm)
+    report("bust", 0.6)
+    net, safe = closed_net(level)
+    mesh, measured = refine_vertices(net, views, settings.spacing_mm)
+    mesh, _ = without_crossings(mesh, safe)
+    report("bust", 0.9)
+    part = parts_by_place(mesh, measured.views, head_world)
+    names = [depth_map.camera.name for depth_map in maps]
+    warnings = tuple(_mask_warnings(names, contradicted))
+    return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, warnings)
+
+
+def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -> Iterator[ReportWarning]:
+    for name, share in zip(names, contradicted, strict=True):
+        if share > CONTRADICTED_WARNED:
+            yield ReportWarning(
+                "mask-contradicted",
+                f"{name}: other views see the subject where its silhouette leaves it out ({share:.1%} of the picture): "
+                "look at its clean plate or mask",
+            )
+
+
+def closed_net(level: Level) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
+    """The largest piece of the zero level, and places of its vertices at which it cannot cross itself: the corners of
+    the cubes about the inner nodes."""
+    grid, field = level.grid, level.field.copy()
+    compose_well(field, grid.neighbours, TURNED_TO * grid.step_mm)
+    vertices, of_cell = net_vertices(field, grid.index, grid.neighbours)
+    faces, cells = net_faces(field, grid.neighbours, vertices, of_cell), np.flatnonzero(of_cell >= 0)
+    kept = _largest(vertices, faces)
+    used, corners = np.unique(faces[kept], return_inverse=True)
+    placed = grid.corner + grid.step_mm * vertices[used]
+    safe = grid.corner + grid.step_mm * (grid.index[cells[used]] + 0.5)
+    return Mesh(placed, corners.reshape(-1, 3).astype(np.int32)), safe
+
+
+def _largest(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Bool[np.ndarray, " f"]:
+    """Faces of the piece that holds the greatest volume; cavities hold a negative one."""
+    piece = component_of(faces, len(vertices))[faces[:, 0]]
+    towards = vertices[faces[:, 0]] - vertices.mean(axis=0)
+    volume = np.bincount(piece, (face_normals(vertices, faces) * towards).sum(axis=1))
+    return piece == np.argmax(volume)

@@ -1,0 +1,58 @@
+"""Where the surface may be that nobody sees: the fitted head, as thick with hair as it is where that is seen."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+
+from rig.mesh import Mesh, boundary_edges
+
+THICKEST_MM = 60.0  # of hair: farther out a point belongs to something else
+RIM_MM = 12.0  # about the open rim of a model the head goes on in a way that it does not know
+EVERY = 4  # vertices of the head stand for the others: 3 mm apart is enough for a guess
+LEAST_POINTS = 3  # of the surface near a vertex, for a thickness
+NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance within which they count alike
+
+
+def distance_to_head(
+    places: Float[np.ndarray, "n 3"], head_world: Mesh, seen: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, " n"]:
+    """Signed distance (mm, positive outside) of places to the head with its hair; -inf where the model ends.
+
+    Hair is as thick over each vertex as the ``seen`` points of the surface say, and evenly so between them.
+    """
+    vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
+    tree = KDTree(vertices, balanced_tree=False, compact_nodes=False)
+    thickness = _thickness(tree, normals, seen)
+    far, near = (np.asarray(found) for found in tree.query(places))
+    height = ((places - vertices[near]) * normals[near]).sum(axis=1)
+    signed = np.copysign(far, height) - thickness[near]
+    return np.where(near_rim(head_world, vertices)[near], -np.inf, signed)
+
+
+def _thickness(
+    tree: KDTree, normals: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, " v"]:
+    """Mean height of the seen points over each vertex; between those that have some, the mean of the nearest of them,
+    by the inverse square of their distance."""
+    vertices = np.asarray(tree.data)
+    far, near = (np.asarray(found) for found in tree.query(seen, distance_upper_bound=THICKEST_MM))
+    near, points = near[np.isfinite(far)], seen[np.isfinite(far)]
+    height = np.maximum(((points - vertices[near]) * normals[near]).sum(axis=1), 0.0)
+    count = np.bincount(near, minlength=len(vertices))
+    thickness = np.bincount(near, height, len(vertices)) / np.maximum(count, 1)
+    known = np.flatnonzero(count >= LEAST_POINTS)
+    if len(known) < NEAREST:
+        return np.zeros(len(vertices))
+    blank = np.flatnonzero(count < LEAST_POINTS)
+    far, near = KDTree(vertices[known]).query(vertices[blank], k=NEAREST)
+    share = 1.0 / (far * far + EVEN_MM**2)
+    thickness[blank] = (share * thickness[known[near]]).sum(axis=1) / share.sum(axis=1)
+    return thickness
+
+
+def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which places lie near the open rim of the head."""
+    rim = np.unique(boundary_edges(head_world.faces))
+    if not len(rim):
+        return np.zeros(len(places), bool)
+    return KDTree(head_world.vertices[rim]).query(places, distance_upper_bound=RIM_MM)[0] < RIM_MM

@@ -1,0 +1,30 @@
+"""How far each vertex of the visible surface may be off."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from pipeline.dense.surface.refinement import Measured
+from rig.mesh import Mesh
+
+LEAST_MM = 0.05  # what no view shows: the calibration's own error, and the surface between vertices
+ALONE_MM = 0.3  # of what a single view says, beside its own deviation: nobody contradicts it
+EDGE_MM, SLOPE, MOST_MM = 1.5, 0.25, 15.0  # a guess at the edge of what is seen, its growth with the distance, its end
+EVERY = 4  # seen vertices stand for the others
+
+
+def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
+    """Standard deviation along the normal: of the views' mean where some see the vertex (their own deviations, or their
+    scatter where that is larger), of a guess elsewhere, by the distance to what is seen."""
+    seen = measured.views > 0
+    out = np.full(len(seen), MOST_MM)
+    if not seen.any():
+        return out
+    views = measured.views[seen].astype(float)
+    variance = np.maximum(1.0 / measured.information[seen], measured.scatter[seen] / np.maximum(views - 1.0, 1.0))
+    variance += np.where(views < 2, ALONE_MM**2, 0.0) + LEAST_MM**2
+    out[seen] = np.minimum(np.sqrt(variance), MOST_MM)
+    known = mesh.vertices[seen][::EVERY]
+    far = KDTree(known, balanced_tree=False, compact_nodes=False).query(mesh.vertices[~seen])[0]
+    out[~seen] = np.minimum(EDGE_MM + SLOPE * far, MOST_MM)
+    return out

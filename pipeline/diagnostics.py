@@ -1,0 +1,39 @@
+"""What stages say beside their values: warnings for the operator, and how deep a fit went."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+WARNING_CODES = (
+    "camera-gain",
+    "camera-moved",
+    "cameras-exchanged",
+    "contour-implausible",
+    "eyes-closed",
+    "features",
+    "mask-contradicted",
+    "no-bust",
+    "no-texture",
+    "picture-duplicated",
+    "plates-exchanged",
+    "scale-implausible",
+    "shape-implausible",
+    "view",
+    "view-left-out",
+)
+"""Codes that a result's warnings may have; docs/results.md says what each means and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportWarning:
+    """Something that an operator should know: a stable ``code`` for programs, a sentence that says what to do."""
+
+    code: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """How deep the fit went, and why no deeper or why so deep."""
+
+    level: Literal["span", "kernel", "photo", "fine"]
+    reason: str

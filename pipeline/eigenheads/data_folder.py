@@ -1,0 +1,24 @@
+"""Where a user's data and head models live: one rule for the command line, the service and its workers.
+
+The data folder is ``--data``, which sets EIGENHEAD_DATA, else EIGENHEAD_DATA, else ``$XDG_DATA_HOME/eigenhead``, else
+~/.local/share/eigenhead. Models lie in its ``models``, unless EIGENHEAD_MODELS names another folder.
+"""
+
+import os
+from pathlib import Path
+
+DATA, MODELS = "EIGENHEAD_DATA", "EIGENHEAD_MODELS"
+
+
+def data_folder() -> Path:
+    """The folder of captures, results, keys, jobs and models. It need not exist."""
+    given = os.environ.get(DATA)
+    if given:
+        return Path(given)
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "eigenhead"
+
+
+def models_folder() -> Path:
+    """The folder of the user's own head models. It need not exist."""
+    given = os.environ.get(MODELS)
+    return Path(given) if given else data_folder() / "models"

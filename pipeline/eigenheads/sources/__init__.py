@@ -1,0 +1,1 @@
+"""Where models come from: MakeHuman's population, other programs' files, downloads."""

@@ -1,0 +1,163 @@
+"""Triangle surfaces as the head models need them: edges, borders, Loop subdivision as a sparse operator, decimation.
+
+Subdivision: C. Loop, *Smooth Subdivision Surfaces Based on Triangles* (1987), interior weights after Warren, cubic
+B-spline rule on open borders. It is linear in the vertices, so one operator refines mean and modes alike (section 3.1).
+Decimation: half-edge collapses ordered by Garland and Heckbert's quadric error (1997). Half-edge collapses keep a
+subset of the vertices where they are, so that a decimated level is a choice of rows of the same operator.
+"""
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int
+
+from rig.errors import EigenheadError
+from rig.mesh import boundary_edges, face_normals
+
+
+class NotAManifold(EigenheadError):
+    """A surface on which an edge has more than two triangles, or two that disagree about the outside."""
+
+    def __init__(self, count: int, what: str) -> None:
+        super().__init__(f"{count} edges {what}; repair the mesh (one consistently wound surface) and try again")
+
+
+def row_count(operator: sparse.csr_array) -> int:
+    """Rows of a sparse operator."""
+    shape = operator.shape
+    assert shape is not None
+    return int(shape[0])
+
+
+def edges_of(
+    faces: Int[np.ndarray, "F 3"],
+) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F 3"], Int[np.ndarray, " E"]]:
+    """Unique edges (sorted pairs), the edge opposite each corner of each face, and the faces at each edge (a count)."""
+    directed = np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]).astype(np.int64)
+    low, high = directed.min(1), directed.max(1)
+    base = int(faces.max()) + 1
+    keys, inverse, counts = np.unique(low * base + high, return_inverse=True, return_counts=True)
+    return (
+        np.stack([keys // base, keys % base], 1).astype(np.int32),
+        inverse.reshape(3, -1).T.astype(np.int32),
+        counts.astype(np.int32),
+    )
+
+
+def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:
+    """Raises NotAManifold where an edge has over two faces, or two neighbours wind against each other."""
+    _, _, counts = edges_of(faces)
+    if (counts > 2).any():
+        raise NotAManifold(int((counts > 2).sum()), "are shared by more than two triangles")
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    _, repeats = np.unique(directed[:, 0] * (int(faces.max()) + 1) + directed[:, 1], return_counts=True)
+    if (repeats > 1).any():
+        raise NotAManifold(int((repeats > 1).sum()), "run the same way in both of their triangles")
+
+
+def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndarray, " V"]:
+    """Vertices on an open edge of the mesh."""
+    edges, _, uses = edges_of(faces)
+    flags = np.zeros(count, bool)
+    flags[edges[uses == 1].ravel()] = True
+    return flags
+
+
+def vertex_areas(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, " V"]:
+    """A third of the area of the triangles at each vertex, mm²."""
+    area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 6
+    return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+
+
+def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
+    """Closed loops of open edges, each in the direction in which its triangles run. Raises NotAManifold."""
+    after: dict[int, int] = {}
+    rim = boundary_edges(faces)
+    for a, b in rim.tolist():
+        after[a] = b
+    if len(after) < len(rim):
+        raise NotAManifold(len(rim) - len(after), "make a border touch itself at a vertex")
+    loops = []
+    while after:
+        first, here = after.popitem()
+        loop = [first]
+        while here != first:
+            loop.append(here)
+            here = after.pop(here)
+        loops.append(loop)
+    return loops
+
+
+def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.ndarray, "T 3"]:
+    """A strip of triangles across a long opening such as a mouth or an eye, from its left end to its right one.
+
+    No vertex is added. The strip continues the surface if ``loop`` runs as ``boundary_loops`` gives it.
+    """
+    x = vertices[loop, 0]
+    start, end = int(x.argmin()), int(x.argmax())
+    ring = loop[start:] + loop[:start]
+    turn = (end - start) % len(loop)
+    one, other = ring[: turn + 1], [ring[0], *ring[: turn - 1 : -1]]
+    out, i, j = [], 0, 0
+    while i < len(one) - 1 or j < len(other) - 1:
+        # step on the side that is behind; both halves end in the far corner
+        ahead = j == len(other) - 1 or (i < len(one) - 1 and vertices[one[i + 1], 0] <= vertices[other[j + 1], 0])
+        if ahead:
+            out.append([one[i + 1], one[i], other[j]])
+            i += 1
+        else:
+            out.append([other[j], other[j + 1], one[i]])
+            j += 1
+    return np.array([t for t in out if len(set(t)) == 3], np.int32).reshape(-1, 3)
+
+
+def subdivision(faces: Int[np.ndarray, "F 3"], count: int) -> tuple[sparse.csr_array, Int[np.ndarray, "F4 3"]]:
+    """One Loop step: the operator ((V + E) x V) and the refined faces. Old vertices come first."""
+    edges, opposite_edge, uses = edges_of(faces)
+    moved = _even_rule(edges, uses, count)
+    fresh = _odd_rule(faces, edges, opposite_edge, uses, count)
+    a, b, c = faces.T
+    ea, eb, ec = (count + opposite_edge).T  # the new vertex opposite a, b, c
+    refined = np.stack([[a, ec, eb], [b, ea, ec], [c, eb, ea], [ea, eb, ec]]).transpose(2, 0, 1).reshape(-1, 3)
+    return sparse.csr_array(sparse.vstack([moved, fresh])), refined.astype(np.int32)
+
+
+def _even_rule(edges: Int[np.ndarray, "E 2"], uses: Int[np.ndarray, " E"], count: int) -> sparse.csr_array:
+    both = np.concatenate([edges, edges[:, ::-1]])
+    on_border = np.zeros(count, bool)
+    on_border[edges[uses == 1].ravel()] = True
+    valence = np.bincount(both[:, 0], minlength=count)
+    beta = np.where(valence == 3, 3 / 16, 3 / (8 * np.maximum(valence, 1)))  # Warren's weights
+    border_edge = np.concatenate([uses == 1, uses == 1])
+    source = both[:, 0]
+    keep = ~on_border[source] | border_edge
+    weight = np.where(on_border[source], 1 / 8, beta[source])
+    centre = np.where(on_border, 3 / 4, 1 - valence * beta)
+    rows = np.concatenate([source[keep], np.arange(count)])
+    columns = np.concatenate([both[keep, 1], np.arange(count)])
+    return sparse.csr_array((np.concatenate([weight[keep], centre]), (rows, columns)), shape=(count, count))
+
+
+def _odd_rule(
+    faces: Int[np.ndarray, "F 3"],
+    edges: Int[np.ndarray, "E 2"],
+    opposite_edge: Int[np.ndarray, "F 3"],
+    uses: Int[np.ndarray, " E"],
+    count: int,
+) -> sparse.csr_array:
+    ends = np.where(uses == 1, 1 / 2, 3 / 8)
+    index = np.arange(len(edges))
+    across = opposite_edge.ravel()
+    inner = uses[across] == 2
+    rows = np.concatenate([index, index, across[inner]])
+    columns = np.concatenate([edges[:, 0], edges[:, 1], faces.ravel()[inner]])
+    values = np.concatenate([ends, ends, np.full(int(inner.sum()), 1 / 8)])
+    return sparse.csr_array((values, (rows, columns)), shape=(len(edges), count))
+
+
+def refine(faces: Int[np.ndarray, "F 3"], count: int, steps: int) -> tuple[sparse.csr_array, Int[np.ndarray, "G 3"]]:
+    """``steps`` Loop steps as one operator (identity for 0)."""
+    operator: sparse.csr_array = sparse.csr_array(sparse.identity(count, format="csr"))
+    for _ in range(steps):
+        step, faces = subdivision(faces, row_count(operator))
+        operator = sparse.csr_array(step @ operator)
+    return operator, faces.astype(np.int32)

@@ -1,0 +1,140 @@
+"""Levenberg-Marquardt for a sum of robust terms, with one rule of damping and one of stopping.
+
+Each step solves ``(M + lambda diag(M)) step = -gradient`` (Marquardt 1963: steps do not depend on the unknowns' units).
+It is taken where the cost falls; lambda then shrinks ten times, else it grows a hundred times and the step is tried
+again. The end is where the linear model predicts a fall below ``Limits.tolerance``: costs count squared standard
+deviations, so that a predicted fall of f is a step of sqrt(f) standard deviations of what is estimated.
+
+Some costs are uneven (the rim's samples change as the head moves). For these a step may climb back to the worst of the
+last ``Limits.memory`` costs (Grippo, Lampariello and Lucidi 1986); the best value is returned in any case.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Literal
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Value
+
+DAMPING_LEAST = 1e-7  # after accepted steps; relative to the diagonal, Gauss-Newton to seven digits
+DAMPING_REFUSED = 1e-2  # at least, after a refused step
+DIAGONAL_LEAST = 1e-12  # of what nothing determines: damping then keeps it where it is
+
+Reason = Literal["converged", "no step lowers the cost", "step limit"]
+Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.ndarray, " p"]]
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """When to stop, and how to begin. ``tolerance``: predicted fall of the cost (squared standard deviations)."""
+
+    steps: int = 50
+    tolerance: float = 1e-6
+    tries: int = 3  # of a step, each with a hundred times the damping
+    memory: int = 1  # costs that a step may climb back to; 1: each step lowers the cost
+    first_damping: float = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """How a solution came about; ``predicted_fall``: of the last step tried, in squared standard deviations."""
+
+    stopped_because: Reason
+    evaluations: int
+    steps: int
+    cost: float
+    predicted_fall: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution(Generic[Value]):
+    """The best value found, the problem there (for its normal equations), and the evidence."""
+
+    value: Value
+    at: Linearised
+    evidence: Evidence
+
+
+def cholesky_solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """The solution of a symmetric positive definite system. Raises LinAlgError where it is not definite."""
+    # Not ``solve(assume_a="pos")``: its estimate of the condition warns of unknowns with different units.
+    return scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix, check_finite=False), right, check_finite=False)
+
+
+def minimise(
+    problem: Problem[Value],
+    start: Value,
+    limits: Limits,
+    *,
+    solve: Solve = cholesky_solve,
+    at_start: Linearised | None = None,
+    watch: Callable[[], None] = lambda: None,
+) -> Solution[Value]:
+    """A local minimum of the problem's cost.
+
+    Args:
+        problem: terms, unknowns, and how a step moves a value.
+        start: a value where all terms are finite.
+        limits: when to stop.
+        solve: of symmetric positive definite systems; raises LinAlgError where one is not, which costs a try.
+        at_start: the problem at ``start`` where the caller has it already.
+        watch: called before every step; what it raises ends the search.
+    """
+    here = at_start or problem.at(start)
+    now = best = _Place(start, here, here.cost)
+    recent, damping, evaluations, predicted = [now.cost], limits.first_damping, 1, np.inf
+
+    def ended(reason: Reason) -> Solution[Value]:
+        return Solution(best.value, best.at, Evidence(reason, evaluations, len(recent) - 1, best.cost, predicted))
+
+    for _ in range(limits.steps):
+        watch()
+        equations, accepted = problem.equations(now.at), None
+        for _ in range(limits.tries):
+            step = _damped_step(equations, damping, solve)
+            if step is not None:
+                predicted = -float(equations.gradient @ step)
+                tried, evaluations = _place(problem, problem.after(now.value, step)), evaluations + 1
+                if tried.cost < max(recent[-limits.memory :]):  # False for the NaN of a value that makes no sense
+                    accepted = tried
+                    break
+                if predicted < limits.tolerance:
+                    return ended("converged")
+            damping = max(damping * 100.0, DAMPING_REFUSED)
+        if accepted is None:
+            return ended("no step lowers the cost")
+        now, damping = accepted, max(damping * 0.1, DAMPING_LEAST)
+        recent.append(now.cost)
+        if now.cost < best.cost:
+            best = now
+        if predicted < limits.tolerance:
+            return ended("converged")
+    return ended("step limit")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place(Generic[Value]):
+    """A value with the problem there and its cost."""
+
+    value: Value
+    at: Linearised
+    cost: float
+
+
+def _place(problem: Problem[Value], value: Value) -> _Place[Value]:
+    there = problem.at(value)
+    return _Place(value, there, there.cost)
+
+
+def _damped_step(equations: NormalEquations, damping: float, solve: Solve) -> Float[np.ndarray, " p"] | None:
+    """The step, or None where the damped matrix is not positive definite."""
+    damped = equations.matrix.copy()
+    diagonal = np.einsum("ii->i", damped)
+    diagonal += damping * (diagonal + DIAGONAL_LEAST)
+    try:
+        return -solve(damped, equations.gradient)
+    except np.linalg.LinAlgError:
+        return None

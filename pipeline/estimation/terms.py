@@ -1,0 +1,184 @@
+"""What a cost is made of: terms, each with its own residuals, and the sum of them as a complete problem.
+
+A term taken at a value has a cost and adds its part to the normal equations
+
+    matrix += J^T W J,    gradient += J^T W r,
+
+W the information times the robust weight, so that the gradient is half of the cost's. ``Residuals`` is the usual form,
+with its Jacobian; a term whose Jacobian is too large to build adds its blocks by itself.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.estimation.robust import LeastSquares, Loss
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """J^T W J and J^T W r over p unknowns."""
+
+    matrix: Float[np.ndarray, "p p"]
+    gradient: Float[np.ndarray, " p"]
+
+    @classmethod
+    def empty(cls, size: int) -> "NormalEquations":
+        return cls(np.zeros((size, size)), np.zeros(size))
+
+
+Value = TypeVar("Value")
+ValueIn = TypeVar("ValueIn", contravariant=True)
+
+
+@runtime_checkable
+class Linearised(Protocol):
+    """A term at one value: its cost, and its normal equations for who asks."""
+
+    @property
+    def cost(self) -> float: ...
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """Adds its part in place: sums of a thousand unknowns are 8 MB each."""
+        ...
+
+
+@runtime_checkable
+class Term(Protocol[ValueIn]):
+    """One part of a cost."""
+
+    def at(self, value: ValueIn, /) -> Linearised: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Residuals at a value, with the Jacobian to be had: cost ``sum_i rho(|r_i|^2)``.
+
+    ``residual``: n residuals of d components, in standard deviations; ``jacobian`` computes their derivatives by the
+    unknowns. The loss is of the norm of all d components.
+    """
+
+    residual: Float[np.ndarray, "n d"]
+    jacobian: Callable[[], Float[np.ndarray, "n d p"]]
+    loss: Loss = field(default_factory=LeastSquares)
+
+    @property
+    def squares(self) -> Float[np.ndarray, " n"]:
+        return (self.residual**2).sum(axis=1)
+
+    @property
+    def cost(self) -> float:
+        return float(self.loss.cost(self.squares).sum())
+
+    def add_to(self, equations: NormalEquations) -> None:
+        weight = np.repeat(self.loss.weight(self.squares), self.residual.shape[1])
+        rows = self.jacobian().reshape(self.residual.size, -1)
+        weighted = (rows * weight[:, None]).T
+        equations.matrix[...] += weighted @ rows
+        equations.gradient[...] += weighted @ self.residual.ravel()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quadratic:
+    """``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector: a Gaussian prior where g is zero, or what another problem,
+    solved for everything else, says of x. ``matrix`` M, ``centre`` c, ``pull`` g (towards the minimum)."""
+
+    matrix: Float[np.ndarray, "p p"]
+    centre: Float[np.ndarray, " p"]
+    pull: Float[np.ndarray, " p"]
+
+    @classmethod
+    def prior(cls, information: Float[np.ndarray, "p p"], mean: Float[np.ndarray, " p"]) -> "Quadratic":
+        """N(mean, information^-1)."""
+        return cls(information, mean, np.zeros(len(mean)))
+
+    def at(self, value: Float[np.ndarray, " p"]) -> "QuadraticAt":
+        return QuadraticAt(self, value - self.centre)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QuadraticAt:
+    """``Quadratic`` at a distance from its centre."""
+
+    term: Quadratic
+    away: Float[np.ndarray, " p"]
+
+    @property
+    def cost(self) -> float:
+        return float(self.away @ self.term.matrix @ self.away - 2.0 * self.term.pull @ self.away)
+
+    def add_to(self, equations: NormalEquations) -> None:
+        equations.matrix[...] += self.term.matrix
+        equations.gradient[...] += self.term.matrix @ self.away - self.term.pull
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sum:
+    """Several terms at one value."""
+
+    parts: tuple[Linearised, ...]
+
+    @property
+    def cost(self) -> float:
+        return sum(part.cost for part in self.parts)
+
+    def add_to(self, equations: NormalEquations) -> None:
+        for part in self.parts:
+            part.add_to(equations)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeOnly:
+    """A term's part over some of its unknowns; the others stay where they are. ``free``: which of all q move."""
+
+    whole: Linearised
+    free: Bool[np.ndarray, " q"]
+
+    @property
+    def cost(self) -> float:
+        return self.whole.cost
+
+    def add_to(self, equations: NormalEquations) -> None:
+        everything = NormalEquations.empty(len(self.free))
+        self.whole.add_to(everything)
+        equations.matrix[...] += everything.matrix[np.ix_(self.free, self.free)]
+        equations.gradient[...] += everything.gradient[self.free]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem(Generic[Value]):
+    """A complete problem: all terms, the number of unknowns, and what a step in them does to a value.
+
+    ``free``: which of the unknowns move, all by default. ``moved(value, step)`` gets steps of all unknowns.
+    """
+
+    terms: tuple[Term[Value], ...]
+    unknowns: int
+    moved: Callable[[Value, Float[np.ndarray, " p"]], Value]
+    free: Bool[np.ndarray, " p"] | None = None
+
+    @property
+    def size(self) -> int:
+        """How many unknowns move."""
+        return self.unknowns if self.free is None else int(np.count_nonzero(self.free))
+
+    def at(self, value: Value) -> Linearised:
+        terms = Sum(tuple(term.at(value) for term in self.terms))
+        return terms if self.free is None else FreeOnly(terms, self.free)
+
+    def equations(self, here: Linearised) -> NormalEquations:
+        """The normal equations of the free unknowns."""
+        equations = NormalEquations.empty(self.size)
+        here.add_to(equations)
+        return equations
+
+    def after(self, value: Value, step: Float[np.ndarray, " f"]) -> Value:
+        """``value`` moved by a step of the free unknowns."""
+        if self.free is None:
+            return self.moved(value, step)
+        whole = np.zeros(self.unknowns)
+        whole[self.free] = step
+        return self.moved(value, whole)

@@ -1,0 +1,177 @@
+"""The experiments behind ``eigenhead experiments``: which there are, what each needs from this machine, and the files
+that they leave: rows (so that a stopped run goes on), a Markdown table, pictures."""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.eigenheads.data_folder import models_folder
+from pipeline.eigenheads.model import HeadModel, assemble, load_model, model_path
+from pipeline.eigenheads.sources.imports import import_model
+from pipeline.experiments import markdown
+from rig.atomic_write import write_atomically
+from rig.errors import EigenheadError, InputError
+from rig.formats.images import write_image
+
+Report = Callable[[str, float], None]
+Outcome = dict[str, Any]
+
+
+class UnknownExperiment(EigenheadError):
+    """A name that no experiment has."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"no experiment is called {name!r}; there are {', '.join(EXPERIMENTS)}")
+
+
+class MissingPeers(EigenheadError):
+    """A package of the group ``peers`` is not installed."""
+
+    def __init__(self, package: str) -> None:
+        super().__init__(f"{package} is not installed: run `uv sync --group peers`")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What a command asks for."""
+
+    head: HeadModel
+    subjects: int | None
+    shared: Path
+    folder: Path | None
+    report: Report
+    simplex: int | None = None
+
+
+def run_experiment(
+    name: str,
+    *,
+    model: str,
+    subjects: int | None,
+    shared: Path,
+    folder: Path | None,
+    report: Report,
+    simplex: int | None = None,
+) -> Outcome:
+    """Figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a table and
+    pictures are left there. ``simplex``: how many subjects of a table the simplex fits too.
+
+    ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
+    """
+    if name not in EXPERIMENTS:
+        raise UnknownExperiment(name)
+    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, simplex))
+    pictures = found.pop("pictures", {})
+    text = found.pop("markdown", None) or markdown.of_figures(found["figures"])
+    if folder is not None:
+        write_atomically(folder / f"{name}.md", text.encode())
+        for title, image in pictures.items():
+            write_image(folder / f"{name}-{title}.png", image)
+    return found
+
+
+def _drawn(module: str) -> Callable[[Task], Outcome]:
+    """An experiment that needs a renderer, the model and a number of subjects."""
+
+    def run(task: Task) -> Outcome:
+        from rig.render.renderer import Renderer
+
+        chosen = getattr(importlib.import_module(f".{module}", __package__), module)
+        count = {"subjects": task.subjects} if task.subjects else {}
+        with Renderer.create() as renderer:
+            return chosen(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
+
+    return run
+
+
+def _table(name: str) -> Callable[[Task], Outcome]:
+    def run(task: Task) -> Outcome:
+        from pipeline.experiments import tables
+        from rig.render.renderer import Renderer
+
+        given = {"subjects": task.subjects, "simplex_subjects": task.simplex}
+        count = {key: value for key, value in given.items() if value is not None}
+        with Renderer.create() as renderer:
+            return getattr(tables, name)(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
+
+    return run
+
+
+def _peers(task: Task) -> Outcome:
+    for package in ("cma", "pybobyqa", "jax"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingPeers(package)
+    return _drawn("peers")(task)
+
+
+def _limit(task: Task) -> Outcome:
+    from pipeline.experiments.limit import limit
+    from rig.render.renderer import Renderer
+
+    with Renderer.create() as renderer:
+        return limit(task.head, renderer=renderer, report=task.report, subjects=task.subjects or 15)
+
+
+def _span(task: Task) -> Outcome:
+    from pipeline.experiments import span
+
+    other = _facekit(task.shared)
+    truths = [span.read_truth(path) for path in _truths(task.shared).values()]
+    truths += span.random_draws(other, task.subjects or 20)
+    return span.run({"default": task.head, "ict": other}, truths, report=task.report)
+
+
+def _detail(task: Task) -> Outcome:
+    from pipeline.experiments import detail
+    from rig.render.renderer import Renderer
+
+    other = _facekit(task.shared)
+    captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
+    with Renderer.create() as renderer:
+        return detail.run(
+            {"default": task.head, "ict": other},
+            captures,
+            renderer=renderer,
+            report=task.report,
+            others=other,
+            draws=task.subjects or 20,
+            in_span=task.subjects or 10,
+            folder=task.folder,
+        )
+
+
+EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
+    "table1": _table("table1"),
+    "table2": _table("table2"),
+    "table3": _table("table3"),
+    "cost": _drawn("cost"),
+    "levels": _drawn("levels"),
+    "peers": _peers,
+    "limit": _limit,
+    "robustness": _drawn("robustness"),
+    "convergence": _drawn("convergence"),
+    "alignment": _drawn("alignment"),
+    "posterior": _drawn("posterior_check"),
+    "views": _drawn("views"),
+    "span": _span,
+    "detail": _detail,
+}
+
+
+def _truths(shared: Path) -> dict[str, Path]:
+    found = {path.stem: path for path in sorted((shared / "captures").glob("*.truth"))}
+    if not found:
+        raise InputError(str(shared), ["holds no captures/<name>.truth; name the folder that does with --shared"])
+    return found
+
+
+def _facekit(shared: Path) -> HeadModel:
+    """ICT-FaceKit: the user's own import, or the compact copy in the shared folder."""
+    if (models_folder() / "ict-facekit.npz").is_file():
+        return load_model(model_path("ict-facekit"))
+    source = shared / "ict-facekit" / "ict_facekit_light.npz"
+    if not source.exists():
+        raise InputError("ict-facekit", ["is not at hand: run `eigenhead model fetch ict-facekit`, or name --shared"])
+    return assemble(import_model(source), "imported")

@@ -1,0 +1,101 @@
+"""How much of all that the cameras see a surface has, and how right the rest of it is, by part.
+
+Recall: distance of every point of the truth (``rig.studio.visible``) to the surface, where that faces the same way.
+Precision: distance of the surface's own points to the truth, as far as the truth says anything there. Distances are to
+tangent planes wherever a sample is close, so that the density of samples does not show.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+from scipy.spatial import KDTree
+
+from rig.mesh import Mesh, boundary_edges
+from rig.studio.scene.visible import PARTS, VisiblePoints, sample_surface
+
+Distances = Float[np.ndarray, " n"]
+SAMPLE_MM2 = 0.25  # of surface for each of its points
+NEIGHBOURS = 8  # samples among which one that faces the same way is looked for
+MISSING_MM = 50.0  # counted for a true point that has no such sample
+REACH_MM = 25.0  # surface farther from every true point is where nobody looked
+PLANE_MM = {"recall": 1.0, "precision": 2.0}  # sideways, within which a sample's tangent plane stands for the surface
+COUNTED_MOST = 200_000  # points of the surface for precision: shares are then good to 0.001
+LEAST_POINTS = 100  # of a part, for figures of its own
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VisibleScore:
+    """``recall`` and ``precision`` by part: median, p95 (mm) and shares within 1, 2 and 5 mm; recall has "all", too."""
+
+    recall: dict[str, dict[str, float]]
+    precision: dict[str, dict[str, float]]
+    closed: bool
+
+    def flat(self) -> dict[str, float]:
+        """One number a key, for tables: ``recall_hair_within_2mm``."""
+        kinds = {"recall": self.recall, "precision": self.precision}
+        named = ((f"{kind}_{part}_{key}", value) for kind, parts in kinds.items() for part, figures in parts.items()
+                 for key, value in figures.items())  # fmt: skip
+        return dict(named) | {"closed": float(self.closed)}
+
+
+def read_visible(truth: Path) -> VisiblePoints:
+    """``visible.npz`` of a truth folder."""
+    with np.load(truth / "visible.npz") as kept:
+        return VisiblePoints(kept["points"], kept["normals"], kept["part"], kept["views"])
+
+
+def score_visible(truth: VisiblePoints, mesh: Mesh) -> VisibleScore:
+    """Scores a surface (world frame, mm) as delivered, without any realignment."""
+    rng = np.random.default_rng(0)
+    points, normals = sample_surface(mesh, SAMPLE_MM2, rng)
+    true_points, true_normals = truth.points.astype(float), truth.normals.astype(float)
+    far, near = KDTree(points).query(true_points, k=NEIGHBOURS)
+    missed = _distances(true_points[:, None], points[near], normals[near], far, PLANE_MM["recall"])
+    agree = np.einsum("nkx,nx->nk", normals[near], true_normals) > 0
+    recall = np.where(agree, missed, np.inf).min(axis=1)
+    recall[np.isinf(recall)] = MISSING_MM
+    counted = rng.choice(len(points), min(len(points), COUNTED_MOST), replace=False)
+    far, near = KDTree(true_points).query(points[counted])
+    told = (far < REACH_MM) & (np.einsum("nx,nx->n", normals[counted], true_normals[near]) > 0)
+    precision = _distances(points[counted], true_points[near], true_normals[near], far, PLANE_MM["precision"])
+    of_all = {"all": figures_of(recall)}
+    return VisibleScore(
+        _by_part(recall, truth.part, np.ones(len(recall), bool)) | of_all,
+        _by_part(precision, truth.part[near], told),
+        len(boundary_edges(mesh.faces)) == 0,
+    )
+
+
+def figures_of(distances: Distances) -> dict[str, float]:
+    """Median, 95th percentile, and the share within 1, 2 and 5 mm."""
+    shares = {f"within_{limit}mm": float((distances <= limit).mean()) for limit in (1, 2, 5)}
+    return {"median": float(np.median(distances)), "p95": float(np.percentile(distances, 95))} | shares
+
+
+def _distances(
+    points: Float[np.ndarray, "... 3"],
+    samples: Float[np.ndarray, "... 3"],
+    normals: Float[np.ndarray, "... 3"],
+    far: Float[np.ndarray, "..."],
+    plane_mm: float,
+) -> Float[np.ndarray, "..."]:
+    """To the sample's tangent plane where its foot is near, else to the sample."""
+    plane = np.abs(((points - samples) * normals).sum(axis=-1))
+    sideways = np.sqrt(np.maximum(far * far - plane * plane, 0.0))
+    return np.where(sideways < plane_mm, plane, far)
+
+
+def _by_part(
+    distances: Distances, part: Integer[np.ndarray, " n"], counted: Bool[np.ndarray, " n"]
+) -> dict[str, dict[str, float]]:
+    chosen = {name: counted & (part == code) for code, name in enumerate(PARTS)}
+    return {name: figures_of(distances[of]) for name, of in chosen.items() if of.sum() > LEAST_POINTS}
+
+
+def document(score: VisibleScore) -> dict[str, Any]:
+    """The score as JSON types."""
+    return {"recall": score.recall, "precision": score.precision, "closed": score.closed}

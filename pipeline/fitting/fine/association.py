@@ -1,0 +1,76 @@
+"""Which place of the head each point of the dense surface shows: the closest one whose side agrees.
+
+From the points to the head, and not the other way: a place of the head that no point shows stays silent by itself, at
+the rim of a hole as well as in its middle.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.fitting.fine.association_kernels import closest_triangles
+from pipeline.parallel_for import in_threads
+
+CANDIDATES = 4  # vertices whose triangles are tried
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Associated:
+    """n points and their places on the head."""
+
+    row: Int[np.ndarray, " n"]  # of the points asked for
+    triangle: Int[np.ndarray, " n"]
+    blend: Float[np.ndarray, "n 3"]  # barycentric weights of its corners
+    distance_mm: Float[np.ndarray, " n"]
+
+
+def faces_at_vertices(
+    faces: Int[np.ndarray, "f 3"], count: int
+) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
+    """Where each vertex's faces begin, and the faces, vertex by vertex."""
+    corner = np.argsort(faces.ravel(), kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
+    return start.astype(np.int64), (corner // 3).astype(np.int64)
+
+
+def associate(
+    points: Float[np.ndarray, "p 3"],
+    normals: Float[np.ndarray, "p 3"],
+    vertices: Float[np.ndarray, "v 3"],
+    vertex_normals: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    *,
+    reach_mm: float | Float[np.ndarray, " p"],
+    least_agreement: float,
+) -> Associated:
+    """The closest place on the head of every point that has one within reach.
+
+    Args:
+        points: of the dense surface, mm.
+        normals: unit, outwards.
+        vertices: of the head, mm, same frame.
+        vertex_normals: unit.
+        faces: of the head.
+        reach_mm: farther points have no place on it; one value, or one for each point.
+        least_agreement: cosine between a point's normal and the head's.
+
+    Returns:
+        The points that have a place, in their order.
+    """
+    reach = np.broadcast_to(np.asarray(reach_mm, float), len(points))
+    start, member = faces_at_vertices(faces, len(vertices))
+    _, near = KDTree(vertices).query(points, k=min(CANDIDATES, len(vertices)), workers=-1)
+    near = near.reshape(len(points), min(CANDIDATES, len(vertices)))
+    triangle = np.empty(len(points), np.int64)
+    blend, square = np.zeros((len(points), 3)), np.empty(len(points))
+    in_threads(
+        len(points),
+        lambda a, b: closest_triangles(
+            a, b, points, normals, near, vertices, vertex_normals, faces, start, member, least_agreement,
+            triangle, blend, square,
+        ),
+    )  # fmt: skip
+    row = np.flatnonzero((triangle >= 0) & (square <= reach**2))
+    return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))

@@ -1,0 +1,129 @@
+"""Ears brought in place as a whole, before anything bends.
+
+An ear may sit a centimetre off where the face says it should, with a shell of folds: the closest point of another fold
+is no help. So each ear first moves as a similarity, from several starts, to where the dense points about it agree with
+it best (iterated closest points along the normals; Chen and Medioni 1992), and its surroundings follow smoothly.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.regions import head_regions
+from pipeline.fitting.fine.association import associate
+from pipeline.fitting.fine.surface_points import SKIN, SurfacePoints
+from rig.geometry import rotation_from_vector
+from rig.mesh import vertex_normals
+
+ABOUT_MM = 25.0  # points that far from the ear may be its own
+BLEND_MM = 10.0  # over which the head follows
+STARTS_MM = (0.0, -9.0, 9.0)  # up and down the head, and to and fro
+REACHES_MM = (14.0, 10.0, 7.0, 5.0, 4.0, 3.0, 3.0, 3.0)
+ROBUST_SHARE = 0.4  # of the reach
+LEAST_POINTS = 80
+TURN_SD, SCALE_SD, SHIFT_SD_MM = 0.2, 0.08, 8.0  # of the motion, against points worth ...
+POINT_SD_MM = 3.0  # ... that each: they are many, and the shape is another's
+AGREEMENT = 0.4
+
+
+def with_ears_in_place(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel, surface: SurfacePoints
+) -> Float[np.ndarray, "v 3"]:
+    """The head with each ear where the skin's points say, if enough of them do.
+
+    Args:
+        vertices: full level, world frame, mm.
+        model: the topology.
+        surface: what the dense stage knows; thin, 1.5 to 3 mm apart.
+    """
+    faces, ears = model.levels["full"].faces, head_regions(model)["ears"]
+    middle = model.vertices(np.zeros(0))[:, 0] < 0
+    skin = surface.chosen(surface.part == SKIN)
+    moved = np.zeros_like(vertices)
+    for side in (ears & middle, ears & ~middle):
+        rows = np.flatnonzero(side)
+        if not len(rows) or not len(skin.points):
+            continue
+        distance, _ = KDTree(vertices[rows]).query(skin.points, distance_upper_bound=ABOUT_MM)
+        near = skin.chosen(np.isfinite(distance))
+        if len(near.points) < LEAST_POINTS:
+            continue
+        turned = _registered(vertices, faces, side, near, model)
+        off, _ = KDTree(vertices[rows]).query(vertices, distance_upper_bound=4.0 * BLEND_MM)
+        share = np.exp(-0.5 * (np.where(np.isfinite(off), off, 1e3) / BLEND_MM) ** 2)
+        moved += share[:, None] * (turned - vertices)
+    return vertices + moved
+
+
+def _registered(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    ear: Bool[np.ndarray, " v"],
+    points: SurfacePoints,
+    model: HeadModel,
+) -> Float[np.ndarray, "v 3"]:
+    """All vertices under the motion that explains the points about the ear best."""
+    centre = vertices[ear].mean(axis=0)
+    local = np.flatnonzero(np.linalg.norm(vertices - centre, axis=1) < np.linalg.norm(
+        vertices[ear] - centre, axis=1).max() + BLEND_MM)  # fmt: skip
+    place = np.full(len(vertices), -1)
+    place[local] = np.arange(len(local))
+    part = place[faces[(place[faces] >= 0).all(axis=1)]]
+    up, ahead = _axes(vertices, model)
+    found = []
+    for rise in STARTS_MM:
+        for forth in STARTS_MM:
+            shift = rise * up + forth * ahead
+            if abs(rise) + abs(forth) <= max(STARTS_MM):  # up, down, to or fro
+                found.append(_descend(vertices[local], part, ear[local], points, centre, shift))
+    _, scale, turn, shift = min(found, key=lambda each: each[0])
+    return scale * (vertices - centre) @ turn.T + centre + shift
+
+
+def _axes(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Up and ahead of the head, unit, world frame."""
+    at = {name: vertices[row] for name, row in model.landmarks.items()}
+    up = at["nasion"] - at["gnathion"]
+    ahead = at["nasion"] - 0.5 * (at["tragion_left"] + at["tragion_right"])
+    up = up / np.linalg.norm(up)
+    ahead = ahead - (ahead @ up) * up
+    return up, ahead / np.linalg.norm(ahead)
+
+
+def _descend(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    ear: Bool[np.ndarray, " v"],
+    points: SurfacePoints,
+    centre: Float[np.ndarray, " 3"],
+    shift: Float[np.ndarray, " 3"],
+) -> tuple[float, float, Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+    """Robust cost (per point), scale, rotation about ``centre`` and shift of the best motion from one start."""
+    normals = vertex_normals(vertices, faces)
+    scale, turn, cost = 1.0, np.eye(3), np.inf
+    prior = np.diag([TURN_SD**-2] * 3 + [SHIFT_SD_MM**-2] * 3 + [SCALE_SD**-2])
+    for reach in REACHES_MM:
+        now = scale * (vertices - centre) @ turn.T + centre + shift
+        found = associate(
+            points.points, points.normals, now, normals @ turn.T, faces, reach_mm=reach, least_agreement=AGREEMENT
+        )
+        corner = faces[found.triangle]
+        at = np.einsum("nk,nkc->nc", found.blend, now[corner])
+        ahead = points.normals[found.row]
+        off = ((points.points[found.row] - at) * ahead).sum(axis=1)
+        robust = ROBUST_SHARE * reach
+        weight = 1.0 / (1.0 + (found.distance_mm / robust) ** 2) ** 2
+        missing = len(points.points) - len(found.row)
+        square = found.distance_mm**2 / (found.distance_mm**2 + robust**2)
+        cost = float((square.sum() + missing) / len(points.points))
+        arm = at - centre - shift
+        rows = np.concatenate([np.cross(arm, ahead), ahead, (arm * ahead).sum(axis=1, keepdims=True)], axis=1)
+        weighted = rows * weight[:, None] / POINT_SD_MM**2
+        state = np.concatenate([np.zeros(3), shift, [np.log(scale)]])
+        step = np.linalg.solve(weighted.T @ rows + prior, weighted.T @ off - prior @ state)
+        turn = rotation_from_vector(step[:3]) @ turn
+        shift, scale = shift + step[3:6], scale * float(np.exp(step[6]))
+    return cost, scale, turn, shift

@@ -1,0 +1,59 @@
+"""The complete problem of one stage at one robust scale: rim, feature points, photographs and priors as terms."""
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.estimation.terms import Linearised, Problem, Sum, Term
+from pipeline.fitting.feature_term import FeatureTerm
+from pipeline.fitting.prior_term import PriorTerm
+from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State
+from pipeline.fitting.rim_term import RimAt, RimTerm
+from pipeline.fitting.surface_term import SurfaceTerm
+from rig.geometry import Similarity, rotation_from_vector
+
+
+def head_problem(
+    problem: ContourProblem,
+    evidence: StageEvidence,
+    stage: Stage,
+    scale_px: float,
+    reference_px: float | None = None,
+) -> Problem[State]:
+    """Terms over (coefficients, pose, cameras where the stage solves for them); ``reference_px`` as ``RimTerm`` has
+    it."""
+    cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
+    rim = RimTerm(problem, evidence, stage, scale_px, reference_px)
+    terms: tuple[Term[State], ...] = (rim, *_other_terms(problem, evidence, stage))
+    return Problem(terms, stage.modes + POSE + cameras, lambda state, step: apply_step(state, step, stage))
+
+
+def started_problem(
+    problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, start: State
+) -> tuple[Problem[State], Linearised]:
+    """The problem whose outline length is that of ``start``, and itself there: the rim is found only once."""
+    seen = RimTerm(problem, evidence, stage, scale_px).at(start)
+    whole = head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
+    rim, *others = whole.terms
+    assert isinstance(rim, RimTerm)
+    return whole, Sum((RimAt(rim, start, seen.rim), *(term.at(start) for term in others)))
+
+
+def _other_terms(problem: ContourProblem, evidence: StageEvidence, stage: Stage) -> list[Term[State]]:
+    terms: list[Term[State]] = []
+    if problem.features is not None:
+        terms.append(FeatureTerm(problem, problem.features, stage))
+    if evidence.photographs is not None:
+        terms.append(SurfaceTerm(evidence.photographs.surface, stage))
+    return [*terms, PriorTerm(problem, stage)]
+
+
+def apply_step(state: State, step: Float[np.ndarray, " p"], stage: Stage) -> State:
+    """The state after a step in the unknowns of the stage."""
+    m = stage.modes
+    pose = state.world_from_head
+    turned = rotation_from_vector(step[m : m + 3]) @ pose.rotation
+    shift = state.camera_shift
+    if stage.cameras:
+        shift = shift + step[m + POSE :].reshape(shift.shape)
+    moved = Similarity(pose.scale * float(np.exp(step[m + 6])), turned, pose.translation + step[m + 3 : m + 6])
+    return State(state.coefficients + step[:m], moved, shift)

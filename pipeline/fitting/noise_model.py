@@ -1,0 +1,79 @@
+"""What the residuals of a stage say of the model's misfit: how far an outline may be believed, where it is clutter, and
+whether the head is bare."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Int
+
+from pipeline.fitting.clutter import CLUTTER_PX, CLUTTER_SIGMAS, find_clutter
+from pipeline.fitting.problem import FIRST_NOISE_PX, ContourProblem, RimNoise, Stage, StageEvidence, State
+from pipeline.fitting.rim import Rim
+from pipeline.fitting.rim_term import observed_rim
+
+BLOCK_PX = 20.0
+BARE_SLACK_PX = 0.1  # noise of a contour's RMS
+FLOOR_SIGMAS, FLOOR_MOST_PX = 3.0, 6.0
+UNIT_RANGE = (1.0, 40.0)  # px^3: noise of 0.5 px over 4 px; misfit of 2 px over 10 px
+
+
+def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
+    """The evidence with what the residuals say of the model's misfit: unit, robust floor and, once, where clutter is.
+
+    Clutter is found while the eigenheads alone still hold the shape: a wider basis would rather bulge into the hair
+    than pay for it as an outlier, since every px of outline pays alone.
+    """
+    rim = observed_rim(problem, evidence, state, stage)
+    near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
+    deviation = 1.4826 * float(np.median(np.abs(near))) if len(near) > 10 else FIRST_NOISE_PX
+    floor = min(FLOOR_SIGMAS * deviation, FLOOR_MOST_PX)
+    clutter = evidence.noise.clutter
+    if clutter is None and not stage.whole_head:  # a bare head has none
+        clutter = find_clutter(problem, rim, max(CLUTTER_PX, CLUTTER_SIGMAS * deviation))
+    unit = estimated_unit(problem, rim, 2.0 * floor) or evidence.noise.unit
+    return StageEvidence(RimNoise(unit, floor, clutter), evidence.photographs)
+
+
+def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
+    """l sigma^2 (px^3) of what the contours still miss, the model's misfit included; None where the settings
+    state both.
+
+    Means over blocks of B px of outline have the variance l sigma^2 / B where B is well above l, whatever l is.
+    """
+    stated = problem.settings
+    if stated.contour_noise_px is not None and stated.contour_correlation_px is not None:
+        return None
+    means = []
+    for k in range(len(problem.views.names)):
+        here = np.flatnonzero((rim.view == k) & (np.abs(rim.residual) < most_px) & (rim.length > 0))
+        if not len(here):
+            continue
+        spoke = rim.pixel[here] - rim.pixel[here].mean(axis=0)
+        order = here[np.argsort(np.arctan2(spoke[:, 1], spoke[:, 0]))]
+        length = rim.length[order]
+        block = (np.cumsum(length) / BLOCK_PX).astype(int)
+        total = np.bincount(block, length)
+        means.append((np.bincount(block, length * rim.residual[order]) / np.maximum(total, 1e-9))[total > BLOCK_PX / 2])
+    found = np.concatenate(means) if means else np.zeros(0)
+    variance = (1.4826 * float(np.median(np.abs(found)))) ** 2 if len(found) > 10 else FIRST_NOISE_PX**2
+    return float(np.clip(BLOCK_PX * variance, *UNIT_RANGE))
+
+
+def is_bare(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
+    """Does a fit to the whole head explain cranium and ears, and the face as well as ``from_face``, the fit to the face
+    alone? An outline of hair is mostly no head's; where it is, that head has another face."""
+    rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
+    region = problem.model.levels[stage.level].face_region
+    other = np.flatnonzero(~region[rim.corner].all(axis=1))
+    face = np.flatnonzero(region[rim.corner].all(axis=1))
+    agrees = np.abs(rim.residual) < problem.settings.bare_px
+    if (rim.length * agrees)[other].sum() <= problem.settings.bare_share * rim.length[other].sum():
+        return False
+    alone = observed_rim(problem, evidence, from_face, replace(stage, whole_head=False))
+    face_alone = np.flatnonzero(region[alone.corner].all(axis=1))
+    return _spread(rim, face) < problem.settings.bare_loss * _spread(alone, face_alone) + BARE_SLACK_PX
+
+
+def _spread(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:
+    """Robust standard deviation (px) of the residuals: hair on the forehead must not hide what the rest loses."""
+    return 1.4826 * float(np.median(np.abs(rim.residual[chosen]))) if len(chosen) else 0.0

@@ -1,0 +1,127 @@
+"""The compiled inner loops of photo-consistency: what the views show along the normals, and how alike they look.
+
+Plain loops over arrays; threads share them out.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from pipeline.compiled import njit
+from pipeline.fitting.photo.patches import Patches
+from pipeline.parallel_for import in_threads
+
+LEAST_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
+
+
+def choose_views(
+    patches: Patches, weights: Float[np.ndarray, " e"], facing: Float32[np.ndarray, "k s"], least_seen: float, most: int
+) -> tuple[Int[np.ndarray, "c n"], Float[np.ndarray, "c n"]]:
+    """The views that see a patch whole and most frontally, at most ``most``, and the squared cosine of each; -1 and 0
+    where there are fewer."""
+    total = patches.sums(weights, np.ones((facing.shape[1], 1)))
+    seen = patches.sums(weights, (facing > 0).T.astype(float))
+    cosine = patches.sums(weights, facing.T.astype(float)) / np.maximum(seen, 1e-9)
+    value = np.where(seen > least_seen * total, cosine**2, 0.0)
+    view = np.argsort(-value, axis=1, kind="stable")[:, :most]
+    value = np.take_along_axis(value, view, axis=1)
+    speaks = value > LEAST_VIEW
+    return np.where(speaks, view, -1), np.where(speaks, value, 0.0)
+
+
+def sweep(
+    pixel: Float[np.ndarray, "k s 2"],
+    along: Float[np.ndarray, "k s 2"],
+    seen: Bool[np.ndarray, "k s"],
+    size: Int[np.ndarray, "k 2"],
+    offset: Int[np.ndarray, " k"],
+    image: Float32[np.ndarray, " n"],
+    steps: Float[np.ndarray, " d"],
+) -> Float32[np.ndarray, "s k d"]:
+    """Grey values of every sample moved along its normal by ``steps`` (mm), as each camera shows it. ``pixel``: where
+    it sees the sample, ``along``: how that moves (px / mm)."""
+    out = np.zeros((pixel.shape[1], len(pixel), len(steps)), np.float32)
+    in_threads(len(out), lambda a, b: _sweep(a, b, pixel, along, seen, size, offset, image, steps, out))
+    return out
+
+
+def correlate(
+    patches: Patches,
+    weights: Float[np.ndarray, " e"],
+    view: Int[np.ndarray, "c n"],
+    value: Float[np.ndarray, "c n"],
+    seen: Bool[np.ndarray, "k s"],
+    grey: Float32[np.ndarray, "s k d"],
+    noise: Float[np.ndarray, " k"],
+) -> Float32[np.ndarray, "c d"]:
+    """Mean normalised cross-correlation over the pairs of the chosen views of each patch; 0 where there is no pair.
+
+    Gain and offset of a view drop out of it. ``noise`` is the standard deviation of grey values: it stands in the norm,
+    so that a patch without texture is like nothing, however alike its noise may look.
+    """
+    score = np.zeros((len(patches.centre), grey.shape[2]), np.float32)
+    start, member = patches.start, patches.member
+    in_threads(len(score), lambda a, b: _correlate(a, b, start, member, weights, view, value, seen, grey, noise, score))
+    return score
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def read(image, start, width, height, x, y):
+    """The image that begins at ``start`` of the row of images, bilinear, held inside."""
+    x, y = min(max(x, 0.0), width - 1.001), min(max(y, 0.0), height - 1.001)
+    column, row = int(x), int(y)
+    fx, fy = np.float32(x - column), np.float32(y - row)
+    i = start + row * width + column
+    top = image[i] + fx * (image[i + 1] - image[i])
+    bottom = image[i + width] + fx * (image[i + width + 1] - image[i + width])
+    return top + fy * (bottom - top)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _sweep(first, last, pixel, along, seen, size, offset, image, steps, out):
+    for s in range(first, last):
+        for k in range(len(pixel)):
+            if not seen[k, s]:
+                continue
+            for d in range(len(steps)):
+                x = pixel[k, s, 0] + along[k, s, 0] * steps[d]
+                y = pixel[k, s, 1] + along[k, s, 1] * steps[d]
+                out[s, k, d] = read(image, offset[k], size[k, 0], size[k, 1], x, y)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _correlate(first, last, start, member, weight, view, value, seen, grey, noise, score):
+    for p in range(first, last):
+        begin, count, views = start[p], start[p + 1] - start[p], 0
+        while views < view.shape[1] and view[p, views] >= 0:
+            views += 1
+        if views < 2:
+            continue
+        shades, norms = np.empty((views, count), np.float32), np.empty(views)
+        for d in range(grey.shape[2]):
+            for q in range(views):
+                k = view[p, q]
+                mean = total = energy = 0.0
+                for i in range(count):
+                    s, w = member[begin + i], weight[begin + i]
+                    shades[q, i] = grey[s, k, d]
+                    if seen[k, s]:
+                        mean += w * grey[s, k, d]
+                        total += w
+                mean /= total
+                for i in range(count):
+                    shade = np.float32(0.0)
+                    if seen[k, member[begin + i]]:
+                        shade = shades[q, i] - np.float32(mean)
+                    shades[q, i] = shade
+                    energy += weight[begin + i] * shade * shade
+                norms[q] = np.sqrt(energy + total * noise[k] * noise[k])
+            together = shared = 0.0
+            for q in range(views):
+                for r in range(q):
+                    product = np.float32(0.0)
+                    for i in range(count):
+                        product += np.float32(weight[begin + i]) * shades[q, i] * shades[r, i]
+                    pair = value[p, q] * value[p, r]
+                    together += pair * product / (norms[q] * norms[r])
+                    shared += pair
+            score[p, d] = together / shared

@@ -1,0 +1,243 @@
+"""Photo-consistency: where along its normal each patch of the surface looks alike in the views that see it.
+
+The variance of a place is that of a shift between two signals of correlation rho,
+
+    variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|,
+
+so that texture, noise, defocus and grazing views all show in it. Gain and offset of a camera drop out.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from pipeline.fitting.photo.camera_term import gram_matrices, lean
+from pipeline.fitting.photo.correlation import choose_views, correlate, sweep
+from pipeline.fitting.photo.hair_mask import Sight, under_hair
+from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
+from pipeline.fitting.photo.patches import Patches
+from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations, moved_views
+from pipeline.imaging.cpu_raster import camera_depths
+from pipeline.imaging.cpu_raster_kernels import rasterise
+from pipeline.settings import PhotoSettings
+from rig.camera import Camera
+from rig.geometry import RigidTransform
+from rig.mesh import vertex_normals
+
+DEPTH_LEVEL = "p95"  # of the z-buffer: it differs from the full mesh by far less than what may hide a sample
+LEAST_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
+EDGE_PX = 4  # nothing is read nearer to the image's edge
+WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
+SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring a surface within the window
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One pass over all patches."""
+
+    window_mm: float  # standard deviation of the patch's window
+    blur_mm: float  # of the images, on the head
+    reach_mm: float  # to both sides along the normal
+    steps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """The head as it stands, and who sees what of it."""
+
+    cameras: tuple[Camera, ...]  # where the state has them
+    vertices: Float[np.ndarray, "v 3"]  # full level, world
+    normals: Float[np.ndarray, "v 3"]
+    points: Float[np.ndarray, "s 3"]  # samples
+    facing: Float32[np.ndarray, "k s"]  # cosine between normal and line of sight, 0 where a camera does not see it
+    pixel: Float[np.ndarray, "k s 2"]  # where each camera sees a sample, and how that moves along the normal, px / mm;
+    along: Float[np.ndarray, "k s 2"]  # both 0 where it does not
+    covered: tuple[Bool[np.ndarray, "_ _"], ...]  # where each camera sees the head
+
+
+def look(
+    problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
+) -> Looks:
+    """Draws the depth of the head in every view, and asks for every sample."""
+    model, pose = problem.model, state.world_from_head
+    cage = model.cage(state.coefficients)
+    vertices = pose.apply(model.levels["full"].operator @ cage)
+    coarse = pose.apply(model.levels[DEPTH_LEVEL].operator @ cage)
+    normals = vertex_normals(vertices, model.levels["full"].faces)
+    points, outward = patches.points(vertices), patches.normals(normals)
+    cameras = moved_cameras(problem, state)
+
+    def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        camera, distance = cameras[k], distance_of(problem.views, k)
+        facing, ends = np.zeros(len(points), np.float32), np.zeros((2, len(points), 2))
+        if not speaks[k]:
+            return facing, ends[0], ends[1], np.zeros(distance.shape, bool)
+        depth, _ = rasterise(
+            camera.project(coarse), camera_depths(camera, coarse), model.levels[DEPTH_LEVEL].faces, *distance.shape
+        )
+        facing = facing_of(points, outward, camera, depth, distance, settings)
+        seen = np.flatnonzero(facing)
+        here, further = camera.project(points[seen]), camera.project(points[seen] + outward[seen])
+        ends[:, seen] = here, further - here
+        return facing, ends[0], ends[1], np.isfinite(depth)
+
+    with ThreadPoolExecutor() as pool:
+        facing, pixel, along, covered = zip(*pool.map(one, range(len(cameras))), strict=True)
+    return Looks(cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along), covered)
+
+
+def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
+    """The cameras where the state has them."""
+    views = moved_views(problem, state)
+    return tuple(
+        replace(camera, camera_from_world=RigidTransform(rotation, translation))
+        for camera, rotation, translation in zip(problem.rig, views.rotation, views.translation, strict=True)
+    )
+
+
+def facing_of(
+    points: Float[np.ndarray, "s 3"],
+    normals: Float[np.ndarray, "s 3"],
+    camera: Camera,
+    depth: Float32[np.ndarray, "h w"],
+    distance: Float32[np.ndarray, "h w"],
+    settings: PhotoSettings,
+) -> Float32[np.ndarray, " s"]:
+    """Cosine between normal and line of sight for every sample that the camera sees; 0 where it does not.
+
+    ``depth`` is the z-buffer of the head, ``distance`` the silhouette's signed distance.
+    """
+    towards = camera.centre_world - points
+    cosine = np.einsum("sc,sc->s", towards, normals) / np.linalg.norm(towards, axis=1)
+    height, width = depth.shape
+    pixel = camera.project(points)
+    with np.errstate(invalid="ignore"):  # NaN is outside
+        inside = ((pixel >= EDGE_PX) & (pixel < (width - EDGE_PX - 1, height - EDGE_PX - 1))).all(axis=1)
+    rows = np.flatnonzero((cosine >= LEAST_FACING) & inside)
+    column, row = np.rint(pixel[rows]).astype(int).T
+    nearest = cv2.erode(depth, np.ones((2 * WINDOW_PX + 1,) * 2, np.uint8))[row, column]
+    z, facing = camera_depths(camera, points[rows]), cosine[rows]
+    slope = np.minimum(np.sqrt(np.maximum(1.0 - facing**2, 0.0)) / facing, 4.0)
+    slack = settings.hidden_mm + SLOPE_SLACK * slope * z / camera.intrinsics.fx
+    seen = (distance[row, column] <= -settings.contour_margin_px) & (z <= nearest + slack)
+    out = np.zeros(len(points), np.float32)
+    out[rows[seen]] = facing[seen]
+    return out
+
+
+def hair_patches(
+    problem: ContourProblem, state: State, patches: Patches, photographs: Photographs, looks: Looks
+) -> Bool[np.ndarray, " c"]:
+    """The patches that lie under hair, by its colour."""
+    chin = looks.vertices[problem.model.landmarks["gnathion"]]
+    ends = np.stack([chin, chin + 10.0 * state.world_from_head.rotation[:, 1]])
+    sights = []
+    for k in np.flatnonzero(photographs.speaks).tolist():
+        low, high = looks.cameras[k].project(ends)
+        sights.append(
+            Sight(
+                photographs.colour[k], looks.covered[k], distance_of(problem.views, k), looks.pixel[k],
+                looks.facing[k] > 0, low, high - low,
+            )
+        )  # fmt: skip
+    return under_hair(problem.model, patches, sights)
+
+
+def observe(
+    problem: ContourProblem,
+    state: State,
+    photographs: Photographs,
+    patches: Patches,
+    looks: Looks,
+    hair: Bool[np.ndarray, " c"],
+    basis: Float32[np.ndarray, "m c 3"],
+    each: Round,
+    settings: PhotoSettings,
+) -> tuple[SurfaceObservations, Int[np.ndarray, " u"]]:
+    """Where the photographs see the surface, by the vertices at the patches' centres, and the vertices that they see
+    without knowing where they are; a patch of ``hair`` says only that the head is no farther out than that. ``basis``:
+    the model's modes at the centres."""
+    views = problem.views
+    steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
+    scale = pixels_per_mm(looks.cameras, state.world_from_head.translation)
+    image, noise = blurred(photographs, each.blur_mm * scale)
+    weights, seen = patches.weights(each.window_mm), looks.facing > 0
+    grey = sweep(looks.pixel, looks.along, seen, views.size, views.offset, image, steps)
+    view, value = choose_views(patches, weights, looks.facing, settings.least_seen, settings.views_most)
+    found = find_peaks(correlate(patches, weights, view, value, seen, grey, noise), steps)
+    blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
+    variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - found.height) / found.curvature
+    several, clear = view[:, 1] >= 0, found.inside & (found.height > settings.least_correlation)
+    kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > 0.9))))
+    # Patches overlap: what they say together is worth their area, not their number.
+    overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / settings.centre_mm**2)
+    information = 1.0 / (overlap * variance[kept])
+    rows, place = patches.centre[kept], found.place[kept]
+    grams = gram_matrices(
+        patches, kept, weights, view[kept], place, looks.pixel, looks.along, seen, views.size, views.offset, image,
+        noise,
+    )  # fmt: skip
+    stood, normal = looks.vertices[rows], looks.normals[rows]
+    leaning = lean(view[kept], value[kept], grams, stood + place[:, None] * normal, normal, looks.cameras)
+    camera_matrix, camera_gradient = leaning.cameras(information)
+    metric = metric_rig(looks.cameras, state.world_from_head.translation, settings.rig_scale_spread)
+    observations = SurfaceObservations(
+        vertex=rows,
+        basis=basis.take(kept, axis=1),  # basis[:, kept] is laid out by vertex, and copied whenever it is used
+        mean=problem.model.levels["full"].operator[rows] @ problem.model.mean.astype(float),
+        normal=normal,
+        seen_at=stood,
+        displacement=place,
+        information=information,
+        by_camera=leaning.by_camera,
+        camera_shift=state.camera_shift,
+        camera_matrix=camera_matrix + metric,
+        camera_gradient=camera_gradient - metric @ state.camera_shift.ravel(),
+    )
+    return observations, patches.centre[~hair & several & ~clear]
+
+
+def metric_rig(
+    cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"], spread: float
+) -> Float[np.ndarray, "c c"]:
+    """Information that cameras do not all err towards the head alike: their distances come from one board, whose size
+    is known. Images alone cannot tell; a contour that lies a tenth of a pixel too far out would otherwise move every
+    camera closer, and the surface with them."""
+    depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
+    nearer = np.zeros((len(depth), 6))
+    nearer[:, 5] = 1.0 / (len(depth) * depth)
+    return np.outer(nearer, nearer) / spread**2
+
+
+def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
+    """How large each camera sees a mm at the head's place."""
+    return np.array([c.intrinsics.fx / c.camera_from_world.apply(at_world)[2] for c in cameras])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Peaks:
+    """The highest point of each patch's correlation."""
+
+    place: Float[np.ndarray, " c"]  # mm along the normal
+    height: Float[np.ndarray, " c"]
+    curvature: Float[np.ndarray, " c"]  # mm^-2
+    inside: np.ndarray  # is it a peak, and not the end of the reach?
+
+
+def find_peaks(score: Float32[np.ndarray, "c d"], steps: Float[np.ndarray, " d"]) -> Peaks:
+    """Through the parabola of the highest step and its neighbours."""
+    best = score.argmax(axis=1)
+    middle = np.clip(best, 1, len(steps) - 2)
+    rows, step = np.arange(len(score)), steps[1] - steps[0]
+    below, at, above = (score[rows, middle + j].astype(float) for j in (-1, 0, 1))
+    bend = np.maximum(2.0 * at - below - above, 1e-6)
+    offset = np.clip(0.5 * (above - below) / bend, -1.0, 1.0)
+    return Peaks(
+        place=steps[middle] + offset * step,
+        height=np.minimum(at + 0.25 * (above - below) * offset, 1.0),
+        curvature=bend / step**2,
+        inside=best == middle,
+    )

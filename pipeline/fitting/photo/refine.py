@@ -1,0 +1,109 @@
+"""Photographs as evidence inside the outline, in the contour solver's own problem.
+
+Enters: a solved contour problem and the photographs. Leaves: the same problem with a finer basis and with observations
+of the surface, solved again. Three rounds, coarse to fine: each patch of the current surface (``patches``) moves along
+its normals through the images of the cameras that see it; where its views look most alike, the surface is said to be
+(``consistency``), and how far the views would rather slide says where the cameras are (``registration``). No peak
+inside the reach, or a low one (occluded, specular, textureless), is silence, and so is hair (``hairline``). The
+observations enter the normal equations beside rims, features and priors (``surface``), robustly; where they are silent
+the kernels carry on smoothly.
+"""
+
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.diagnostics import Detail
+from pipeline.eigenheads.gaussian_process import with_fine_kernel
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.contour import Solved, run_stage
+from pipeline.fitting.photo.depth_search import Round, hair_patches, look, observe
+from pipeline.fitting.photo.images import load_photographs
+from pipeline.fitting.photo.patches import Patches, make_patches
+from pipeline.fitting.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
+from pipeline.fitting.surface_term import surface_residual
+from pipeline.settings import PhotoSettings
+
+ROUNDS = (Round(3.0, 0.8, 4.0, 17), Round(2.5, 0.55, 2.0, 13), Round(2.0, 0.45, 1.0, 9))
+RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
+LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is the full level's anyway
+VIEWS_LEAST = 3
+NEIGHBOURS, NEAR_MM = 24, 4.0  # patches about a vertex: two windows
+HAIR_REACH_MM = 4.0  # patches are 3 mm apart
+LOST_MM = 2.5  # off by at least that where nothing matches: what two photographs still recognise
+MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's own misfit: its few patches know their
+# variance badly, all of them together well. So 95 % intervals hold 91 to 98 % of a scan and four draws
+
+
+def refine_with_photographs(
+    solved: Solved, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], settings: PhotoSettings
+) -> tuple[Solved, Detail]:
+    """Goes on from the contours' solution with what the photographs show inside the outline, in a finer basis.
+
+    Where they show too little, the solution is left as it is; the second value says which and why.
+    """
+    problem = solved.problem
+    photographs = load_photographs(images, problem.views)
+    speaking = int(np.count_nonzero(photographs.speaks))
+    if speaking < VIEWS_LEAST:
+        why = f"{speaking} of {len(problem.views.names)} views have a photograph with texture, {VIEWS_LEAST} are needed"
+        return solved, Detail("kernel", why)
+    model, patches, basis = finer(problem.model, settings)
+    problem = widened(problem, model, (LEVEL,))
+    stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
+    state, evaluations, reason, share = solved.state, solved.evaluations, solved.stopped_because, 0.0
+    evidence, misfit = solved.evidence, solved.misfit_mm
+    lost = np.zeros(0, int)
+    for each in ROUNDS:
+        looks = look(problem, state, patches, photographs.speaks, settings)
+        hair = hair_patches(problem, state, patches, photographs, looks)
+        surface, lost = observe(problem, state, photographs, patches, looks, hair, basis, each, settings)
+        share = len(surface.vertex) / max(len(patches.centre), 1)
+        if share < settings.least_share:
+            why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"
+            return solved, Detail("kernel", why)
+        hidden = {LEVEL: near_hair(model, patches.centre[hair])}
+        evidence = StageEvidence(solved.evidence.noise, PhotoEvidence(surface, hidden))
+        state, used, reason = run_stage(problem, evidence, state, stage, lambda fraction: None)
+        misfit = unfollowed(model, surface, state, lost)
+        evaluations += used
+    why = f"{share:.0%} of the face look alike in two or more of {speaking} photographs"
+    return Solved(problem, evidence, state, stage, evaluations, reason, misfit), Detail("photo", why)
+
+
+@lru_cache(maxsize=1)  # 150 MB; studios work with one model
+def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
+    """The model with the fine kernel, its patches, and its modes at their centres."""
+    fine = with_fine_kernel(model, length_mm=settings.fine_length_mm, amplitude_mm=settings.fine_amplitude_mm)
+    radius = RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS)
+    patches = make_patches(model, sample_mm=settings.sample_mm, centre_mm=settings.centre_mm, radius_mm=radius)
+    return fine, patches, fine.basis("full", len(fine.modes), patches.centre)
+
+
+def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
+    """The vertices of the rim's level about vertices of the full level that lie under hair: their outline is hair's. A
+    fit to contours alone has bulged into it wherever its edge hung together with the face's."""
+    mean = model.vertices(np.zeros(0))
+    if not len(hair):
+        return np.zeros(model.levels[LEVEL].count, bool)
+    return KDTree(mean[hair]).query(mean[model.levels[LEVEL].rows])[0] < HAIR_REACH_MM
+
+
+def unfollowed(
+    model: HeadModel, seen: SurfaceObservations, state: State, lost: Int[np.ndarray, " u"]
+) -> Float[np.ndarray, " v0"]:
+    """How far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).
+
+    Where several cameras see a place (vertex ``lost``) and find no match within reach, it is off by more than they can
+    tell: eyes that the model has open and the subject closed. Nothing is said beyond the patches.
+    """
+    off, _ = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)
+    full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)
+    square = np.concatenate([np.minimum(np.abs(off), LOST_MM), np.full(len(lost), LOST_MM)]) ** 2
+    square = MISFIT_LOCAL * square + (1.0 - MISFIT_LOCAL) * square.mean()
+    distance, near = KDTree(full[np.concatenate([seen.vertex, lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
+    weight = np.exp(-0.5 * (distance / NEAR_MM) ** 2)
+    return MISFIT_FACTOR * np.sqrt((weight * square[near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 0.1))

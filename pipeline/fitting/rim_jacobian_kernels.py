@@ -1,0 +1,50 @@
+"""The compiled inner loop of the rim's Jacobian: a row a sample, written in place."""
+
+import numpy as np
+
+from pipeline.compiled import njit
+
+POSE = 7  # rotation, translation, log scale
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def fill_rows(first, last, indptr, indices, data, modes, count, turn, place, rotation, translation, view, corner,
+               blend, point, gradient, out):  # fmt: skip
+    """Modes: the sum over the cage of (gradient . mode), through the level's operator and the edge's blend."""
+    for s in range(first, last):
+        gx, gy, gz = gradient[s]
+        hx = gx * turn[0, 0] + gy * turn[1, 0] + gz * turn[2, 0]
+        hy = gx * turn[0, 1] + gy * turn[1, 1] + gz * turn[2, 1]
+        hz = gx * turn[0, 2] + gy * turn[1, 2] + gz * turn[2, 2]
+        row = np.zeros(count, np.float32)
+        for end in range(2):
+            share = blend[s] if end else 1.0 - blend[s]
+            v = corner[s, end]
+            for j in range(indptr[v], indptr[v + 1]):
+                i, w = indices[j], share * data[j]
+                wx, wy, wz = np.float32(w * hx), np.float32(w * hy), np.float32(w * hz)
+                for m in range(count):
+                    row[m] += wx * modes[i, 0, m] + wy * modes[i, 1, m] + wz * modes[i, 2, m]
+        for m in range(count):
+            out[s, m] = row[m]
+        _fill_rigid(point[s, 0] - place[0], point[s, 1] - place[1], point[s, 2] - place[2], gx, gy, gz, out[s], count)
+        out[s, count + 6] = (
+            gx * (point[s, 0] - place[0]) + gy * (point[s, 1] - place[1]) + gz * (point[s, 2] - place[2])
+        )
+        r, t = rotation[view[s]], translation[view[s]]
+        _fill_rigid(
+            r[0, 0] * point[s, 0] + r[0, 1] * point[s, 1] + r[0, 2] * point[s, 2] + t[0],
+            r[1, 0] * point[s, 0] + r[1, 1] * point[s, 1] + r[1, 2] * point[s, 2] + t[1],
+            r[2, 0] * point[s, 0] + r[2, 1] * point[s, 1] + r[2, 2] * point[s, 2] + t[2],
+            r[0, 0] * gx + r[0, 1] * gy + r[0, 2] * gz,
+            r[1, 0] * gx + r[1, 1] * gy + r[1, 2] * gz,
+            r[2, 0] * gx + r[2, 1] * gy + r[2, 2] * gz,
+            out[s], count + POSE,
+        )  # fmt: skip
+
+
+@njit(cache=True, fastmath=True)
+def _fill_rigid(x, y, z, gx, gy, gz, out, first):
+    """Rotation and translation: g . (w x arm) = w . (arm x g), and g."""
+    out[first], out[first + 1], out[first + 2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+    out[first + 3], out[first + 4], out[first + 5] = gx, gy, gz

@@ -1,0 +1,399 @@
+"""The compiled inner loops of the rim: sweeps over the mesh for all views at once, then one view at a time.
+
+Plain loops over arrays; the views are shared out to threads. ``rim`` says what they are for.
+"""
+
+import numpy as np
+
+from pipeline.compiled import njit
+from pipeline.imaging.projection_kernels import NOWHERE, distorted
+
+BLOCK = 1024  # faces whose planes stay in the cache while all views look at them
+LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by more than 60 degrees, they are no curve
+
+
+@njit(cache=True, fastmath=True)
+def projected_with_slopes(points, view, rotation, translation, lens):
+    pixels, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
+    for n in range(len(points)):
+        k = view[n]
+        pixels[n] = _project(points[n], rotation[k], translation[k], lens[k])
+        slopes[n] = _projection_jacobian(points[n], rotation[k], translation[k], lens[k])
+    return pixels, slopes
+
+
+@njit(cache=True, fastmath=True)
+def normals_and_planes(vertices, faces):
+    """Unit vertex normals; and by face its normal n and n . a: a centre C is in front of it where n . C > n . a."""
+    normals = np.zeros_like(vertices)
+    planes = np.empty((4, len(faces)))
+    for f in range(len(faces)):
+        a, b, c = faces[f]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        wx, wy, wz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        for v in (a, b, c):
+            normals[v, 0] += nx
+            normals[v, 1] += ny
+            normals[v, 2] += nz
+        planes[0, f], planes[1, f], planes[2, f] = nx, ny, nz
+        planes[3, f] = nx * vertices[a, 0] + ny * vertices[a, 1] + nz * vertices[a, 2]
+    for v in range(len(normals)):
+        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2) + 1e-30
+        normals[v] /= length
+    return normals, planes
+
+
+@njit(cache=True, fastmath=True)
+def _project(point, rotation, translation, lens):
+    """Pixel of a world point; not finite behind the camera or past the lens's turning radius."""
+    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
+    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
+    z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
+    if z <= 1.0:
+        return NOWHERE, NOWHERE
+    return distorted(x / z, y / z, lens)
+
+
+@njit(cache=True, fastmath=True)
+def _slopes(point, rotation, translation, lens):
+    """P = d(pixel) / d(world point): the two rows, x and y, as six numbers."""
+    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
+    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
+    iz = 1.0 / (rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2])
+    x, y = x * iz, y * iz
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
+    slope = 2.0 * (lens[4] + r2 * (2.0 * lens[5] + 3.0 * r2 * lens[8]))
+    xy = slope * x * y + 2.0 * lens[6] * x + 2.0 * lens[7] * y
+    xx = lens[0] * iz * (radial + slope * x * x + 2.0 * lens[6] * y + 6.0 * lens[7] * x)
+    yy = lens[1] * iz * (radial + slope * y * y + 6.0 * lens[6] * y + 2.0 * lens[7] * x)
+    xy, yx = lens[0] * iz * xy, lens[1] * iz * xy
+    dx0, dx1, dx2 = (
+        rotation[0, 0] - x * rotation[2, 0],
+        rotation[0, 1] - x * rotation[2, 1],
+        rotation[0, 2] - x * rotation[2, 2],
+    )
+    dy0, dy1, dy2 = (
+        rotation[1, 0] - y * rotation[2, 0],
+        rotation[1, 1] - y * rotation[2, 1],
+        rotation[1, 2] - y * rotation[2, 2],
+    )
+    return (
+        (xx * dx0 + xy * dy0, xx * dx1 + xy * dy1, xx * dx2 + xy * dy2),
+        (yx * dx0 + yy * dy0, yx * dx1 + yy * dy1, yx * dx2 + yy * dy2),
+    )
+
+
+@njit(cache=True, fastmath=True)
+def _projection_jacobian(point, rotation, translation, lens):
+    """P = d(pixel) / d(world point), 2 x 3."""
+    return np.array(_slopes(point, rotation, translation, lens))
+
+
+@njit(cache=True, fastmath=True)
+def _facing(planes, centres):
+    """By face a word: bit k is set where it looks to view k."""
+    words = np.zeros(planes.shape[1], np.uint64)
+    for first in range(0, len(words), BLOCK):
+        last = min(first + BLOCK, len(words))
+        for k in range(len(centres)):
+            x, y, z = centres[k]
+            bit = np.uint64(1) << np.uint64(k)
+            for f in range(first, last):
+                in_front = planes[0, f] * x + planes[1, f] * y + planes[2, f] * z > planes[3, f]
+                words[f] |= bit if in_front else np.uint64(0)
+    return words
+
+
+@njit(cache=True, fastmath=True)
+def _side(vertex, normal, centre):
+    """N . (X - C): its zero crossings are the rim."""
+    x, y, z = vertex[0] - centre[0], vertex[1] - centre[1], vertex[2] - centre[2]
+    return normal[0] * x + normal[1] * y + normal[2] * z
+
+
+@njit(cache=True, fastmath=True)
+def _turned(vertices, normals, centres):
+    """By vertex a word: bit k is set where its normal looks away from view k."""
+    words = np.zeros(len(vertices), np.uint64)
+    for v in range(len(vertices)):
+        word = np.uint64(0)
+        for k in range(len(centres)):
+            if _side(vertices[v], normals[v], centres[k]) > 0:
+                word |= np.uint64(1) << np.uint64(k)
+        words[v] = word
+    return words
+
+
+@njit(cache=True, fastmath=True)
+def _folds(edges, facing):
+    """The edges where the number of layers changes in some view, and the word of those views; borders in all."""
+    count = 0
+    for e in range(len(edges)):
+        if edges[e, 3] < 0 or facing[edges[e, 2]] != facing[edges[e, 3]]:
+            count += 1
+    which, words = np.empty(count, np.int32), np.empty(count, np.uint64)
+    i = 0
+    for e in range(len(edges)):
+        if edges[e, 3] < 0:
+            which[i], words[i] = e, ~np.uint64(0)
+        elif facing[edges[e, 2]] != facing[edges[e, 3]]:
+            which[i], words[i] = e, facing[edges[e, 2]] ^ facing[edges[e, 3]]
+        else:
+            continue
+        i += 1
+    return which, words
+
+
+@njit(cache=True, fastmath=True)
+def _crossed(faces, speaking, turned):
+    """The speaking faces that the rim crosses in some view, and the word of those views."""
+    which, words = np.empty(len(speaking), np.int32), np.empty(len(speaking), np.uint64)
+    count = 0
+    for s in range(len(speaking)):
+        a, b, c = faces[speaking[s]]
+        word = (turned[a] ^ turned[b]) | (turned[a] ^ turned[c])
+        if word:
+            which[count], words[count] = speaking[s], word
+            count += 1
+    return which[:count], words[:count]
+
+
+@njit(cache=True, fastmath=True)
+def _chain(vertices, edges, folds, words, bit, facing, rotation, translation, lens):
+    """Image of one view's folds: x0 y0 x1 y1, directed as in the face that looks to the camera (against the direction
+    in one that looks away), and by how many layers."""
+    total = 0
+    for word in words:
+        total += 1 if word & bit else 0
+    chain = np.empty((total, 5))
+    i = 0
+    for j in range(len(folds)):
+        if not words[j] & bit:
+            continue
+        a, b, one, two = edges[folds[j]]
+        if not facing[one] & bit:
+            a, b = b, a
+        chain[i, 0], chain[i, 1] = _project(vertices[a], rotation, translation, lens)
+        chain[i, 2], chain[i, 3] = _project(vertices[b], rotation, translation, lens)
+        chain[i, 4] = 1.0 if two < 0 else 2.0
+        i += 1
+    return chain
+
+
+@njit(cache=True, fastmath=True)
+def _rows(chain, height):
+    """The chain's edges sorted into the image rows that they cross: where each row starts, and for every entry the
+    edge's y0, y1, x0, dx/dy and signed layers. Copies, not indices: a query then reads one stretch of memory."""
+    start = np.zeros(height + 1, np.int64)
+    for i in range(len(chain)):
+        low, high = min(chain[i, 1], chain[i, 3]), max(chain[i, 1], chain[i, 3])
+        if high > 1e8 or high < 0 or low >= height or low == high:
+            continue
+        for row in range(max(0, int(np.floor(low))), min(height - 1, int(np.floor(high))) + 1):
+            start[row + 1] += 1
+    for row in range(height):
+        start[row + 1] += start[row]
+    entries = np.empty((5, start[height]))
+    fill = start[:-1].copy()
+    for i in range(len(chain)):
+        x0, y0, x1, y1, layers = chain[i]
+        low, high = min(y0, y1), max(y0, y1)
+        if high > 1e8 or high < 0 or low >= height or low == high:
+            continue
+        for row in range(max(0, int(np.floor(low))), min(height - 1, int(np.floor(high))) + 1):
+            m = fill[row]
+            entries[0, m], entries[1, m], entries[2, m] = y0, y1, x0
+            entries[3, m], entries[4, m] = (x1 - x0) / (y1 - y0), layers if y1 > y0 else -layers
+            fill[row] += 1
+    return start, entries
+
+
+@njit(cache=True, fastmath=True)
+def _layers(x, y, start, entries):
+    """Winding number of the chain about a pixel: how many faces lie over it."""
+    row = int(np.floor(y))
+    if row < 0 or row >= len(start) - 1:
+        return 1.0  # outside the image nothing is known; such samples are dropped
+    count = 0.0
+    for m in range(start[row], start[row + 1]):
+        across = (entries[0, m] <= y) != (entries[1, m] <= y)
+        right = entries[2, m] + (y - entries[0, m]) * entries[3, m] > x
+        count += entries[4, m] if across and right else 0.0
+    return count
+
+
+@njit(cache=True, fastmath=True)
+def _bilinear(distance, offset, width, height, x, y):
+    x0, y0 = min(max(int(np.floor(x)), 0), width - 2), min(max(int(np.floor(y)), 0), height - 2)
+    fx, fy = x - x0, y - y0
+    i = offset + y0 * width + x0
+    top = distance[i] * (1.0 - fx) + distance[i + 1] * fx
+    bottom = distance[i + width] * (1.0 - fx) + distance[i + width + 1] * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+@njit(cache=True, fastmath=True)
+def _crossings(vertices, normals, turned, faces, crossed, words, bit, centre, corners, floats):
+    """Zero crossings of N . (X - C) along the edges of the crossed faces; each edge once. Fills the sample's edge,
+    blend, point, normal (in the place of the gradient); returns how many, and the segments that join them."""
+    kept_index = np.full(len(vertices), -1, np.int32)
+    segments = np.empty((corners.shape[0], 2), np.int32)
+    count = joined = 0
+    ends = np.empty(2, np.int32)
+    for s in range(len(crossed)):
+        if not words[s] & bit:
+            continue
+        f = crossed[s]
+        n = 0
+        for j in range(3):
+            k = (j + 1) % 3
+            a, b = min(faces[f, j], faces[f, k]), max(faces[f, j], faces[f, k])
+            if not (turned[a] ^ turned[b]) & bit:
+                continue
+            # An edge has at most two faces: the sample that the first made is found by its ends.
+            found = -1
+            probe = kept_index[a]
+            while probe >= 0:
+                if corners[probe, 1] == b:
+                    found = probe
+                    break
+                probe = np.int32(floats[probe, 13])
+            if found < 0:
+                if count >= corners.shape[0]:
+                    return count, joined, segments
+                found = count
+                count += 1
+                here, there = _side(vertices[a], normals[a], centre), _side(vertices[b], normals[b], centre)
+                t = min(max(here / (here - there), 0.0), 1.0)
+                corners[found, 0], corners[found, 1] = a, b
+                floats[found, 0] = t
+                # The chord lies below the surface: by t (1 - t) / 2 (n_b - n_a) . (b - a), its sagitta.
+                bend = 0.0
+                for c in range(3):
+                    bend += (normals[b, c] - normals[a, c]) * (vertices[b, c] - vertices[a, c])
+                for c in range(3):
+                    floats[found, 4 + c] = (1.0 - t) * normals[a, c] + t * normals[b, c]
+                    lift = 0.5 * t * (1.0 - t) * bend * floats[found, 4 + c]
+                    floats[found, 1 + c] = (1.0 - t) * vertices[a, c] + t * vertices[b, c] + lift
+                floats[found, 11] = 0.0
+                floats[found, 13] = kept_index[a]
+                kept_index[a] = found
+            if n < 2:
+                ends[n] = found
+            n += 1
+        if n == 2 and joined < len(segments):
+            segments[joined, 0], segments[joined, 1] = ends[0], ends[1]
+            joined += 1
+    return count, joined, segments
+
+
+@njit(cache=True, fastmath=True)
+def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words, bit, rotation,
+          translation, lens, width, height, distance, offset, steps, averaged, corners, floats):  # fmt: skip
+    """One view: fills ``corners`` and ``floats`` with the samples on the outer outline; returns their number."""
+    centre = -(rotation.T @ translation)
+    chain = _chain(vertices, edges, folds, fold_words, bit, facing, rotation, translation, lens)
+    start, entries = _rows(chain, height)
+    count, joined, segments = _crossings(
+        vertices, normals, turned, faces, crossed, crossed_words, bit, centre, corners, floats
+    )
+    for s in range(count):
+        floats[s, 7], floats[s, 8] = _project(floats[s, 1:4], rotation, translation, lens)
+    for j in range(joined):
+        a, b = segments[j]
+        half = 0.5 * np.sqrt((floats[a, 7] - floats[b, 7]) ** 2 + (floats[a, 8] - floats[b, 8]) ** 2)
+        floats[a, 11] += half
+        floats[b, 11] += half
+    kept, place = 0, np.full(count, -1, np.int32)
+    for s in range(count):
+        u, v = floats[s, 7], floats[s, 8]
+        if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+            continue
+        to_x, to_y = _slopes(floats[s, 1:4], rotation, translation, lens)
+        # l = N^T P^+ through the 2 x 2 normal matrix of P's rows.
+        n0, n1, n2 = floats[s, 4], floats[s, 5], floats[s, 6]
+        g00 = to_x[0] ** 2 + to_x[1] ** 2 + to_x[2] ** 2
+        g11 = to_y[0] ** 2 + to_y[1] ** 2 + to_y[2] ** 2
+        g01 = to_x[0] * to_y[0] + to_x[1] * to_y[1] + to_x[2] * to_y[2]
+        h0 = to_x[0] * n0 + to_x[1] * n1 + to_x[2] * n2
+        h1 = to_y[0] * n0 + to_y[1] * n1 + to_y[2] * n2
+        det = g00 * g11 - g01 * g01
+        lx, ly = (g11 * h0 - g01 * h1) / det, (g00 * h1 - g01 * h0) / det
+        size = np.sqrt(lx * lx + ly * ly) + 1e-30
+        nx, ny = lx / size, ly / size
+        covered = False
+        for i in range(len(steps)):
+            if _layers(u + steps[i] * nx, v + steps[i] * ny, start, entries) != 0:
+                covered = True
+                break
+        if covered:
+            continue
+        corners[kept, 0], corners[kept, 1] = corners[s, 0], corners[s, 1]
+        for c in range(4):
+            floats[kept, c] = floats[s, c]
+        for c in range(3):
+            floats[kept, 4 + c] = nx * to_x[c] + ny * to_y[c]
+        floats[kept, 7], floats[kept, 8], floats[kept, 9], floats[kept, 10] = u, v, nx, ny
+        floats[kept, 11] = floats[s, 11]
+        floats[kept, 12] = _bilinear(distance, offset, width, height, u, v)
+        place[s] = kept
+        kept += 1
+    if averaged:
+        _average(segments[:joined], place, kept, distance, offset, width, height, floats)
+    return kept
+
+
+@njit(cache=True, fastmath=True)
+def _average(segments, place, kept, distance, offset, width, height, floats):
+    """Residuals as means over the outline that samples stand for, half way to their neighbours.
+
+    The rim crosses the mesh every 2 to 6 px, and the noise of a contour is another after 2 px: read at the samples
+    alone, half of what a contour says is thrown away.
+    """
+    total, read = np.zeros(kept), np.zeros(kept)
+    for j in range(len(segments)):
+        a, b = place[segments[j, 0]], place[segments[j, 1]]
+        if a < 0 or b < 0:
+            continue
+        dx, dy = floats[b, 7] - floats[a, 7], floats[b, 8] - floats[a, 8]
+        half = 0.5 * np.sqrt(dx * dx + dy * dy)
+        turn_x, turn_y = floats[b, 9] - floats[a, 9], floats[b, 10] - floats[a, 10]
+        if 2.0 * half > LONGEST_PX or turn_x * turn_x + turn_y * turn_y > 1.0:
+            continue
+        bend = turn_x * dx + turn_y * dy  # the outline bulges over the chord by t (1 - t) / 2 of it, its sagitta
+        reads = int(half) + 1
+        for i in range(2 * reads):
+            t = (i + 0.5) / (2 * reads)
+            end = a if i < reads else b
+            lift = 0.5 * t * (1.0 - t) * bend
+            x = floats[a, 7] + t * dx + lift * floats[end, 9]
+            y = floats[a, 8] + t * dy + lift * floats[end, 10]
+            total[end] += half / reads * _bilinear(distance, offset, width, height, x, y)
+        read[a] += half
+        read[b] += half
+    for s in range(kept):
+        if floats[s, 11] > 0.0:
+            floats[s, 12] = (total[s] + (floats[s, 11] - read[s]) * floats[s, 12]) / floats[s, 11]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def swept(vertices, normals, planes, faces, edges, speaking, centres):
+    """What all views ask of faces, edges and vertices: a bit of a word for each view."""
+    facing = _facing(planes, centres)
+    folds, fold_words = _folds(edges, facing)
+    turned = _turned(vertices, normals, centres)
+    crossed, crossed_words = _crossed(faces, speaking, turned)
+    return facing, folds, fold_words, turned, crossed, crossed_words
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def see(first, last, vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
+         rotation, translation, lens, size, distance, offset, steps, averaged, counts, corners, floats):  # fmt: skip
+    for k in range(first, last):
+        counts[k] = _view(
+            vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
+            np.uint64(1) << np.uint64(k), rotation[k], translation[k], lens[k], size[k, 0], size[k, 1], distance,
+            offset[k], steps, averaged, corners[k], floats[k],
+        )  # fmt: skip

@@ -1,0 +1,130 @@
+"""The contour term: how far the input's outline lies from the model's rim, all samples of all views.
+
+Residual of a rim sample: the input's signed distance ``r = D_obs(u)`` (px), with
+
+    dr/dz      = n^T P s R B            n^T P from rim.py, B the modes at the sample
+    dr/dpose   = n^T P [-[X - c]x, I, X - c]        rotation and log scale about the head's place c, translation
+    dr/dcamera = n^T P_c [-[X_c]x, I]               left perturbation of camera_from_world
+
+Each sample stands for ``length`` px of outline and weighs ``length / (l sigma^2)``: the Fisher information of a contour
+with noise sigma and correlation length l.
+
+Clutter (hair, shoulders, clothes) only ever adds area: the input may lie outside the model, hardly ever inside. So the
+robust scale (Geman-McClure) is one-sided: it forgives early where the model lies inside the input, and late where it
+sticks out.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.estimation.robust import GemanMcClure
+from pipeline.estimation.terms import NormalEquations
+from pipeline.fitting.clutter import held_inside, without_clutter
+from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State, moved_views
+from pipeline.fitting.rim import Rim, find_rim
+from pipeline.fitting.rim_jacobian_kernels import fill_rows
+from pipeline.parallel_for import in_threads
+
+OUTSIDE_SCALE = 2.0  # robust scale where the model sticks out of the input, by the other side's; 3 (10 px at least)
+# left 20 % of bad contour ten times the error
+
+
+def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> Rim:
+    """The rim of the head as it stands; samples that are not to be believed have no length."""
+    vertices = state.world_from_head.apply(problem.bases[stage.level].vertices(state.coefficients))
+    # On a decimated mesh a sample's share of the outline is long enough to be half clutter: it would hide what is not.
+    fine, whole = stage.level == "full", stage.whole_head or stage.contained
+    views = moved_views(problem, state)
+    rim = find_rim(problem.topologies[stage.level], vertices, views, whole_head=whole, averaged=fine)
+    rim = without_clutter(evidence, rim)
+    if stage.contained and not stage.whole_head:
+        rim = held_inside(problem, evidence, rim, stage.level)
+    return rim
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RimTerm:
+    """``reference_px``: outline length that the cost is scaled to, so that a fit gains nothing by hiding its rim; None
+    for the rim's own."""
+
+    problem: ContourProblem
+    evidence: StageEvidence
+    stage: Stage
+    scale_px: float
+    reference_px: float | None = None
+
+    def at(self, state: State) -> "RimAt":
+        return RimAt(self, state, observed_rim(self.problem, self.evidence, state, self.stage))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RimAt:
+    """The rim's part of the cost at one state."""
+
+    term: RimTerm
+    state: State
+    rim: Rim
+
+    @property
+    def cost(self) -> float:
+        rho = _loss(self.rim.residual, self.term.scale_px).cost(self.rim.residual**2)
+        total = float(self.rim.length.sum())
+        share = (self.term.reference_px or total) / max(total, 1.0)
+        return float((self.rim.length * rho).sum()) / self.term.evidence.noise.unit * share
+
+    def add_to(self, equations: NormalEquations) -> None:
+        """A view's samples touch shape, pose and their own camera: one block a view."""
+        stage, rim = self.term.stage, active_samples(self.rim)
+        rows = rim_rows(self.term.problem, self.state, rim, stage)
+        weight = _loss(rim.residual, self.term.scale_px).weight(rim.residual**2)
+        weight *= rim.length / self.term.evidence.noise.unit
+        shared, views = stage.modes + POSE, len(self.term.problem.views.names)
+        ends = np.searchsorted(rim.view, np.arange(views + 1))
+        matrix, gradient = equations.matrix, equations.gradient
+        for k, (first, last) in enumerate(pairwise(ends)):
+            part = rows[first:last]
+            weighted = part * weight[first:last, None]
+            square, slope = weighted.T @ part, weighted.T @ rim.residual[first:last]
+            matrix[:shared, :shared] += square[:shared, :shared]
+            gradient[:shared] += slope[:shared]
+            if stage.cameras:
+                own = slice(shared + PER_CAMERA * k, shared + PER_CAMERA * (k + 1))
+                matrix[:shared, own] += square[:shared, shared:]
+                matrix[own, :shared] += square[shared:, :shared]
+                matrix[own, own] += square[shared:, shared:]
+                gradient[own] += slope[shared:]
+
+
+def _loss(residual_px: Float[np.ndarray, " s"], scale_px: float) -> GemanMcClure:
+    """With another scale for each side of the input's outline."""
+    return GemanMcClure(np.where(residual_px < 0, scale_px, OUTSIDE_SCALE * scale_px))
+
+
+def active_samples(rim: Rim) -> Rim:
+    """The samples that have any weight."""
+    kept = rim.length > 0
+    return rim if kept.all() else Rim(*(getattr(rim, name)[kept] for name in Rim.__dataclass_fields__))
+
+
+def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> Float[np.ndarray, "s q"]:
+    """d(residual) / d(coefficients, pose, the correction of the sample's own camera)."""
+    pose, views = state.world_from_head, moved_views(problem, state)
+    basis = problem.bases[stage.level]
+    operator = basis.operator
+    rows = np.empty((len(rim.view), stage.modes + POSE + PER_CAMERA))
+    # One type for every level, or the loop is compiled once for each.
+    start, member = operator.indptr.astype(np.int64), operator.indices.astype(np.int64)
+    blend, point, gradient = (np.ascontiguousarray(part) for part in (rim.blend, rim.point, rim.gradient))
+    turn = pose.scale * pose.rotation
+
+    def fill(first: int, last: int) -> None:
+        fill_rows(
+            first, last, start, member, operator.data, basis.modes, stage.modes, turn, pose.translation, views.rotation,
+            views.translation, rim.view, rim.corner, blend, point, gradient, rows,
+        )  # fmt: skip
+
+    in_threads(len(rows), fill)
+    return rows

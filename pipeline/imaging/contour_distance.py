@@ -1,0 +1,37 @@
+"""Signed distance to a sub-pixel contour: the level set of a smooth field on the pixel grid.
+
+The contour is what marching squares draws between pixel centres. Up to ``BAND_PX`` from it every pixel takes the
+distance to the nearest contour piece, exactly. Farther out nobody needs hundredths of a pixel: there it is a 5 x 5
+chamfer transform of the mask, good to half a pixel and 2 %, blended in over the band's outer third.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from pipeline.imaging.contour_distance_kernels import refine_distance, segments_of_level
+from pipeline.imaging.masks import box_around
+
+BAND_PX = 12
+
+
+def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> Float32[np.ndarray, "h w"]:
+    """Signed distance (px) to the contour ``field == level``; negative where the field is above. +-inf without one."""
+    above = field > level
+    near = box_around(above, BAND_PX + 1)
+    segments = segments_of_level(field[near], level)
+    if not len(segments):
+        return np.where(above, -np.inf, np.inf).astype(np.float32)
+    whole = chamfer(above.view(np.uint8))
+    refine_distance(whole[near], field[near], level, segments, BAND_PX)
+    return whole
+
+
+def chamfer(above: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Signed distance from a mask; a transform ends at pixel centres, half a pixel beyond the contour."""
+    distance = cv2.distanceTransform(1 - above, cv2.DIST_L2, cv2.DIST_MASK_5)
+    distance -= np.float32(0.5)
+    box = box_around(above.view(bool), 1)
+    inside = cv2.distanceTransform(above[box], cv2.DIST_L2, cv2.DIST_MASK_5)
+    distance[box] += above[box] - inside
+    return distance

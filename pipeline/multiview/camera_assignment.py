@@ -1,0 +1,278 @@
+"""Does every camera hold its own picture? Asked of the silhouettes and the calibration, before anything is fitted.
+
+Cables are plugged in the wrong way, files are renamed: then two cameras hold each other's pictures, or three in a ring,
+or all of them are off by one. The planes through two camera centres that touch the subject touch both silhouettes (Wong
+and Cipolla, *Structure and motion from silhouettes*, ICCV 2001), and they do so only where each silhouette stands under
+the camera that saw it: right pictures miss by tenths of a pixel, exchanged ones by tens.
+
+Enters: silhouettes and the rig. Leaves: which picture each camera should have, and how sure that is. A camera that was
+knocked, or whose mask is bad, contradicts the others under every picture and keeps its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, permutations
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.tangency import BORDER_PX, outer_hull
+from rig.camera import Camera
+from rig.rig import Rig
+
+NOISE_LEAST_PX, NOISE_MOST_PX = 0.5, 1.5  # of one tangency: what masks leave, and what exchanges may not hide in
+ROBUST_SIGMAS = 3.0
+INSET_PX = (
+    2.0  # hair that one camera resolves and the other does not: misses of 2.4 px become 0.9 (three quarters: half)
+)
+CUT_OFF_MISFIT = (
+    0.3  # of a tangent that the border hides: neither for nor against, between right (0.03) and wrong (0.7)
+)
+SUSPECT_MISFIT = 0.2  # mean over a camera's tangents above which the search is worth its 0.05 s
+FITTING_MISFIT = (
+    0.28  # mean over all tangents of a camera that holds its own picture: at most 0.25 in 72 exchanges among
+)
+# 3 to 11 cameras; two knocked cameras whose pictures are tried on each other keep 0.34 and more
+NAMED_GAIN = 1.5  # tangents that an exchange explains before it is named: of three cameras that share three at most
+REPAIRED_GAIN = 4.0  # and before it is believed without asking: five planes, met by chance once in 10,000
+CAMERAS_LEAST = 3
+STEPS_OF_A_PIXEL = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assignment:
+    """``pictures``: for every camera that holds another's picture, the name under which its own is filed.
+
+    ``gain`` is how many tangent planes agree that did not before, ``overwhelming`` whether that leaves no doubt.
+    """
+
+    pictures: Mapping[str, str]
+    gain: float = 0.0
+    overwhelming: bool = False
+
+    def __str__(self) -> str:
+        return "; ".join(ring_texts(self.pictures, "pictures"))
+
+
+NOTHING = Assignment({})
+
+
+def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignment:
+    """The permutation of pictures among cameras of one size that the tangent planes ask for; none in a good capture.
+
+    Args:
+        silhouettes: by camera; views without a mask are left out of the question.
+        rig: the cameras as calibrated.
+
+    Returns:
+        An empty assignment where every camera holds its own picture, or where no exchange explains what is wrong.
+    """
+    seen = _with_masks(silhouettes, rig)
+    if len(seen) < CAMERAS_LEAST:
+        return NOTHING
+    hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
+    if not _any_suspect(hulls, seen):
+        return NOTHING
+    misfit = _misfit_tensor(hulls, seen)
+    return _judged(_least_misfit(misfit, seen), misfit, seen)
+
+
+def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, float]:
+    """How much each camera's picture contradicts the others where it is filed: 0.2 for its own, 0.5 and more for
+    another's (mean robust misfit of its tangent planes)."""
+    seen = _with_masks(silhouettes, rig)
+    if len(seen) < CAMERAS_LEAST:
+        return dict.fromkeys(seen.names, CUT_OFF_MISFIT)
+    misses = _own_misses([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
+    return dict(zip(seen.names, _mean_misfit(misses, CUT_OFF_MISFIT).tolist(), strict=True))
+
+
+def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
+    """The rings of an exchange: in (a, b, c) camera a's picture is filed under b, b's under c, and c's under a."""
+    left, found = dict(pictures), []
+    while left:
+        first = min(left)
+        ring, at = [first], left.pop(first)
+        while at != first:
+            ring.append(at)
+            at = left.pop(at)
+        found.append(tuple(ring))
+    return found
+
+
+def ring_texts(pictures: Mapping[str, str], what: str) -> list[str]:
+    """A sentence for every ring of an exchange."""
+    return [_ring_text(ring, what) for ring in rings(pictures)]
+
+
+def _ring_text(ring: tuple[str, ...], what: str) -> str:
+    told = f"{', '.join(ring[:-1])} and {ring[-1]} hold each other's {what}"
+    if len(ring) == 2:
+        return told
+    filed = [f"{name}'s {what} under {ring[(k + 1) % len(ring)]}" for k, name in enumerate(ring)]
+    return f"{told} ({', '.join(filed)})"
+
+
+def _with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
+    return rig.subset(
+        name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
+    )
+
+
+def _any_suspect(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> bool:
+    """Whether any camera's planes contradict the others more than good masks do."""
+    return bool((_mean_misfit(_own_misses(hulls, rig)) > SUSPECT_MISFIT).any())
+
+
+def _own_misses(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
+    """Misses (px of both images together) while every camera holds the picture that is filed under it."""
+    cameras = list(rig)
+    touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
+    angle, step = (np.stack([touch[k][0] for touch in touches]) for k in range(2))
+    return (angle - angle.swapaxes(0, 1)) / np.hypot(step, step.swapaxes(0, 1))
+
+
+def _mean_misfit(misses: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
+    """Robust misfit of each camera, the mean of its planes; of those that the border hides ``cut_off``, or nothing."""
+    there = np.isfinite(misses)
+    of_each = np.where(there, _robust(misses, ROBUST_SIGMAS * _noise_px(misses[there])), cut_off or 0.0)
+    count = there.sum(axis=(1, 2)) if cut_off is None else 2 * (len(misses) - 1)
+    return (of_each.sum(axis=(1, 2)) - (0 if cut_off is None else 2 * cut_off)) / np.maximum(count, 1)
+
+
+def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Assignment:
+    """The permutation as an answer: none where it leaves a camera that it moves in contradiction."""
+    own = np.arange(len(rig))
+    displaced = np.flatnonzero(held != own)
+    if not len(displaced):
+        return NOTHING
+    before, after = (_rows(misfit, pictures)[own, pictures] for pictures in (own, held))
+    mean_after = after / (2 * (len(rig) - 1))
+    gain = float(_cost(misfit, own) - _cost(misfit, held))
+    if gain < NAMED_GAIN or (mean_after[displaced] > FITTING_MISFIT).any() or (after > before)[displaced].any():
+        return NOTHING
+    pictures = {rig.names[i]: rig.names[held[i]] for i in displaced.tolist()}
+    return Assignment(pictures, gain, gain >= REPAIRED_GAIN)
+
+
+def _noise_px(misses: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation (px) of a plane's miss by the best quarter: half of them may be of exchanged pictures."""
+    quarter = float(np.quantile(np.abs(misses), 0.25)) if len(misses) else 0.0
+    return float(np.clip(quarter / 0.3186, NOISE_LEAST_PX, NOISE_MOST_PX))
+
+
+def _robust(miss_px: np.ndarray, scale_px: float) -> np.ndarray:
+    """Misfit of each plane, 0 to 1 (Geman and McClure)."""
+    return miss_px**2 / (miss_px**2 + scale_px**2)
+
+
+def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float32[np.ndarray, "n n n n"]:
+    """Robust misfit of the two outer planes of cameras i and j, were camera i to hold picture a and camera j picture b.
+
+    Of a picture of another size than the camera nothing is said.
+    """
+    cameras, count = list(rig), len(rig)
+    angle, step = np.full((2, count, count, count, 2), np.nan)  # camera i, picture a, the other camera j; top, bottom
+    for i, camera in enumerate(cameras):
+        held = [a for a in range(count) if _size(cameras[a]) == _size(camera)]
+        angle[i, held], step[i, held] = _touches(camera, [hulls[a] for a in held], i, cameras)
+    misses = _own_misses(hulls, rig)
+    scale = ROBUST_SIGMAS * _noise_px(misses[np.isfinite(misses)])
+    misfit = np.zeros((count,) * 4, np.float32)
+    for i, j in permutations(range(count), 2):
+        gap = angle[i, :, j, None, :] - angle[j, None, :, i, :]
+        miss = gap / np.hypot(step[i, :, j, None, :], step[j, None, :, i, :])
+        misfit[i, :, j] = np.where(np.isfinite(miss), _robust(miss, scale), CUT_OFF_MISFIT).sum(axis=-1)
+    return misfit
+
+
+def _touches(
+    camera: Camera, hulls: Sequence[Float[np.ndarray, "_ 2"]], index: int, cameras: Sequence[Camera]
+) -> tuple[Float[np.ndarray, "h n 2"], Float[np.ndarray, "h n 2"]]:
+    """Angles (rad) of the outermost planes through this camera and each other one that touch each of the silhouettes,
+    were it this camera's, and the change of angle a pixel. NaN where the border cuts the tangent off."""
+    pixels, ends = np.concatenate(hulls), np.cumsum([0, *map(len, hulls)])
+    rays = camera.rays_world(pixels)
+    k = camera.intrinsics
+    border = np.minimum(pixels, (k.width - 1, k.height - 1) - pixels).min(axis=1) < BORDER_PX
+    angles = np.full((len(hulls), len(cameras), 2), np.nan)
+    touched = np.zeros((len(hulls), len(cameras), 2), int)
+    frames = {j: _pencil(cameras, index, j) for j in range(len(cameras)) if j != index}
+    for j, (u, v) in frames.items():
+        angle = np.arctan2(rays @ v, rays @ u)
+        for h, (low, high) in enumerate(pairwise(ends)):
+            part = angle[low:high]
+            top, bottom = low + int(np.argmax(part)), low + int(np.argmin(part))
+            touched[h, j] = top, bottom
+            if not angle[top] - angle[bottom] > 2.0:  # else the epipole lies in or near it: no outer tangent
+                angles[h, j] = [np.nan if border[at] else angle[at] for at in (top, bottom)]
+    around = camera.rays_world((pixels[touched][..., None, :] + STEPS_OF_A_PIXEL).reshape(-1, 2))
+    around = around.reshape(*touched.shape, 4, 3)
+    steps = np.full(angles.shape, np.nan)
+    for j, (u, v) in frames.items():
+        turn = np.arctan2(around[:, j] @ v, around[:, j] @ u)
+        steps[:, j] = np.hypot(turn[..., 0] - turn[..., 1], turn[..., 2] - turn[..., 3]) / 2.0
+    return angles + steps * (INSET_PX, -INSET_PX), steps
+
+
+def _pencil(cameras: Sequence[Camera], i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (world) across the line of two camera centres, the same for (i, j) and (j, i): the planes
+    through that line are told apart by their angle, counted from where the two cameras look."""
+    one, two = cameras[min(i, j)], cameras[max(i, j)]
+    axis = two.centre_world - one.centre_world
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
+    towards = one.axis_world + two.axis_world
+    u = towards - axis * (towards @ axis)
+    u = u / max(float(np.linalg.norm(u)), 1e-9)
+    return u, np.cross(axis, u)
+
+
+def _size(camera: Camera) -> tuple[int, int]:
+    return camera.intrinsics.width, camera.intrinsics.height
+
+
+def _least_misfit(misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Int[np.ndarray, " n"]:
+    """The permutation of least misfit, by exchanges of two from the identity: whatever ring an exchange is, each step
+    of it puts one picture right. Where all names are off by the same number, no single step helps, so that those
+    permutations are starts of their own."""
+    count = len(rig)
+    sizes = [_size(camera) for camera in rig]
+    allowed = np.array([[one == two for two in sizes] for one in sizes])
+    identity = np.arange(count)
+    starts = [identity]
+    if allowed.all():
+        starts += [np.roll(identity, shift) for shift in range(1, count)]
+    least = _cost(misfit, identity)
+    starts = [start for start in starts if _cost(misfit, start) <= least]
+    return min((_descended(misfit, start, allowed) for start in starts), key=lambda found: _cost(misfit, found))
+
+
+def _descended(
+    misfit: Float32[np.ndarray, "n n n n"], start: Int[np.ndarray, " n"], allowed: np.ndarray
+) -> Int[np.ndarray, " n"]:
+    held, every = start.copy(), np.arange(len(start))
+    while True:
+        rows = _rows(misfit, held)
+        own = rows[every, held]
+        p, q = np.ix_(every, every)
+        a, b = held[p], held[q]
+        before = own[:, None] + own[None, :] - misfit[p, a, q, b]
+        crossed = rows[p, b] - misfit[p, b, q, b] + rows[q, a] - misfit[q, a, p, a] + misfit[p, b, q, a]
+        gain = np.where(allowed, before - crossed, -np.inf)
+        np.fill_diagonal(gain, -np.inf)
+        one, two = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        if not gain[one, two] > 1e-3:
+            return held
+        held[[one, two]] = held[[two, one]]
+
+
+def _rows(misfit: Float32[np.ndarray, "n n n n"], held: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    """Misfit of camera i under each picture a, all others holding what they hold."""
+    every = np.arange(len(held))
+    return misfit[:, :, every, held].sum(axis=2, dtype=float)
+
+
+def _cost(misfit: Float32[np.ndarray, "n n n n"], held: Int[np.ndarray, " n"]) -> float:
+    every = np.arange(len(held))
+    return float(_rows(misfit, held)[every, held].sum()) / 2.0

@@ -1,0 +1,122 @@
+"""Epipolar tangencies: planes through two camera centres that touch one silhouette touch the other's too.
+
+Enters: two silhouettes and their cameras. Leaves: pairs of contour points that one plane should touch, and by how much
+they miss (Wong and Cipolla, *Structure and motion from silhouettes*, ICCV 2001)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.imaging.silhouette import Silhouette
+from rig.camera import Camera
+from rig.rig import Rig
+
+BORDER_PX = 4.0  # a tangent this near the image border may belong to what the border has cut off
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tangency:
+    """One tangent plane of two cameras: in each camera the pixel where it touches, the unit normal of the epipolar line
+    (px), the plane's change of angle per pixel (rad), and by how many pixels its silhouette reaches beyond the plane
+    that touches the other's."""
+
+    cameras: tuple[str, str]
+    pixels: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]
+    steepness: tuple[float, float]
+    normals: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]
+    excess_px: tuple[float, float]
+
+
+def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Tangency]:
+    """Every pair's outer tangent planes that both images hold whole."""
+    outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name]) for camera in rig}
+    found = []
+    for one, two in combinations(rig, 2):
+        found += _pair(outlines[one.name], outlines[two.name], one, two)
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outline:
+    """The convex hull of a mask: outer tangents touch nothing else."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    rays: Float[np.ndarray, "n 3"]
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, camera: Camera, silhouette: Silhouette) -> "_Outline":
+        hull = outer_hull(silhouette)
+        return cls(hull, camera.rays_world(hull), (camera.intrinsics.width, camera.intrinsics.height))
+
+    def cut(self, i: int) -> bool:
+        x, y = self.pixels[i]
+        return bool(min(x, y, self.size[0] - 1 - x, self.size[1] - 1 - y) < BORDER_PX)
+
+
+def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarray, "n 2"]:
+    """Corners of the convex hull of a mask, on the sub-pixel contour (px); or of the line ``inset_px`` inside it, which
+    strands and specks thinner than twice that do not reach. Empty where nothing is."""
+    inside = silhouette.distance < -inset_px if inset_px else silhouette.mask
+    contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return np.zeros((0, 2))
+    hull = cv2.convexHull(np.concatenate(contours)).reshape(-1, 2).astype(float)
+    return on_contour(hull, silhouette.distance + np.float32(inset_px))
+
+
+def on_contour(pixels: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
+    """Outermost pixel centres moved along the gradient of the signed distance onto the contour itself."""
+    height, width = distance.shape
+    x, y = pixels.astype(int).T
+    left, right = np.maximum(x - 1, 0), np.minimum(x + 1, width - 1)
+    up, down = np.maximum(y - 1, 0), np.minimum(y + 1, height - 1)
+    slope = 0.5 * np.stack([distance[y, right] - distance[y, left], distance[down, x] - distance[up, x]], axis=1)
+    norm = np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 0.5)
+    return pixels - np.clip(distance[y, x], -1.5, 1.5)[:, None] * slope / norm**2
+
+
+def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[Tangency]:
+    base = two.centre_world - one.centre_world
+    axis = base / np.linalg.norm(base)
+    towards = first.rays.mean(axis=0) + second.rays.mean(axis=0)
+    u = towards - axis * (towards @ axis)
+    u /= np.linalg.norm(u)
+    v = np.cross(axis, u)
+    angles = [np.arctan2(outline.rays @ v, outline.rays @ u) for outline in (first, second)]
+    if max(np.ptp(angle) for angle in angles) > 2.0:  # the epipole lies in or near the silhouette: no outer tangent
+        return []
+    found = []
+    for pick in (np.argmax, np.argmin):
+        i, j = int(pick(angles[0])), int(pick(angles[1]))
+        if first.cut(i) or second.cut(j):
+            continue
+        difference = float(angles[0][i] - angles[1][j])
+        slopes = [_angle_slope(one, first.pixels[i], u, v), _angle_slope(two, second.pixels[j], u, v)]
+        steep = [float(np.linalg.norm(slope)) for slope in slopes]
+        if min(steep) < 1e-9:
+            continue
+        normals = (slopes[0] / steep[0], slopes[1] / steep[1])
+        found.append(
+            Tangency(
+                (one.name, two.name),
+                (first.pixels[i], second.pixels[j]),
+                (steep[0], steep[1]),
+                normals,
+                (difference / steep[0], -difference / steep[1]),
+            )
+        )
+    return found
+
+
+def _angle_slope(
+    camera: Camera, pixel: Float[np.ndarray, " 2"], u: np.ndarray, v: np.ndarray
+) -> Float[np.ndarray, " 2"]:
+    """Change of a ray's angle in the pencil of epipolar planes per pixel."""
+    rays = camera.rays_world(pixel + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
+    angle = np.arctan2(rays @ v, rays @ u)
+    return np.array([angle[0] - angle[1], angle[2] - angle[3]]) / 2.0

@@ -1,0 +1,92 @@
+"""A point from its pixels in several views (section 4.2): Levenberg-Marquardt on the reprojection error.
+
+Enters: one pixel per camera. Leaves: the world point with its covariance. The start is the point nearest to all rays
+(linear least squares), and lens distortion is part of the projection, so nothing is undistorted first.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.estimation.levenberg_marquardt import Limits, minimise
+from pipeline.estimation.terms import Problem, Residuals
+from rig.errors import EigenheadError
+from rig.rig import Rig
+
+LIMITS = Limits(steps=50, tolerance=1e-12, tries=6)  # a step of 1e-6 standard deviations
+RAYS_APART_LEAST = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
+
+
+class NoPoint(EigenheadError):
+    """Pixels that determine no point."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(f"{why}; pick the point again, in views that look from clearly different sides")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangulatedPoint:
+    """A world point (mm), its covariance (mm^2), and what each view says against it (measured minus projected, px)."""
+
+    position_world: Float[np.ndarray, " 3"]
+    covariance: Float[np.ndarray, "3 3"]
+    residuals_px: Mapping[str, Float[np.ndarray, " 2"]]
+
+    def misfit(self, noise_px: float) -> float:
+        """Sum of squared residuals in units of the noise: chi-square with ``2 * views - 3`` degrees of freedom."""
+        return sum(float(r @ r) for r in self.residuals_px.values()) / noise_px**2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReprojectionTerm:
+    """``(projected - picked) / noise`` of a world point (mm) in the views of ``pixels``; NaN behind a camera."""
+
+    pixels: Mapping[str, Float[np.ndarray, " 2"]]
+    rig: Rig
+    noise_px: float
+
+    def at(self, position_world: Float[np.ndarray, " 3"]) -> Residuals:
+        views = [self.rig[name].project_with_jacobian(position_world[None]) for name in self.pixels]
+        projected, slopes = (np.concatenate(part) for part in zip(*views, strict=True))
+        miss = projected - np.array([np.asarray(pixel, float) for pixel in self.pixels.values()])
+        return Residuals(miss / self.noise_px, lambda: slopes / self.noise_px)
+
+
+def triangulate(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, *, noise_px: float) -> TriangulatedPoint:
+    """The point that minimises the sum of squared reprojection errors over the cameras in ``pixels``.
+
+    Args:
+        pixels: the picked pixel by camera.
+        noise_px: standard deviation of a picked coordinate; the covariance and the end of the search scale with it.
+
+    Raises NoPoint where fewer than two views, parallel rays or a point behind a camera leave nothing to determine.
+    """
+    if len(pixels) < 2:
+        raise NoPoint(f"{len(pixels)} view of a point; two at least are needed")
+    problem = Problem((ReprojectionTerm(pixels, rig, noise_px),), 3, np.add)
+    start = _start(pixels, rig)
+    at_start = problem.at(start)
+    if not np.isfinite(at_start.cost):
+        raise NoPoint("the rays of a point meet behind a camera")
+    found = minimise(problem, start, LIMITS, at_start=at_start)
+    miss_px = -noise_px * ReprojectionTerm(pixels, rig, noise_px).at(found.value).residual
+    covariance = np.linalg.inv(problem.equations(found.at).matrix)
+    return TriangulatedPoint(found.value, covariance, dict(zip(pixels, miss_px, strict=True)))
+
+
+def _start(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig) -> Float[np.ndarray, " 3"]:
+    """The point with the least sum of squared distances to the rays."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for name, pixel in pixels.items():
+        ray = rig[name].rays_world(np.asarray(pixel, float)[None])[0]
+        off_ray = np.eye(3) - np.outer(ray, ray)
+        normal += off_ray
+        right += off_ray @ rig[name].centre_world
+    if not np.isfinite(normal).all():
+        raise NoPoint("a pixel lies where the lens model of its camera sees nothing")
+    # The smallest eigenvalue is the sum of squared sines between the rays and their mean direction.
+    if np.linalg.eigvalsh(normal)[0] < RAYS_APART_LEAST**2:
+        raise NoPoint("the rays of a point are parallel")
+    return np.linalg.solve(normal, right)

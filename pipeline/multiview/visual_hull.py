@@ -1,0 +1,150 @@
+"""The visual hull (figure 1): the largest body that casts the silhouettes. A comparison, and a start for the pose.
+
+A point's value is its largest signed distance over the views, in mm at its depth, so that the hull's surface is the
+zero level and sub-pixel contours are used as they are. The field is computed on a coarse grid, and on the fine one only
+where the surface can be; naive surface nets (Gibson, *Constrained elastic surface nets*, 1998) make the mesh: a vertex
+in every cell that the surface crosses, a quadrilateral over every edge that it crosses. A hull, even from 50 views, has
+no eye sockets or philtrum; the paper shows it for that.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from pipeline.imaging.projection import packed_lens
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.visual_hull_kernels import COARSE, carve_view, mark_occupied, surface_net
+from rig.camera import Camera
+from rig.errors import EigenheadError
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+SPACING_MM = 3.0
+LEAST_SHARE = 0.5  # of the views must see a point of the hull; where fewer look, anything could be
+
+
+class NoHull(EigenheadError):
+    """The silhouettes have no common body."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the silhouettes have no body in common: cameras.json does not belong to these images, or a mask is wrong"
+        )
+
+
+def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
+    """``mask_extent`` of the usable silhouettes."""
+    return mask_extent({camera.name: silhouettes[camera.name].mask for camera in _believed(silhouettes, rig)}, rig)
+
+
+def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre (world, mm) and edge (mm) of a cube that holds what the masks show; they may be smaller than the images.
+
+    The centre is where the rays through the masks' middles cross, the edge the largest mask's diagonal at that depth.
+    Without a mask it is the place that the cameras look at, and 400 mm.
+    """
+    normal, right, views = 1e-9 * np.eye(3), np.zeros(3), []
+    for name, mask in masks.items():
+        camera = rig[name]
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        scale = camera.intrinsics.width / mask.shape[1]
+        middle = np.array([[(columns[0] + columns[-1]) / 2, (rows[0] + rows[-1]) / 2]])
+        ray = camera.rays_world((middle + 0.5) * scale - 0.5)[0]
+        across = np.eye(3) - np.outer(ray, ray)
+        normal += across
+        right += across @ camera.centre_world
+        views.append((camera, scale * np.hypot(np.ptp(rows), np.ptp(columns))))
+    if not views:
+        return rig.centre_world(), 400.0
+    centre = np.linalg.solve(normal, right)
+    return centre, float(max(diagonal * depth_of(camera, centre) / camera.intrinsics.fx for camera, diagonal in views))
+
+
+def depth_of(camera: Camera, point: Float[np.ndarray, " 3"]) -> float:
+    """Camera z of a point, at least 1 mm."""
+    return max(1.0, float(camera.camera_from_world.apply(point)[2]))
+
+
+def visual_hull(
+    silhouettes: Mapping[str, Silhouette], rig: Rig, *, spacing_mm: float = SPACING_MM, cells: int = 192
+) -> Mesh:
+    """The hull of the usable silhouettes, closed, world frame, mm. Raises NoHull.
+
+    ``cells`` a side at most: a larger subject gets a coarser grid.
+    """
+    centre, edge = hull_extent(silhouettes, rig)
+    views = _believed(silhouettes, rig)
+    blocks = int(np.ceil(min(edge / spacing_mm, cells) / COARSE))
+    field, step = _field(silhouettes, views, centre, edge, blocks)
+    vertices, faces = surface_net(field)
+    if not len(faces):
+        raise NoHull
+    corner = centre - edge / 2
+    return Mesh(vertices.astype(float) * step + corner, faces)
+
+
+def _believed(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Camera]:
+    """The cameras whose silhouettes are usable and not empty."""
+    return [
+        c
+        for c in rig
+        if c.name in silhouettes and silhouettes[c.name].quality.usable and silhouettes[c.name].mask.any()
+    ]
+
+
+def _field(
+    silhouettes: Mapping[str, Silhouette],
+    cameras: list[Camera],
+    centre: Float[np.ndarray, " 3"],
+    edge: float,
+    blocks: int,
+) -> tuple[Float32[np.ndarray, "n n n"], float]:
+    """Signed distance (mm) on a grid of ``COARSE * blocks + 1`` points a side, exact only near the surface."""
+    corner, wide = centre - edge / 2, edge / blocks
+    coarse = np.full((blocks + 1,) * 3, -np.inf, np.float32)
+    votes = np.zeros(coarse.shape, np.int32)
+    everywhere = np.ones((blocks,) * 3, bool)
+    for camera in cameras:
+        carve_view(
+            coarse, votes, everywhere, 1, corner, wide, camera_parameters(camera), silhouettes[camera.name].distance
+        )
+    _settle(coarse, votes, LEAST_SHARE * len(cameras))
+    # The field grows by at most a millimetre a millimetre (and a little: perspective), so that only blocks whose
+    # corners are within their own diagonal of the surface can hold any of it.
+    near = np.abs(coarse) < 1.2 * np.sqrt(3) * wide
+    active = np.zeros((blocks,) * 3, bool)
+    for offset in np.ndindex(2, 2, 2):
+        active |= near[tuple(slice(o, o + blocks) for o in offset)]
+    fine = _spread(coarse)
+    votes = np.zeros(fine.shape, np.int32)
+    exact = np.full(fine.shape, -np.inf, np.float32)
+    step = wide / COARSE
+    for camera in cameras:
+        carve_view(
+            exact, votes, active, COARSE, corner, step, camera_parameters(camera), silhouettes[camera.name].distance
+        )
+    _settle(exact, votes, LEAST_SHARE * len(cameras))
+    known = np.zeros(fine.shape, bool)
+    mark_occupied(known, active)
+    fine = np.where(known, exact, fine)
+    for axis in range(3):  # a closed mesh, also where the images cut the subject off
+        np.moveaxis(fine, axis, 0)[[0, -1]] = wide
+    return fine, step
+
+
+def _spread(coarse: Float32[np.ndarray, "b b b"]) -> Float32[np.ndarray, "n n n"]:
+    """The nearest coarse value at every fine point: only its sign is used."""
+    index = np.arange(COARSE * (coarse.shape[0] - 1) + 1) // COARSE
+    return coarse[np.ix_(index, index, index)]
+
+
+def _settle(field: np.ndarray, votes: np.ndarray, least: float) -> None:
+    """Points that too few views see are outside."""
+    field[votes < max(2.0, least)] = np.float32(1e3)
+
+
+def camera_parameters(camera: Camera) -> Float[np.ndarray, " 22"]:
+    """Rotation, translation and ``packed_lens``, for compiled projections."""
+    pose = camera.camera_from_world
+    return np.concatenate([pose.rotation.ravel(), pose.translation, packed_lens(camera)])

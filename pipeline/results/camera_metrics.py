@@ -1,0 +1,99 @@
+"""How well a fitted head explains every camera: the figures of the report."""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.fit import Fit
+from pipeline.fitting.rim import find_rim, make_topology, pack_views
+from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.imaging.masks import box_around
+from pipeline.imaging.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
+from pipeline.results.reconstruction import CameraFigures
+from rig.camera import Camera
+from rig.geometry import Similarity
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+EXCLUDED_PX = 3.0  # a rim sample farther from the input than this is clutter or misfit, and hardly counts in the fit
+START_LEVEL = "p95"  # of the head before the fit, which is centimetres off: drawn in a third of the time
+ZONE_MARGIN_PX = 4  # how far the face's zone reaches beyond its own hull, so that a face that is too large shows
+
+Masks = Mapping[str, Bool[np.ndarray, "h w"]]
+
+
+def camera_figures(
+    model: HeadModel,
+    fit: Fit,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    fitted: Masks,
+    started: Masks,
+) -> dict[str, CameraFigures]:
+    """Figures of every camera, in the rig's order; rim figures over the face region, none trimmed.
+
+    The cameras stand where their calibration says, not where the fit has moved them.
+    """
+    level = model.levels["full"]
+    vertices = fit.world_from_head.apply(model.vertices(fit.coefficients))
+    views = pack_views(rig, {camera.name: silhouettes[camera.name].distance for camera in rig})
+    rim = find_rim(make_topology(level.faces, level.face_region), vertices, views)
+    face = vertices[level.face_region]
+
+    def figures_of(k: int, camera: Camera) -> CameraFigures:
+        here = rim.view == k
+        length, residual = rim.length[here], rim.residual[here]
+        observed, spoke = silhouettes[camera.name].mask, float(length.sum()) > 0
+        before, after = _costs(observed, started[camera.name], fitted[camera.name])
+        return CameraFigures(
+            used=fit.used.get(camera.name, False),
+            iou=_overlap(observed, fitted[camera.name], _zone(camera, face)),
+            contour_rms_px=float(np.sqrt((length @ residual**2) / length.sum())) if spoke else None,
+            excluded_share=float(length[np.abs(residual) > EXCLUDED_PX].sum() / length.sum()) if spoke else None,
+            xor_cost=after,
+            xor_cost_start=before,
+            samples=int(here.sum()),
+        )
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # distance transforms release the interpreter lock
+        return dict(zip(rig.names, pool.map(figures_of, range(len(rig)), rig), strict=True))
+
+
+def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) -> list[float]:
+    """Eq. (5) of each model. Beyond the box around all of them nothing differs, and nothing there is nearest."""
+    everything = observed.copy()
+    for model in models:
+        everything |= model
+    box = box_around(everything, 1)
+    weights = boundary_weights(observed[box])
+    return [boundary_weighted_xor(observed[box], model[box], weights) for model in models]
+
+
+def _zone(camera: Camera, face_world: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "h w"]:
+    """The hull of the face in the image, a little wider: where hair and shoulders do not decide."""
+    zone = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+    pixels = camera.project(face_world)
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    if len(pixels) > 2:
+        cv2.fillConvexPoly(zone, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
+    size = 2 * ZONE_MARGIN_PX + 1
+    return cv2.dilate(zone, np.ones((size, size), np.uint8)) > 0
+
+
+def _overlap(
+    observed: Bool[np.ndarray, "h w"], fitted: Bool[np.ndarray, "h w"], zone: Bool[np.ndarray, "h w"]
+) -> float | None:
+    """Intersection over union inside the zone."""
+    union = np.count_nonzero((observed | fitted) & zone)
+    return float(np.count_nonzero(observed & fitted & zone) / union) if union else None
+
+
+def start_masks(model: HeadModel, world_from_head: Similarity, rig: Rig) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """The mean head where the alignment put it, as each camera sees it."""
+    vertices = world_from_head.apply(model.vertices(np.zeros(0), START_LEVEL))
+    depths = depth_maps(rig, Mesh(vertices, model.levels[START_LEVEL].faces))
+    return {name: np.isfinite(depth) for name, depth in depths.items()}

@@ -1,0 +1,131 @@
+"""Anthropometric landmarks and distances of a fitted head, with standard deviations by linear propagation.
+
+What enters is a model, a fit and its covariance; what leaves is in the world frame, mm. A landmark is a vertex of the
+model's full level, so with ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the paper's T) its derivatives are exact:
+``s R h_m`` by a coefficient, ``-[x - t]x`` by a left rotation about the head's place, the identity by the translation
+and ``x - t`` by log scale. A distance has ``var = g C g^T``; its rotation and translation parts cancel by themselves.
+
+Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three points that
+are not among the 26 landmarks: the farthest point of the back of the head from the glabella in the midsagittal plane
+(opisthocranion) and the most lateral points of the skull above the ears (euryon). They are found on the fitted head;
+the distance is stationary in their choice, so that its first-order variance does not see the choice. Heads without a
+cranium (face-only models) have no such measurement.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.fit import Fit
+from rig.geometry import cross_matrix
+
+DISTANCES: Mapping[str, tuple[str, str]] = {
+    "head_breadth": ("euryon_right", "euryon_left"),
+    "head_length": ("glabella", "opisthocranion"),
+    "minimum_frontal_breadth": ("frontotemporale_right", "frontotemporale_left"),
+    "bizygomatic_breadth": ("zygion_right", "zygion_left"),
+    "bigonial_breadth": ("gonion_right", "gonion_left"),
+    "bitragion_breadth": ("tragion_right", "tragion_left"),
+    "face_height": ("nasion", "gnathion"),
+    "lower_face_height": ("subnasale", "gnathion"),
+    "nose_length": ("nasion", "subnasale"),
+    "nose_breadth": ("alare_right", "alare_left"),
+    "nose_protrusion": ("subnasale", "pronasale"),
+    "biocular_breadth": ("exocanthion_right", "exocanthion_left"),
+    "intercanthal_breadth": ("endocanthion_right", "endocanthion_left"),
+    "eye_fissure_length_right": ("exocanthion_right", "endocanthion_right"),
+    "eye_fissure_length_left": ("exocanthion_left", "endocanthion_left"),
+    "mouth_breadth": ("cheilion_right", "cheilion_left"),
+    "vermilion_height": ("labiale_superius", "labiale_inferius"),
+}
+EURYON_ABOVE_GLABELLA_MM = 10.0  # Farkas: the ears end at the height of the brows, so that none is above this
+CRANIUM_BEHIND_TRAGION_MM = 40.0  # half of what the smallest adult skull has there; less is a face without a cranium
+MIDSAGITTAL_MM = 5.0  # half width of the band that stands for the midsagittal plane, one edge length of the models
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmark:
+    """A point in the world frame and the standard deviation of each coordinate (mm; None if the fit has none)."""
+
+    position_mm: Float[np.ndarray, " 3"]
+    std_mm: Float[np.ndarray, " 3"] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A length and its standard deviation (mm; None if the fit has none)."""
+
+    value_mm: float
+    std_mm: float | None
+
+
+def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None) -> dict[str, Landmark]:
+    """The model's landmarks on the fitted head, world frame.
+
+    ``vertices``: the head as delivered (full level, world, mm) where it goes beyond the fit; deviations stay the fit's.
+    """
+    names = list(model.landmarks)
+    index = np.array([model.landmarks[name] for name in names])
+    points, jacobian = _points(model, fit, index)
+    points = points if vertices is None else vertices[index]
+    if fit.covariance is None:
+        return {name: Landmark(point, None) for name, point in zip(names, points, strict=True)}
+    variance = np.einsum("nip,pq,niq->ni", jacobian, fit.covariance, jacobian)
+    std = np.sqrt(np.maximum(variance, 0.0))
+    return {name: Landmark(points[i], std[i]) for i, name in enumerate(names)}
+
+
+def measurements(
+    model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None
+) -> dict[str, Measurement]:
+    """Every distance of ``DISTANCES`` whose two points the model has; ``vertices`` as for ``landmarks``."""
+    rows = dict(model.landmarks) | _cranial_points(model, fit)
+    found = {name: ends for name, ends in DISTANCES.items() if ends[0] in rows and ends[1] in rows}
+    index = np.array([[rows[a], rows[b]] for a, b in found.values()], int).reshape(-1)
+    points, jacobian = _points(model, fit, index)
+    points = points if vertices is None else vertices[index]
+    chords = points[1::2] - points[::2]
+    values = np.linalg.norm(chords, axis=1)
+    if fit.covariance is None:
+        return {name: Measurement(float(value), None) for name, value in zip(found, values, strict=True)}
+    units = chords / np.maximum(values, 1e-9)[:, None]
+    gradients = np.einsum("ni,nip->np", units, jacobian[1::2] - jacobian[::2])
+    variances = np.einsum("np,pq,nq->n", gradients, fit.covariance, gradients)
+    stds = np.sqrt(np.maximum(variances, 0.0))
+    return {name: Measurement(float(values[i]), float(stds[i])) for i, name in enumerate(found)}
+
+
+def _points(
+    model: HeadModel, fit: Fit, vertices: np.ndarray
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 p"]]:
+    """World positions of full-level vertices, and their derivative by the parameters in the order of ``Fit``."""
+    place = fit.world_from_head
+    count = len(fit.coefficients)
+    basis = model.basis("full", count, vertices).astype(float)
+    mean = model.levels["full"].operator[vertices] @ model.mean.astype(float)
+    points = place.apply(mean + np.einsum("m,mni->ni", fit.coefficients, basis))
+    by_shape = np.einsum("ij,mnj->nim", place.scale * place.rotation, basis)
+    arms = points - place.translation
+    by_rotation = np.array([-cross_matrix(arm) for arm in arms]).reshape(-1, 3, 3)
+    by_translation = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return points, np.concatenate([by_shape, by_rotation, by_translation, arms[:, :, None]], axis=2)
+
+
+def _cranial_points(model: HeadModel, fit: Fit) -> dict[str, int]:
+    """Euryon right and left and opisthocranion, as full-level vertices, on heads that have a cranium."""
+    if not {"glabella", "tragion_right", "tragion_left"} <= set(model.landmarks):
+        return {}
+    head = model.vertices(fit.coefficients)
+    glabella = head[model.landmarks["glabella"]]
+    _, tragion_y, tragion_z = head[[model.landmarks["tragion_right"], model.landmarks["tragion_left"]]].mean(axis=0)
+    behind = (head[:, 2] < tragion_z - CRANIUM_BEHIND_TRAGION_MM) & (head[:, 1] > tragion_y)  # no nape, no back
+    middle = np.flatnonzero(behind & (np.abs(head[:, 0] - glabella[0]) < MIDSAGITTAL_MM))
+    skull = np.flatnonzero((head[:, 1] > glabella[1] + EURYON_ABOVE_GLABELLA_MM) & (head[:, 2] < tragion_z + 20.0))
+    if not len(middle) or not len(skull):
+        return {}
+    far = middle[np.argmax(np.linalg.norm(head[middle] - glabella, axis=1))]
+    right, left = skull[np.argmin(head[skull, 0])], skull[np.argmax(head[skull, 0])]
+    return {"euryon_right": int(right), "euryon_left": int(left), "opisthocranion": int(far)}

@@ -1,0 +1,148 @@
+"""Pictures of a result: input and fitted contour over each image, the contact sheet, the turntable strip.
+
+A contour is painted straight from a signed distance, ``alpha = half width + 1/2 - |d|``, so that it is antialiased and
+lies where the sub-pixel contour lies. Vermilion and sky blue are told apart by every kind of colour vision
+(Okabe and Ito, *Color Universal Design*,
+https://jfly.uni-koeln.de/color/); a dark rim keeps them readable on any image.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from pipeline.imaging.contour_distance import chamfer
+from pipeline.imaging.cpu_raster import picture
+from pipeline.imaging.masks import box_around
+from rig.camera import Camera, Intrinsics
+from rig.geometry import look_at
+from rig.mesh import Mesh
+
+INPUT_COLOUR = (70, 215, 255)  # sky blue, a little lighter
+FITTED_COLOUR = (255, 110, 20)  # vermilion, a little lighter
+AZIMUTHS_DEG = (-80, -60, -40, -20, 0, 20, 40, 60, 80)
+PANEL = (480, 360)  # width and height of one panel of the contact sheet
+PAPER = (245, 245, 245)
+MARGIN_PX = 16  # around a fitted mask: wider than any line that is painted
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+Resized = UInt8[np.ndarray, "_ _ 3"]  # a picture of any size, whatever others the call has
+
+
+def overlay(
+    image: ImageRgb, input_distance: Float32[np.ndarray, "h w"], fitted_mask: Bool[np.ndarray, "h w"], label: str = ""
+) -> ImageRgb:
+    """The image with the input contour (sky blue) and the fitted head's contour (vermilion)."""
+    line = max(1.0, 1.5 * image.shape[1] / 1024)
+    painted = image.copy()
+    contours = [_near(input_distance, line), _near(_smooth_distance(fitted_mask), line)]
+    for near in contours:
+        _paint(painted, near, (0, 0, 0), line + 1.0, 0.45)
+    for near, colour in zip(contours, (INPUT_COLOUR, FITTED_COLOUR), strict=True):
+        _paint(painted, near, colour, line, 1.0)
+    entries = [(label, (255, 255, 255))] if label else []
+    return legend(painted, [*entries, ("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)])
+
+
+def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:
+    """Eq. (4) at a panel's size, over a pale image: sky blue where only the input is, vermilion only the model."""
+    size = _fitted_size(image)
+    image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    observed, model = (
+        cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in (observed, model)
+    )
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+    shade = np.round(0.35 * np.arange(256) + 150.0)
+    pale, dark = shade.astype(np.uint8), (shade - 60.0).astype(np.uint8)
+    canvas = cv2.cvtColor(np.where(observed & model, dark[grey], pale[grey]), cv2.COLOR_GRAY2RGB)
+    for where, colour in ((observed & ~model, INPUT_COLOUR), (model & ~observed, FITTED_COLOUR)):
+        canvas[where] = (0.25 * canvas[where] + 0.75 * np.array(colour, np.float32)).astype(np.uint8)
+    return canvas
+
+
+def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
+    """Lines of text in the top left corner, each in its colour on a darkened ground."""
+    if not entries:
+        return image
+    scale = max(0.5, image.shape[1] / 1280)
+    line, pad = round(28 * scale), round(8 * scale)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    width = max(cv2.getTextSize(text, font, scale * 0.8, 1)[0][0] for text, _ in entries) + 2 * pad
+    out = image.copy()
+    ground = out[: line * len(entries) + pad, :width]
+    ground[:] = (ground * 0.3).astype(np.uint8)
+    for i, (text, colour) in enumerate(entries):
+        cv2.putText(out, text, (pad, (i + 1) * line - pad // 2), font, scale * 0.8, colour, 1, cv2.LINE_AA)
+    return out
+
+
+def turntable(
+    mesh_head: Mesh, colours: UInt8[np.ndarray, "v 3"], panel: tuple[int, int] = (280, 360)
+) -> list[ImageRgb]:
+    """The head from ``AZIMUTHS_DEG`` around its own y axis, as drawn panels (width, height); twice supersampled."""
+    low, high = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
+    centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    width, height = 2 * panel[0], 2 * panel[1]
+    distance = 6.0 * radius
+    focal = 0.5 * min(width * 1.25, height) * distance / (0.9 * radius)
+    lens = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    def draw(azimuth: float) -> ImageRgb:
+        eye = centre + distance * np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
+        camera = Camera("turntable", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
+        drawn = picture(camera, mesh_head.vertices, mesh_head.faces, colours, PAPER)
+        return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # the rasteriser releases the interpreter lock
+        return list(pool.map(draw, np.radians(AZIMUTHS_DEG)))
+
+
+def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]]) -> Resized:
+    """Rows of labelled pictures, each fitted into a panel of ``PANEL``."""
+    width = max(len(row) for row in rows)
+    blank = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
+    drawn = [[legend(_panel(image), [(text, (255, 255, 255))] if text else []) for text, image in row] for row in rows]
+    return np.vstack([np.hstack(row + [blank] * (width - len(row))) for row in drawn])
+
+
+def _panel(image: ImageRgb) -> Resized:
+    size = _fitted_size(image)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_CUBIC)
+    out = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
+    left, top = (PANEL[0] - size[0]) // 2, (PANEL[1] - size[1]) // 2
+    out[top : top + size[1], left : left + size[0]] = small
+    return out
+
+
+def _fitted_size(image: ImageRgb) -> tuple[int, int]:
+    """Width and height of an image that fills a panel."""
+    scale = min(PANEL[0] / image.shape[1], PANEL[1] / image.shape[0])
+    return max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+
+
+def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """The distance to a binary mask's contour without its stairs, which would make a thin line look broken; taken in
+    the mask's own frame and a margin, infinite outside."""
+    distance = np.full(mask.shape, np.inf, np.float32)
+    own = box_around(mask, MARGIN_PX)
+    if mask[own].size:
+        distance[own] = cv2.GaussianBlur(chamfer(mask[own].view(np.uint8)), (0, 0), 1.0)
+    return distance
+
+
+def _near(distance: Float32[np.ndarray, "h w"], line: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (flat) that a line and its dark rim may touch, and how far they are from its middle."""
+    flat = distance.ravel()
+    index = np.flatnonzero((flat < line / 2 + 1) & (flat > -line / 2 - 1))
+    return index, np.abs(flat[index])
+
+
+def _paint(
+    canvas: ImageRgb, near: tuple[np.ndarray, np.ndarray], colour: tuple[int, int, int], width: float, strength: float
+) -> None:
+    index, distance = near
+    pixels = canvas.reshape(-1, 3)
+    alpha = strength * np.clip(width / 2 + 0.5 - distance, 0.0, 1.0)[:, None]
+    pixels[index] = np.round(pixels[index] + alpha * (np.array(colour, np.float32) - pixels[index]))

@@ -1,0 +1,98 @@
+"""Is the result believable? Checks of a finished fit against what heads, rigs and masks are, each with its own code.
+
+Enters: a fit and the figures of its cameras. Leaves: warnings. Nothing here changes a result;
+``settings.fail_on`` turns codes into failures.
+
+Thresholds stand beside what good captures gave at the deepest level: eyes closed and hair in a real scan (largest
+coefficient 3.5 standard deviations, scale 1.024), a draw of another population (4.3, 1.053).
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.fitting.fit import Fit
+from pipeline.results.reconstruction import CameraFigures
+from rig.errors import EigenheadError
+
+COEFFICIENT_MOST = 4.6  # standard deviations of the largest; the same rig scaled by 0.88 gives 4.6, by 1.12 gives 6.8
+CHANCE_LEAST = 1e-9  # of a sum of squares this large; a posterior mean is shrunk, so that good heads stay far below
+SCALE_OFF_MOST = 0.07  # of size; 0.053 of a head from another population, more of a rig whose unit is wrong
+CONTOUR_MOST_PX_PER_WIDTH = 0.05  # 50 px of 1024: hair moves a rim by half of that
+CONTOUR_TIMES_MEDIAN = 6.0  # and this many times what the other cameras have
+
+
+class ImplausibleResult(EigenheadError):
+    """A result with warnings that the settings do not let pass."""
+
+    def __init__(self, warnings: Sequence[ReportWarning]) -> None:
+        super().__init__("; ".join(f"{w.code}: {w.message}" for w in warnings) + " (settings.fail_on)")
+
+
+def plausibility_warnings(
+    fit: Fit, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
+) -> list[ReportWarning]:
+    """What speaks against a result.
+
+    Args:
+        fit: coefficients in standard deviations; scale against the model's own size.
+        cameras: contour residuals of every camera.
+        widths_px: of the pictures, by camera.
+    """
+    return [
+        *_shape(fit.coefficients),
+        *_scale(fit.world_from_head.scale),
+        *_contours(cameras, widths_px),
+    ]
+
+
+def refuse(warnings: Iterable[ReportWarning], fail_on: Sequence[str]) -> None:
+    """Raises ImplausibleResult where a warning has one of the codes that the settings name."""
+    fatal = [warning for warning in warnings if warning.code in fail_on]
+    if fatal:
+        raise ImplausibleResult(fatal)
+
+
+def _shape(coefficients: Float[np.ndarray, " m"]) -> list[ReportWarning]:
+    """Against the prior z ~ N(0, 1): the largest, and the sum of squares."""
+    if not len(coefficients):
+        return []
+    largest = float(np.abs(coefficients).max())
+    total = float(coefficients @ coefficients)
+    if largest <= COEFFICIENT_MOST and float(chi2.sf(total, len(coefficients))) >= CHANCE_LEAST:
+        return []
+    told = (
+        f"the head is farther from the model's mean than heads are: {largest:.1f} standard deviations in one mode, "
+        f"{np.sqrt(total / len(coefficients)):.2f} RMS. Look at the overlays; check calibration and masks"
+    )
+    return [ReportWarning("shape-implausible", told)]
+
+
+def _scale(scale: float) -> list[ReportWarning]:
+    if abs(float(np.log(scale))) <= SCALE_OFF_MOST:
+        return []
+    told = (
+        f"the head came out at {scale:.3f} of the size that its shape says: "
+        "check the board's square size and the unit of the translations"
+    )
+    return [ReportWarning("scale-implausible", told)]
+
+
+def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]) -> list[ReportWarning]:
+    """Cameras that take part and whose contour the head misses by far more than it misses the others'."""
+    rms = {name: of.contour_rms_px for name, of in cameras.items() if of.used and of.contour_rms_px is not None}
+    if not rms:
+        return []
+    median = float(np.median([rms[name] / widths_px[name] for name in rms]))
+    limit = max(CONTOUR_MOST_PX_PER_WIDTH, CONTOUR_TIMES_MEDIAN * median)
+    return [
+        ReportWarning(
+            "contour-implausible",
+            f"{name}: the head misses its contour by {of:.0f} px RMS: look at overlays/{name}.png",
+        )
+        for name, of in rms.items()
+        if of / widths_px[name] > limit
+    ]

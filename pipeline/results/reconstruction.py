@@ -1,0 +1,68 @@
+"""What a reconstruction is: the value that ``reconstruct()`` fills and ``pipeline.results.write`` writes.
+
+It holds everything that the result folder shows and nothing that depends on where or when it was made, apart from the
+seconds that the stages took (those reach report.json only, never head.ply).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from pipeline.diagnostics import Detail, ReportWarning
+from pipeline.fitting.fit import Fit
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.results.bust import Bust
+from pipeline.results.measurements import Landmark, Measurement
+from pipeline.settings import Settings
+from pipeline.texture.uv_unwrap import Atlas
+from rig.mesh import Mesh
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFigures:
+    """How well the fitted head explains one camera.
+
+    ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none trimmed; ``excluded_share`` is the
+    part of them (0 to 1) that the fit did not believe. ``xor_cost`` is eq. (5) of the fitted head, ``xor_cost_start``
+    of the head that the fit started from. A figure that a view cannot have (no rim sample in it) is None.
+    """
+
+    used: bool
+    iou: float | None
+    contour_rms_px: float | None
+    xor_cost: float | None
+    xor_cost_start: float | None = None
+    excluded_share: float | None = None
+    samples: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """A textured head in the world frame with its evidence. Mappings by camera have every camera of the rig."""
+
+    fit: Fit
+    model_name: str
+    model_sha256: str
+    mesh_world: Mesh  # full level, mm
+    normals: Float[np.ndarray, "v 3"]
+    colours: UInt8[np.ndarray, "v 3"]  # sRGB
+    views: UInt8[np.ndarray, " v"]  # images that coloured a vertex, 0 = filled from its neighbours
+    quality_mm: Float[np.ndarray, " v"]  # posterior standard deviation
+    silhouettes: Mapping[str, Silhouette]
+    start_masks: Mapping[str, Bool[np.ndarray, "h w"]]  # the head that the fit started from, as each camera sees it
+    fitted_masks: Mapping[str, Bool[np.ndarray, "h w"]]
+    cameras: Mapping[str, CameraFigures]
+    landmarks: Mapping[str, Landmark]  # world frame
+    measurements: Mapping[str, Measurement]
+    front: str
+    settings: Settings
+    digests: Mapping[str, str]  # sha256 of every input file
+    seconds: Mapping[str, float]  # per stage, and "total"
+    warnings: tuple[ReportWarning, ...] = ()
+    detail: Detail = field(default_factory=lambda: Detail("span", "not stated"))
+    gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
+    pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
+    atlas: Atlas | None = None  # where the settings ask for it
+    bust: Bust | None = None  # where the settings ask for it and the photographs carry it

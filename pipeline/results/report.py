@@ -1,0 +1,114 @@
+"""``report.json`` of a result (format ``eigenhead-report/1``): everything that a program may want to know of it."""
+
+import math
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from pipeline.dense.surface.parts_by_place import PART_NAMES
+from pipeline.imaging.silhouette import ViewQuality
+from pipeline.results.bust import Bust
+from pipeline.results.reconstruction import CameraFigures, Reconstruction
+from pipeline.settings import document_from_settings
+from rig.geometry import Similarity
+from rig.mesh import boundary_edges
+
+FORMAT = "eigenhead-report/1"
+
+
+def report_document(result: Reconstruction) -> dict[str, Any]:
+    """The decoded report: JSON types only, every number finite (what is not known is null)."""
+    filled = int(np.count_nonzero(result.views == 0))
+    document = {
+        "format": FORMAT,
+        "version": version("eigenhead"),
+        "model": {"name": result.model_name, "sha256": result.model_sha256},
+        "method": result.fit.method,
+        "detail": {"level": result.detail.level, "reason": result.detail.reason},
+        "front": result.front,
+        "cameras": {name: _camera(result, name, figures) for name, figures in result.cameras.items()},
+        "pictures": dict(result.pictures),  # by camera, the name under which its own is filed
+        "coefficients": result.fit.coefficients,
+        "world_from_head": similarity_document(result.fit.world_from_head),
+        "landmarks": {k: {"position": p.position_mm, "std": p.std_mm} for k, p in result.landmarks.items()},
+        "measurements": {k: {"value": m.value_mm, "std": m.std_mm} for k, m in result.measurements.items()},
+        "quality": {"median": np.median(result.quality_mm), "max": result.quality_mm.max()},
+        "texture": {"vertices": len(result.views), "filled": filled, "gains": result.gains},
+        "bust": None if result.bust is None else _bust(result.bust),
+        "evaluations": result.fit.evaluations,
+        "stopped_because": result.fit.stopped_because,
+        "seconds": {"total": sum(result.seconds.values())} | dict(result.seconds),
+        "settings": document_from_settings(result.settings),
+        "inputs": dict(result.digests),
+        "warnings": [{"code": w.code, "message": w.message} for w in result.warnings],
+    }
+    return _plain(document)
+
+
+def similarity_document(transform: Similarity) -> dict[str, Any]:
+    """The paper's form ``x_world = s (R x_head + t)``: its translation is ours divided by the scale."""
+    return {
+        "scale": transform.scale,
+        "rotation": transform.rotation,
+        "translation": transform.translation / transform.scale,
+    }
+
+
+def _bust(bust: Bust) -> dict[str, Any]:
+    """Of the whole visible surface; ``closed``: every edge has two faces."""
+    surface = bust.surface
+    return {
+        "spacing_mm": bust.spacing_mm,
+        "vertices": len(bust.views),
+        "faces": len(surface.mesh_world.faces),
+        "seen_share": np.mean(surface.seen),
+        "closed": len(boundary_edges(surface.mesh_world.faces)) == 0,
+        "parts": {name: np.mean(surface.part == code) for code, name in enumerate(PART_NAMES)},
+        "quality": {"median_seen": np.median(surface.deviation_mm[surface.seen]), "max": surface.deviation_mm.max()},
+        "filled": int(np.count_nonzero(bust.views == 0)),
+    }
+
+
+def _camera(result: Reconstruction, name: str, figures: CameraFigures) -> dict[str, Any]:
+    silhouette = result.silhouettes.get(name)
+    shift = result.fit.camera_shift.get(name)
+    return {
+        "used": figures.used,
+        "iou": figures.iou,
+        "contour_rms_px": figures.contour_rms_px,
+        "excluded_share": figures.excluded_share,
+        "samples": figures.samples,
+        "xor_cost": figures.xor_cost,
+        "xor_cost_start": figures.xor_cost_start,
+        "camera_shift": shift,  # rotation (rad) and translation (mm), left perturbation of camera_from_world
+        "view": None if silhouette is None else _quality(silhouette.quality),
+    }
+
+
+def _quality(quality: ViewQuality) -> dict[str, Any]:
+    return {
+        "usable": quality.usable,
+        "contrast": quality.contrast,
+        "cut_off": list(quality.cut_off),
+        "components": quality.components,
+        "holes": quality.holes,
+        "warnings": list(quality.warnings),
+        "figures": quality.figures,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """NumPy to JSON types; what is not finite becomes null, because JSON has no word for it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

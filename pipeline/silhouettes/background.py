@@ -1,0 +1,152 @@
+"""What the clean plate would look like behind the subject, at the moment of the shot.
+
+Between plate and shot the lamps drift and a camera may change its exposure, so the plate is multiplied by a smooth gain
+field, one a channel, found from the pixels that still look like the plate. The start is the mode of the log ratio: it
+is the background's, however large the subject, because the subject's ratios have no common value. Noise is measured
+from what is left: as a curve over brightness (photon noise grows with it), and by pixel where several plates show more.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from pipeline.settings import SegmentationSettings
+
+CHANNEL_SUM = np.ones(3, np.float32)  # a product with it sums the channels ten times faster than .sum(axis=2)
+LEVEL_BINS = 8  # bins of brightness in the noise curve
+TUKEY = 4.685  # residuals (in standard deviations) beyond which a pixel says nothing of the background
+STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after the third
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Background:
+    """The plate as it would look now, its noise against the image, and how sure that is."""
+
+    plates: UInt8[np.ndarray, "p h w 3"]
+    field: Float32[np.ndarray, "hc wc 3"]  # what their mean is multiplied by
+    coarse: Float32[np.ndarray, "hc wc 3"]  # the product (levels), averaged to the coarse level
+    noise: Float32[np.ndarray, "hc wc 3"]  # standard deviation (levels) of image minus expected, one full-size pixel
+    inliers: Bool[np.ndarray, "hc wc"]  # coarse pixels that look like the plate
+    gain: Float32[np.ndarray, " 3"]  # median of the field, RGB
+
+
+def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
+    """Width and height of the coarse level: the integer reduction that comes nearest to ``width`` columns."""
+    factor = max(1, round(shape[1] / width))
+    return max(1, shape[1] // factor), max(1, shape[0] // factor)
+
+
+def estimate_background(
+    image: UInt8[np.ndarray, "h w 3"],
+    image_coarse: Float32[np.ndarray, "hc wc 3"],
+    plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...],
+    settings: SegmentationSettings,
+) -> Background:
+    """Fits the plates to an image in which the subject stands."""
+    size = (image_coarse.shape[1], image_coarse.shape[0])
+    small = np.stack([cv2.resize(plate, size, interpolation=cv2.INTER_AREA) for plate in plates]).astype(np.float32)
+    plate_coarse = small.mean(axis=0)
+    few = (slice(None, None, 2), slice(None, None, 2))  # a histogram and a median need no more
+    gain = np.array(
+        [_mode_of_ratio(image_coarse[few][:, :, c], plate_coarse[few][:, :, c]) for c in range(3)], np.float32
+    )
+    field = np.broadcast_to(gain, plate_coarse.shape)
+    tolerance = settings.tolerance_levels + settings.tolerance_share * plate_coarse
+    weight = np.zeros(plate_coarse.shape[:2], np.float32)
+    for step in range(STEPS):
+        # The first steps must let the unknown field pass: 3 % of the level, then less.
+        slack = tolerance + plate_coarse * (0.03, 0.015, 0.0, 0.0)[step]
+        weight = _tukey(((image_coarse - field * plate_coarse) / slack) ** 2)
+        field = _gain_field(image_coarse, plate_coarse, weight, settings.field_share * size[0])
+    inliers = weight > 0.3
+    stack = np.stack(plates)
+    noise = _noise_by_level(image, stack, field, plate_coarse, inliers)
+    noise = _with_temporal_noise(noise, small)
+    middle = np.median(field[few][inliers[few]], axis=0) if inliers[few].any() else gain
+    return Background(stack, field, field * plate_coarse, noise, inliers, middle.astype(np.float32))
+
+
+def _mode_of_ratio(image: Float32[np.ndarray, "h w"], plate: Float32[np.ndarray, "h w"]) -> float:
+    """The most frequent ratio of image to plate, between a third and three."""
+    usable = (plate > 8) & (image > 4) & (plate < 250) & (image < 250)  # neither black nor clipped
+    if usable.sum() < 100:
+        return 1.0
+    logs = np.log(image[usable] / plate[usable])
+    counts, edges = np.histogram(logs, bins=220, range=(-1.1, 1.1))
+    smooth = np.convolve(counts, [1, 2, 3, 2, 1], mode="same")
+    centre = (edges[:-1] + edges[1:])[np.argmax(smooth)] / 2
+    near = logs[np.abs(logs - centre) < 0.04]
+    return float(np.exp(np.median(near))) if len(near) else 1.0
+
+
+def _tukey(square: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+    """Tukey's biweight of the worst channel."""
+    worst = np.maximum(np.maximum(square[:, :, 0], square[:, :, 1]), square[:, :, 2]) / TUKEY**2
+    return np.where(worst < 1, (1 - worst) ** 2, 0).astype(np.float32)
+
+
+def _gain_field(
+    image: Float32[np.ndarray, "h w 3"],
+    plate: Float32[np.ndarray, "h w 3"],
+    weight: Float32[np.ndarray, "h w"],
+    sigma: float,
+) -> Float32[np.ndarray, "h w 3"]:
+    """Local least squares ``image = gain * plate`` in a Gaussian window, drawn to the whole image's gain where there
+    is no background nearby."""
+    weighted = plate * cv2.merge([weight] * 3)
+    size = (max(8, image.shape[1] // 4), max(8, image.shape[0] // 4))  # a smooth field needs no more
+    num = cv2.resize(weighted * image, size, interpolation=cv2.INTER_AREA)
+    den = cv2.resize(weighted * plate, size, interpolation=cv2.INTER_AREA)
+    whole = num.sum((0, 1)) / np.maximum(den.sum((0, 1)), 1e-6) if weight.any() else np.ones(3)
+    ridge = 0.02 * den.mean((0, 1)) + 1e-3
+    num, den = (cv2.GaussianBlur(a, (0, 0), max(1.0, sigma / 4), borderType=cv2.BORDER_REPLICATE) for a in (num, den))
+    field = (num + ridge * whole) / (den + ridge)
+    return cv2.resize(field, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32)
+
+
+def _image_noise(image: UInt8[np.ndarray, "h w 3"], plates: UInt8[np.ndarray, "p h w 3"]) -> Float32[np.ndarray, " 3"]:
+    """Standard deviation of image minus plate from differences of neighbours, which no light drift can reach."""
+    pairs = [image[::8, x::4].astype(np.float32) - plates[:, ::8, x::4].mean(axis=0) for x in (0, 1)]
+    columns = min(pair.shape[1] for pair in pairs)
+    steps = pairs[1][:, :columns] - pairs[0][:, :columns]
+    return (1.4826 * np.median(np.abs(steps), axis=(0, 1)) / np.sqrt(2)).astype(np.float32) + 0.3
+
+
+def _noise_by_level(
+    image: UInt8[np.ndarray, "h w 3"],
+    plates: UInt8[np.ndarray, "p h w 3"],
+    field: Float32[np.ndarray, "hc wc 3"],
+    plate_coarse: Float32[np.ndarray, "hc wc 3"],
+    inliers: Bool[np.ndarray, "hc wc"],
+) -> Float32[np.ndarray, "hc wc 3"]:
+    """The noise (levels) of every coarse pixel, from a curve over brightness that the background pixels draw."""
+    rows, columns = np.arange(3, image.shape[0], 6), np.arange(3, image.shape[1], 6)  # 20,000 samples are enough
+    at = np.ix_(rows * inliers.shape[0] // image.shape[0], columns * inliers.shape[1] // image.shape[1])
+    kept = inliers[at]
+    wanted = (plates[:, 3::6, 3::6].mean(axis=0, dtype=np.float32) * field[at])[kept]
+    residual, level = np.abs(image[3::6, 3::6][kept] - wanted), wanted @ np.full(3, 1 / 3, np.float32)
+    which = np.minimum((level * (LEVEL_BINS / 256)).astype(np.int32), LEVEL_BINS - 1)
+    centres, curve = [], []
+    for k in range(LEVEL_BINS):
+        if np.count_nonzero(which == k) >= 200:
+            centres.append((k + 0.5) * 256 / LEVEL_BINS)
+            curve.append(1.4826 * np.median(residual[which == k], axis=0))
+    if not centres:
+        return np.broadcast_to(_image_noise(image, plates), plate_coarse.shape).astype(np.float32)
+    brightness = plate_coarse @ np.full(3, 1 / 3, np.float32)
+    channels = [np.interp(brightness, centres, np.array(curve)[:, c]) for c in range(3)]
+    # 8-bit rounding of both images alone is worth sqrt(2 / 12) levels.
+    return np.maximum(np.stack(channels, axis=2), np.sqrt(2 / 12)).astype(np.float32)
+
+
+def _with_temporal_noise(
+    noise: Float32[np.ndarray, "hc wc 3"], plates: Float32[np.ndarray, "p hc wc 3"]
+) -> Float32[np.ndarray, "hc wc 3"]:
+    """Adds what several plates show beyond the curve: a flickering lamp, a curtain that moves."""
+    if len(plates) < 3:
+        return noise
+    small = plates / np.maximum(plates.mean(axis=(1, 2), keepdims=True), 1.0)  # changes of exposure are not noise
+    spread = small.std(axis=0, ddof=1) * plates.mean()
+    return np.sqrt(noise**2 + cv2.blur(spread**2, (3, 3))).astype(np.float32)

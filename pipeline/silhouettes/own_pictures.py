@@ -1,0 +1,206 @@
+"""Every camera's own picture under its own name, before anything is measured in it.
+
+Enters: a capture as it is filed, and a way to segment it. Leaves: capture and silhouettes as they should be filed, and
+what was found. A plate that belongs to another camera's picture makes no mask of use, so that plates are matched to
+pictures first, by what they show beside the subject; then the pictures, with their plates, are matched to cameras
+(``pipeline.multiview.camera_assignment``).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+from scipy.optimize import linear_sum_assignment
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.camera_assignment import FITTING_MISFIT, Assignment, find_assignment, own_misfit, ring_texts
+from pipeline.multiview.triangulation import NoPoint, triangulate
+from rig.capture import Capture, Features, refiled
+from rig.errors import EigenheadError
+from rig.rig import Rig
+
+PLATE_SEEN = (
+    0.6  # share of a picture that its plate explains, below which other plates are tried; 0.6 to 0.8 in good ones
+)
+PLATE_GAIN = 1.3  # how many times as much of each picture the other plates must explain; another's explains 0 to 0.5
+PLATE_COLUMNS = 64
+PLATE_TOLERANCE = 0.06  # of log level: 2 % of light drift, vignetting, and noise averaged over 16 x 16 pixels
+CLICK_PX, CLICK_MISFIT_MOST = 1.5, 50.0
+
+Segmentation = Callable[[Capture], dict[str, Silhouette]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnPictures:
+    """A capture and its silhouettes with every picture under its own camera; ``pictures`` and ``plates`` say, for each
+    camera that was given another's, the name under which its own is filed."""
+
+    capture: Capture
+    silhouettes: Mapping[str, Silhouette]
+    pictures: Mapping[str, str]
+    plates: Mapping[str, str]
+    warnings: tuple[ReportWarning, ...]
+
+
+class ExchangedPictures(EigenheadError):
+    """Pictures filed under other cameras' names, and no leave or not enough evidence to file them back."""
+
+    def __init__(self, found: str, *, doubtful: bool) -> None:
+        reason = "too few tangent planes say so to exchange them unasked" if doubtful else "the settings refuse to"
+        super().__init__(f"{found}; {reason}. File every picture under the name of the camera that took it")
+
+
+def own_pictures(
+    capture: Capture, rig: Rig, segmented: Segmentation, *, exchanged: Literal["repair", "refuse"]
+) -> OwnPictures:
+    """Segments a capture, and files exchanged pictures and plates back.
+
+    Args:
+        capture: as it was read.
+        rig: the cameras as calibrated.
+        segmented: the silhouettes of a capture; called again for every change of what is filed where.
+        exchanged: what to do about an exchange that is beyond doubt.
+
+    Raises:
+        ExchangedPictures: an exchange that may not be repaired, or is not sure enough to be.
+    """
+    plates = misplaced_plates(capture, rig)
+    if plates and exchanged == "refuse":
+        raise ExchangedPictures("; ".join(ring_texts(plates, "clean plates")), doubtful=False)
+    capture = refiled(capture, plates=plates) if plates else capture
+    silhouettes = segmented(capture)
+    duplicates = duplicate_views(capture, silhouettes, rig)
+    distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
+    assignment = find_assignment(distinct, rig)
+    if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
+        raise ExchangedPictures(str(assignment), doubtful=not assignment.overwhelming)
+    if assignment.pictures:
+        capture = _filed_back(capture, assignment.pictures, rig)
+        silhouettes = segmented(capture)
+        plates = _composed(plates, assignment.pictures)
+    warnings = _warnings(assignment, plates, duplicates)
+    return OwnPictures(capture, _left_out(silhouettes, duplicates), assignment.pictures, plates, warnings)
+
+
+def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
+    """For cameras whose clean plate is another camera's, the name under which their own is filed.
+
+    Asked only where pictures hardly look like their plates; a permutation is believed where every plate in it explains
+    clearly more of the picture that it is given to.
+    """
+    named = [name for name in rig.names if name in capture.images and capture.backgrounds.get(name)]
+    pictures = {name: _thumbnail(capture.images[name]) for name in named}
+    plates = {name: _thumbnail(capture.backgrounds[name][0]) for name in named}
+    asked = [name for name in named if _common_share(pictures[name], plates[name]) < PLATE_SEEN]
+    share = np.array([[_common_share(pictures[name], plates[other]) for other in asked] for name in asked])
+    if len(asked) < 2:
+        return {}
+    best = linear_sum_assignment(-share)[1]
+    moved = np.flatnonzero(best != np.arange(len(asked)))
+    clear = share[moved, best[moved]] > PLATE_GAIN * share[moved, moved]
+    return {asked[i]: asked[best[i]] for i in moved.tolist()} if clear.all() else {}
+
+
+def _thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]:
+    """Log levels at PLATE_COLUMNS columns."""
+    rows = max(1, round(image.shape[0] * PLATE_COLUMNS / image.shape[1]))
+    small = cv2.resize(image, (PLATE_COLUMNS, rows), interpolation=cv2.INTER_AREA)
+    return np.log(small.astype(np.float32) + 1.0)
+
+
+def _common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
+    """Share of a picture that is the plate under another exposure."""
+    if picture.shape != plate.shape:
+        return 0.0
+    ratio = (picture - plate).reshape(-1, 3)
+    edges = np.arange(-1.5, 1.5, PLATE_TOLERANCE / 2)
+    exposure = [edges[int(np.argmax(np.histogram(channel, edges)[0]))] for channel in ratio.T]
+    return float((np.abs(ratio - exposure) < PLATE_TOLERANCE).all(axis=1).mean())
+
+
+def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
+    """Cameras that hold, pixel for pixel, the picture of another one, and that other: noise never repeats.
+
+    The picture is left to the camera whose silhouette contradicts the others least, if any.
+    """
+    groups: list[list[str]] = []
+    for name in (name for name in rig.names if name in capture.images):
+        image = capture.images[name]
+        same = next((group for group in groups if _same(capture.images[group[0]], image)), None)
+        if same is not None:
+            same.append(name)
+        elif image.min() < image.max():  # a black picture is a fault of its own
+            groups.append([name])
+    found: dict[str, str] = {}
+    for group in groups:
+        if len(group) > 1:
+            others = {name: silhouettes[name] for name in silhouettes if name not in group}
+            misfit = {name: own_misfit({**others, name: silhouettes[name]}, rig).get(name, 1.0) for name in group}
+            owner = min(group, key=lambda name: misfit[name])
+            found |= {name: owner for name in group if name != owner}
+            if misfit[owner] > FITTING_MISFIT:
+                found[owner] = next(name for name in group if name != owner)
+    return found
+
+
+def _same(one: UInt8[np.ndarray, "_ _ 3"], two: UInt8[np.ndarray, "_ _ 3"]) -> bool:
+    step = (slice(None, None, 61), slice(None, None, 7))
+    return one.shape == two.shape and np.array_equal(one[step], two[step]) and np.array_equal(one, two)
+
+
+def _left_out(silhouettes: Mapping[str, Silhouette], names: Mapping[str, str]) -> dict[str, Silhouette]:
+    return {
+        name: replace(s, quality=replace(s.quality, usable=False)) if name in names else s
+        for name, s in silhouettes.items()
+    }
+
+
+def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[str, str]:
+    """Where each camera's plates are filed, plates having been matched to pictures before pictures to cameras."""
+    found = {}
+    for name in plates.keys() | pictures.keys():
+        picture = pictures.get(name, name)
+        found[name] = plates.get(picture, picture)
+    return {name: filed for name, filed in sorted(found.items()) if filed != name}
+
+
+def _filed_back(capture: Capture, pictures: Mapping[str, str], rig: Rig) -> Capture:
+    """Pictures and plates under their cameras. Points may have been picked in the pictures as they were filed, or
+    before: whichever contradicts itself less."""
+    moved = refiled(capture, pictures=pictures, plates=pictures, points=pictures)
+    kept = replace(moved, features=capture.features)
+    return min((moved, kept), key=lambda filed: _contradiction(filed.features, rig))
+
+
+def _contradiction(features: Features, rig: Rig) -> float:
+    """Misfit of all points that two views or more show."""
+    total = 0.0
+    for views in features.values():
+        known = {name: pixel for name, pixel in views.items() if name in rig}
+        if len(known) > 1:
+            try:
+                misfit = triangulate(known, rig, noise_px=CLICK_PX).misfit(CLICK_PX)
+            except NoPoint:
+                misfit = CLICK_MISFIT_MOST
+            total += min(misfit, CLICK_MISFIT_MOST)
+    return total
+
+
+def _warnings(
+    assignment: Assignment, plates: Mapping[str, str], duplicates: Mapping[str, str]
+) -> tuple[ReportWarning, ...]:
+    found = []
+    if assignment.pictures:
+        told = f"{assignment}: they were put right for this result. Put the cables or the files right"
+        found.append(ReportWarning("cameras-exchanged", told))
+    if plates and not assignment.pictures:
+        told = "; ".join(ring_texts(plates, "clean plates"))
+        found.append(ReportWarning("plates-exchanged", f"{told}: they were put right for this result"))
+    for name, owner in duplicates.items():
+        told = f"{name} holds the same picture as {owner} and is left out: look what became of its own"
+        found.append(ReportWarning("picture-duplicated", told))
+    return tuple(found)

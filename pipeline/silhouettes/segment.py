@@ -1,0 +1,182 @@
+"""Background subtraction (section 5.4): a capture to one silhouette a camera.
+
+``pipeline.silhouettes.foreground`` decides what is subject, asking the other cameras where it is in doubt;
+``pipeline.silhouettes.matting`` then finds the sub-pixel contour, and ``pipeline.silhouettes.view_consistency``
+compares what the cameras say.
+
+The paper says only "background subtraction". A view whose mask cannot be trusted is reported: ``quality.usable`` is
+False where it would hurt a fit, and ``quality.warnings`` say why. Operator masks override everything.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from pipeline.imaging.contour_distance import distance_to_level
+from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
+from pipeline.settings import SegmentationSettings
+from pipeline.silhouettes.background import Background
+from pipeline.silhouettes.cross_view import ask_the_others
+from pipeline.silhouettes.foreground import Decision, decide, doubtful, reconsider
+from pipeline.silhouettes.matting import Matte, solve_matte
+from pipeline.silhouettes.view_consistency import judge_agreement
+from rig.capture import Capture
+from rig.errors import InputError
+from rig.rig import Rig
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise
+NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise
+LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
+
+
+def segment(
+    capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Callable[[str, float], None]
+) -> dict[str, Silhouette]:
+    """The silhouette of every camera of the rig. Raises InputError where a camera has neither plate nor mask."""
+    blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
+    if blind:
+        raise InputError(
+            "capture", [f"{name} has neither a clean plate nor a mask: record one of them" for name in blind]
+        )
+    silhouettes: dict[str, Silhouette] = {}
+    with ThreadPoolExecutor(max_workers=2) as pool:  # cv2 and the compiled kernels release the interpreter lock
+        given = {
+            name: pool.submit(_operators, capture.masks[name], settings) for name in rig.names & capture.masks.keys()
+        }
+        jobs = {
+            name: pool.submit(decide, capture.images[name], capture.backgrounds[name], settings)
+            for name in rig.names
+            if name not in given
+        }
+        decisions = {name: job.result() for name, job in jobs.items()}
+        masks = {name: decision.mask for name, decision in decisions.items()}
+        masks |= {name: job.result().mask for name, job in given.items()}
+
+        def finish(name: str) -> Silhouette:
+            decision = decisions[name]
+            doubt = doubtful(decision)
+            if doubt.any():
+                decision = reconsider(decision, ask_the_others(doubt, name, masks, rig), settings)
+            return _refined(capture.images[name], decision, settings)
+
+        finished = {name: pool.submit(finish, name) for name in decisions}
+        for count, name in enumerate(rig.names, 1):
+            silhouettes[name] = (given | finished)[name].result()
+            report("segmentation", 0.4 + 0.5 * count / len(rig))
+    agreed = judge_agreement(silhouettes, rig, settings)
+    report("segmentation", 1.0)
+    return agreed
+
+
+def _operators(mask: Bool[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
+    return replace(silhouette_from_mask(mask), quality=_mask_quality(mask, settings))
+
+
+def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Silhouette:
+    """The silhouette of one image against its clean plates, without the other cameras' help."""
+    return _refined(image, decide(image, plates, settings), settings)
+
+
+def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings) -> Silhouette:
+    """From a coarse decision to a sub-pixel silhouette."""
+    if decision.mask.mean() < settings.least_area:
+        return _nothing(image.shape[:2], decision.background)
+    matte = solve_matte(image, decision, settings)
+    return _silhouette(matte, decision, settings)
+
+
+def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings) -> Silhouette:
+    alpha = np.zeros(decision.background.plates.shape[1:3], np.float32)
+    alpha[matte.box], holes = _without_specks(matte.alpha)
+    distance = distance_to_level(alpha)
+    weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
+    contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
+    others = sum(a for a in decision.strangers if a > STRANGER_SHARE)
+    background = decision.background
+    figures = {
+        "gain": [round(float(g), 4) for g in background.gain],
+        "noise_levels": round(float(np.median(background.noise)), 3),
+        "background_share": round(float(background.inliers.mean()), 4),
+        "weak_share": round(weak, 4),
+        "other_pieces": round(others, 4),
+    }
+    mask = alpha > 0.5
+    return Silhouette(mask, distance, _quality(mask, (1, holes), contrast, weak, figures, settings))
+
+
+def _without_specks(alpha: Float32[np.ndarray, "h w"]) -> tuple[Float32[np.ndarray, "h w"], int]:
+    """Alpha of the subject's own component without holes of noise, and how many holes are left."""
+    mask = alpha > 0.5
+    labels, areas = _labelled(mask, 4)
+    if len(areas) > 2:
+        main = int(np.argmax(areas[1:])) + 1
+        alpha = np.where(mask & (labels != main), np.float32(0.49), alpha)
+    labels, areas = _labelled(alpha <= 0.5, 8)
+    small = areas < NOISE_HOLE
+    small[0] = False
+    if small.any():
+        alpha = np.where(small[labels], np.float32(0.51), alpha)
+    enclosed = ~np.isin(np.arange(len(areas)), np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    enclosed[0] = False
+    return alpha, int((enclosed & ~small).sum())
+
+
+def _labelled(mask: Bool[np.ndarray, "h w"], connectivity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Labels of the components, 0 where the mask is False, and their areas."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+        mask.view(np.uint8), connectivity, cv2.CV_16U, cv2.CCL_SPAGHETTI
+    )
+    return labels, stats[:, cv2.CC_STAT_AREA].copy()
+
+
+def _mask_quality(mask: Bool[np.ndarray, "h w"], settings: SegmentationSettings) -> ViewQuality:
+    """The quality of an operator's mask."""
+    components = len(_labelled(mask, 8)[1]) - 1
+    holes = len(_labelled(np.pad(~mask, 1, constant_values=True), 4)[1]) - 2
+    return _quality(mask, (components, holes), float("inf"), 0.0, {}, settings)
+
+
+def _quality(
+    mask: Bool[np.ndarray, "h w"],
+    components_holes: tuple[int, int],
+    contrast: float,
+    weak: float,
+    figures: dict,
+    settings: SegmentationSettings,
+) -> ViewQuality:
+    """What can be said of a mask by itself."""
+    borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
+    cut_off = tuple(name for name, line in borders.items() if line.sum() > 2)
+    warnings, fatal = [], []
+    if "top" in cut_off:
+        warnings.append("the head is cut off at the top of the image: move the camera back or tilt it up")
+    apart = figures.get("other_pieces", 0.0)
+    if apart > settings.other_pieces_warned:
+        text = f"pieces of {apart:.1%} of the subject's area stand apart from it and are left out: did something move"
+        text += " since the plate, or do the clothes match the backdrop?"
+        (fatal if apart > settings.other_pieces_unusable else warnings).append(text)
+    if weak > settings.weak_share_warned:
+        text = f"{weak:.0%} of the contour hardly differs from the background: change the backdrop or the clothes"
+        (fatal if weak > settings.weak_share_unusable else warnings).append(text)
+    share = np.count_nonzero(mask) / mask.size
+    if share < settings.least_area or share > 0.95:
+        fatal.append(f"the subject covers {share:.1%} of the image, which no head does")
+    gains = figures.get("gain", [1.0])
+    if not all(LEAST_GAIN < g < MOST_GAIN for g in gains):
+        fatal.append(f"the light differs from the plate's by a factor {max(gains):.2f}: record a new plate")
+    warnings += [f"{text}; the view is left out" for text in fatal]
+    components, holes = components_holes
+    return ViewQuality(not fatal, contrast, cut_off, components, holes, tuple(warnings), figures)
+
+
+def _nothing(shape: tuple[int, ...], background: Background) -> Silhouette:
+    mask = np.zeros(shape, bool)
+    text = "no subject stands out from the clean plate; the view is left out"
+    figures = {"background_share": float(background.inliers.mean())}
+    far = np.full(shape, float(sum(shape)), np.float32)  # no contour: farther than any pixel
+    return Silhouette(mask, far, ViewQuality(False, 0.0, (), 0, 0, (text,), figures))

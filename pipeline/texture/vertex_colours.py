@@ -1,0 +1,178 @@
+"""Texture (section 4.5): one colour a vertex.
+
+Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour a vertex and how many images gave it.
+``blend = "reference"`` is the paper's: a vertex counts in an image if it projects inside the silhouette and nothing
+lies before it; its weight is the dot product of normal and viewing direction; its colour the weighted mean.
+
+The default departs from it, because real cameras differ and real edges are blurred: margins at contours and occluding
+edges (``pipeline.texture.visibility``), photographs sharpened where there is detail, gain and offset of each camera
+(``pipeline.imaging.colour_balance``), sharper weights so that detail is not averaged away, a mean in linear light that
+gives little to what is brighter than the other views say (a highlight moves with the camera), and a smooth fill where
+no camera looks.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.imaging.colour_balance import balance
+from pipeline.imaging.cpu_raster import camera_depths
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.settings import TextureSettings
+from pipeline.texture.inpaint import fill_unknown
+from pipeline.texture.vertex_colours_kernels import blend_views
+from pipeline.texture.visibility import Sight, see_points, sharpened
+from rig.camera import Camera
+from rig.capture import Capture
+from rig.colour_space import srgb_from_linear
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
+GREY = 0.22  # linear: what a head gets that no camera saw
+STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
+
+
+Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """sRGB colours, the number of images behind each (0 = filled), and what was found of the cameras."""
+
+    colours: UInt8[np.ndarray, "v 3"]
+    views: UInt8[np.ndarray, " v"]
+    gains: Mapping[str, Rgb] = field(default_factory=dict)  # linear, by camera
+    offsets: Mapping[str, Rgb] = field(default_factory=dict)
+    filled: int = 0
+    warnings: tuple[ReportWarning, ...] = ()
+
+
+def texture(
+    mesh_world: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+    settings: TextureSettings,
+) -> Texture:
+    """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them."""
+    views = usable_views(capture, silhouettes, rig)
+    if settings.blend == "reference":
+        return _reference(mesh_world, normals, capture, silhouettes, views, depths)
+    if not len(views):
+        return _untextured(len(normals))
+
+    def look(camera: Camera) -> Sight:
+        name = camera.name
+        image = sharpened(capture.images[name], silhouettes[name].mask, settings)
+        given = image, silhouettes[name], depths[name]
+        return see_points(camera, *given, mesh_world.vertices, normals, settings)
+
+    with ThreadPoolExecutor(max_workers=2) as pool:  # the compiled kernels release the interpreter lock
+        sights = list(pool.map(look, views))
+    gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
+    if settings.balance:
+        gains, offsets = balance(*_stacked(sights))
+    linear, seen = blend(sights, gains, offsets, settings.highlight)
+    if not seen.any():
+        return _untextured(len(seen))
+    colours = np.rint(255 * srgb_from_linear(fill_unknown(linear, seen > 0, mesh_world.faces))).astype(np.uint8)
+    by_camera = _by_name(views, gains)
+    filled = int(np.count_nonzero(seen == 0))
+    return Texture(colours, seen, by_camera, _by_name(views, offsets), filled, _gain_warnings(by_camera))
+
+
+def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
+    """The cameras that may colour a head."""
+    return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
+
+
+def blend(
+    sights: Sequence[Sight], gains: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, "k 3"], highlight: float
+) -> tuple[Float[np.ndarray, "v 3"], UInt8[np.ndarray, " v"]]:
+    """Linear colour of each point and the number of views that gave it."""
+    weights, colours = _stacked(sights)
+    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    return blend_views(weights, balanced, highlight)
+
+
+def _stacked(sights: Sequence[Sight]) -> tuple[Float32[np.ndarray, "k v"], Float32[np.ndarray, "k v 3"]]:
+    return np.stack([sight.weights for sight in sights]), np.stack([sight.colours for sight in sights])
+
+
+def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
+    return {name: (r, g, b) for name, (r, g, b) in zip(rig.names, values.tolist(), strict=True)}
+
+
+def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
+    return tuple(
+        ReportWarning("camera-gain", f"{name} is {1 / min(gain):.2f} times as bright as the others: check its exposure")
+        for name, gain in gains.items()
+        if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
+    )
+
+
+def _untextured(count: int) -> Texture:
+    code = round(255 * float(srgb_from_linear(np.array(GREY))))
+    warning = ReportWarning("no-texture", "no camera with a usable silhouette sees the head, so that it is grey")
+    return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), filled=count, warnings=(warning,))
+
+
+def _reference(
+    mesh: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+) -> Texture:
+    """Section 4.5 to the letter, in the images' own codes; vertices that no camera sees are filled."""
+    total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
+    views = np.zeros(len(normals), np.uint8)
+    for camera in rig:
+        pixels = camera.project(mesh.vertices)
+        seen = _visible(camera, mesh.vertices, pixels, depths[camera.name], silhouettes[camera.name])
+        towards = camera.centre_world - mesh.vertices
+        facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        weight = np.where(seen, np.clip(facing, 0.0, None), 0.0)
+        total += weight[:, None] * _sampled(capture.images[camera.name], pixels)
+        weights += weight
+        views += weight > 0
+    known = weights > 0
+    if not known.any():
+        return _untextured(len(normals))
+    colours = fill_unknown(total / np.where(known, weights, 1.0)[:, None], known, mesh.faces)
+    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+
+
+def _visible(
+    camera: Camera,
+    vertices: Float[np.ndarray, "v 3"],
+    pixels: Float[np.ndarray, "v 2"],
+    depth: Float32[np.ndarray, "h w"],
+    silhouette: Silhouette,
+) -> Bool[np.ndarray, " v"]:
+    """Inside the silhouette, and nothing before the vertex."""
+    height, width = depth.shape
+    framed = np.logical_and(pixels >= 0, pixels <= (width - 1, height - 1)).all(axis=1)  # NaN is not
+    columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
+    free = camera_depths(camera, vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
+    return framed & silhouette.mask[rows, columns] & free
+
+
+def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v 3"]:
+    """Bilinear samples; the nearest border pixel outside the image."""
+    height, width = image.shape[:2]
+    safe = np.clip(np.nan_to_num(pixels), 0, (width - 1.001, height - 1.001))
+    low = safe.astype(int)
+    fx, fy = (safe - low).T[:, :, None]
+    x, y = low.T
+    top = image[y, x] * (1 - fx) + image[y, x + 1] * fx
+    bottom = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
+    return top * (1 - fy) + bottom * fy

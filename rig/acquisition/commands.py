@@ -1,0 +1,217 @@
+"""What an operator does with a rig: `eigenhead rig check`, `preview`, `capture`, and taking clean plates.
+
+Each function is one command: it opens a session, works, and closes it. Nothing is printed here.
+"""
+
+import itertools
+import json
+import math
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.acquisition.plates import Plates, link_plates
+from rig.acquisition.session import MakeDriver, RigSession
+from rig.acquisition.shot import Fault, Shot, ShotFailed
+from rig.atomic_write import write_atomically
+from rig.capture import Capture
+from rig.drivers.registry import driver_for
+from rig.errors import EigenheadError, InputError
+from rig.formats.capture_folder import write_capture
+from rig.formats.images import write_image
+from rig.formats.rig_toml import RigConfig
+from rig.rig import Rig
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+HIDDEN_BY_BOARD = ("view", "swapped", "moved", "plates", "overexposed")  # what is judged by the background, or is paper
+COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "sync", "last seen", "remark")
+
+
+class NoCalibration(EigenheadError):
+    """A capture folder needs cameras.json."""
+
+    def __init__(self) -> None:
+        super().__init__('rig.toml names no calibration: set calibration = "cameras.json" (see `eigenhead calibrate`)')
+
+
+@dataclass(frozen=True, slots=True)
+class RigCheck:
+    """A table that a person can act on: one row of text per camera under ``COLUMNS``, and what concerns the rig."""
+
+    rows: tuple[tuple[str, ...], ...]
+    faults: tuple[Fault, ...]
+
+    @property
+    def healthy(self) -> bool:
+        """Whether a capture would succeed now."""
+        return not any(fault.is_error for fault in self.faults)
+
+
+def check(config: RigConfig, make_driver: MakeDriver = driver_for) -> RigCheck:
+    """`eigenhead rig check`: opens everything and takes a test shot that is not kept."""
+    with RigSession(config, make_driver) as session:
+        session.warm_up()
+        shot = session.shoot()
+        return RigCheck(tuple(_row(name, session, shot) for name in config.names), shot.faults)
+
+
+def preview(config: RigConfig, out: Path, make_driver: MakeDriver = driver_for) -> tuple[Fault, ...]:
+    """`eigenhead rig preview`: a contact sheet of every camera into ``out`` (.jpg or .png); the faults in it."""
+    with RigSession(config, make_driver) as session:
+        session.warm_up()
+        shot = session.shoot()
+    write_image(out, contact_sheet(config.names, shot.images, shot.faults), quality=85)
+    return shot.faults
+
+
+def capture(
+    config: RigConfig,
+    out: Path,
+    make_driver: MakeDriver = driver_for,
+    *,
+    report: Callable[[str, float], None] = lambda stage, fraction: None,
+) -> Shot:
+    """`eigenhead rig capture`: one shot into the capture folder ``out``; ``report`` hears of "warm up", "shot", "done".
+
+    Raises ShotFailed, and writes nothing, where the shot is no complete capture; NoCalibration; InputError where
+    ``out`` is there already. Warnings are in the shot that is returned, and in shot.json of the folder.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(str(out), ["is there already; name a folder that is not"])
+    report("warm up", 0.0)
+    with RigSession(config, make_driver) as session:
+        session.warm_up()
+        report("shot", 0.5)
+        shot = capture_with(session, out)
+        report("done", 1.0)
+    return shot
+
+
+def capture_with(session: RigSession, out: Path) -> Shot:
+    """``capture`` with a session that is open and warm."""
+    if session.rig is None:
+        raise NoCalibration
+    shot = session.shoot()
+    if not shot.complete:
+        raise ShotFailed(shot.faults)
+    write_shot(out, shot, session.plates, session.rig)
+    return shot
+
+
+def board_shots(
+    config: RigConfig, out: Path, count: int, make_driver: MakeDriver = driver_for, *, pause_s: float = 4.0
+) -> Iterator[tuple[str, tuple[str, ...], tuple[Fault, ...]]]:
+    """`eigenhead rig board`: shots of a calibration board into ``out/<camera>/<shot>.png``, for `eigenhead calibrate`.
+
+    Yields, for each shot, its name, the cameras whose pictures were written, and the faults; waits ``pause_s`` before
+    each, for the board to be moved. Names go on after those that are there. Raises ShotFailed where no camera delivers.
+    """
+    taken = {path.stem for path in out.glob("*/*.png")}
+    names = (name for name in map("shot{:03}".format, itertools.count()) if name not in taken)
+    with RigSession(config, make_driver) as session:
+        session.warm_up()
+        for name in itertools.islice(names, count):
+            time.sleep(pause_s)
+            shot = board_shot(session)
+            for camera, image in shot.images.items():
+                write_image(out / camera / f"{name}.png", image)
+            yield name, tuple(shot.images), shot.faults
+
+
+def board_shot(session: RigSession) -> Shot:
+    """One shot of a calibration board, with a session that is open and warm: needs no calibration and no clean plates.
+
+    Holds the pictures of the cameras that deliver, and the faults without those of views that the board itself hides.
+    Raises ShotFailed where no camera delivers."""
+    shot = session.shoot()
+    faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
+    spoilt = {fault.camera for fault in faults if fault.is_error}
+    images = {} if None in spoilt else {name: image for name, image in shot.images.items() if name not in spoilt}
+    if not images:
+        raise ShotFailed(faults)
+    return replace(shot, images=images, faults=faults)
+
+
+def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:
+    """New clean plates of the empty studio, beside rig.toml. Raises ShotFailed; the old ones then stay."""
+    with RigSession(config, make_driver) as session:
+        session.warm_up()
+        return session.take_plates()
+
+
+def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
+    """A capture folder with the plates and shot.json (the certificate); it appears when it is complete."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    try:
+        fresh.chmod(0o777 & ~_umask())  # mkdtemp makes it private
+        write_capture(fresh, Capture(shot.images), rig.subset([name for name in rig.names if name in shot.images]))
+        link_plates(plates, fresh / "background")
+        write_atomically(fresh / "shot.json", json.dumps(shot.document(), indent=1).encode())
+        if out.exists():
+            out.rmdir()
+        fresh.rename(out)
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
+
+
+def contact_sheet(
+    names: tuple[str, ...], images: Mapping[str, ImageRgb], faults: tuple[Fault, ...], tile_width: int = 320
+) -> UInt8[np.ndarray, "_ _ 3"]:
+    """All cameras in one picture, each with its name and the codes of its faults."""
+    tile_height = tile_width * 3 // 4
+    columns = math.ceil(math.sqrt(len(names)))
+    rows = math.ceil(len(names) / columns)
+    sheet = np.full((rows * (tile_height + 24), columns * tile_width, 3), 24, np.uint8)
+    for index, name in enumerate(names):
+        top, left = index // columns * (tile_height + 24), index % columns * tile_width
+        if name in images:
+            tile = _fit(images[name], tile_width, tile_height)
+            sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+        codes = " ".join(sorted({fault.code for fault in faults if fault.camera == name}))
+        colour = (255, 120, 90) if any(f.camera == name and f.is_error for f in faults) else (230, 230, 230)
+        where = (left + 6, top + tile_height + 17)
+        cv2.putText(sheet, f"{name} {codes}", where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return sheet
+
+
+def _fit(image: ImageRgb, width: int, height: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    factor = min(width / image.shape[1], height / image.shape[0])
+    size = (max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _row(name: str, session: RigSession, shot: Shot) -> tuple[str, ...]:
+    state = session.states().get(name)
+    image, measured = shot.images.get(name), shot.checks.get(name)
+    sync = next((line for line in shot.certificate.cameras if line.camera == name), None)
+    faults = [f"{fault.code}: {fault.detail}" for fault in shot.faults if fault.camera == name]
+    seen = "never"
+    if state is not None and state.last_seen_s is not None:
+        seen = f"{time.monotonic() - state.last_seen_s:.1f} s ago"
+    return (
+        name,
+        "yes" if state is not None and state.opened else "no",
+        "-" if image is None else f"{image.shape[1]} x {image.shape[0]}",
+        "-" if state is None or state.period_s is None else f"{1 / state.period_s:.1f}",
+        "-" if measured is None else f"{measured.exposure.mean / 2.55:.0f} %",
+        "-" if measured is None or measured.blur_px is None else f"{measured.blur_px:.1f} px",
+        "-" if sync is None else sync.status if sync.skew_s is None else f"{sync.skew_s * 1000:+.1f} ms",
+        seen,
+        "; ".join(faults) or "ok",
+    )
+
+
+def _umask() -> int:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask

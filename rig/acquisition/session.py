@@ -1,0 +1,390 @@
+"""A session with the rig: every camera open, lamps on, the box at hand; shots, clean plates, looks.
+
+    with RigSession(config) as session:
+        session.warm_up()
+        shot = session.shoot()
+
+Nothing waits without a deadline, and no single camera holds up another: each has its thread (rig.drivers.feed). What
+fails is a named fault of the shot; an exception is for what is no shot at all (ShotFailed, InputError).
+"""
+
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.acquisition.image_checks import disturbed, noise_of
+from rig.acquisition.plates import NO_PLATES, Plates, read_plates, write_plates
+from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify, examine, judge
+from rig.acquisition.trigger import Fired, TriggerBox, TriggerError
+from rig.drivers.base import Driver, DriverError, Frame
+from rig.drivers.feed import CameraFeed, FeedState
+from rig.drivers.registry import driver_for
+from rig.formats.cameras_json import read_rig
+from rig.formats.rig_toml import CameraConfig, RigConfig
+from rig.rig import Rig
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+MakeDriver = Callable[[CameraConfig, Path], Driver]
+
+_LIVE_WAIT_PERIODS = 3.0  # how long a camera that runs by itself may take for its next frame
+_ARM_TO_FIRE_S = 0.02  # for the live view's frame that is under way
+_CLOSE_S = 3.0
+_SILENT_S = 10.0  # a camera that gave a look nothing holds up no other look for so long
+_DIAGNOSIS_S = 1.0  # to look at pictures when nothing could be fired
+
+
+@dataclass(frozen=True, slots=True)
+class _Release:
+    time_s: float
+    uncertainty_s: float
+    fired: bool
+    faults: tuple[Fault, ...] = ()
+
+
+class RigSession:
+    """Owner of the rig's devices. A context manager; ``close`` leaves no thread but those that hang in a driver."""
+
+    def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
+        self.config = config
+        self.rig: Rig | None = None if config.calibration_file is None else read_rig(config.calibration_file)
+        self.plates: Plates = read_plates(config.plates_folder, config.names)
+        self._feeds: dict[str, CameraFeed] = {}
+        self._broken: dict[str, str] = {}
+        self._box: TriggerBox | None = None
+        self._box_error: TriggerError | None = None
+        self._last_seen: dict[str, Frame] = {}  # for what stands still
+        self._silent_until_s: dict[str, float] = {}
+        self._busy = threading.Lock()
+        for camera in config.cameras:
+            try:
+                self._feeds[camera.name] = CameraFeed(
+                    camera, make_driver(camera, config.folder), config.shot.open_timeout_s
+                )
+            except DriverError as error:
+                self._broken[camera.name] = str(error)
+
+    def __enter__(self) -> "RigSession":
+        try:
+            self.open()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """Opens cameras and box, all at once. Cameras that do not open are faults of the shots."""
+        for feed in self._feeds.values():
+            feed.start()
+        self._open_box()
+        deadline_s = time.monotonic() + self.config.shot.open_timeout_s
+        for feed in self._feeds.values():
+            feed.wait_opened(deadline_s)
+
+    def close(self) -> tuple[str, ...]:
+        """Lamps off, everything closed; the cameras whose driver hangs. Safe to call twice."""
+        if self._box is not None:
+            if not self.config.lights.keep_on:
+                self._try_box(lambda box: box.set_lights(0))
+            if self._box is not None:
+                self._box.close()
+                self._box = None
+        deadline_s = time.monotonic() + _CLOSE_S
+        for feed in self._feeds.values():
+            feed.stop()
+        hanging = tuple(name for name, feed in self._feeds.items() if not feed.close(deadline_s))
+        self._feeds = {}
+        return hanging
+
+    def states(self) -> Mapping[str, FeedState]:
+        """What is known of each camera at this moment; those without a driver are left out."""
+        return {name: feed.state() for name, feed in self._feeds.items()}
+
+    def trigger_error(self) -> str | None:
+        """Why the box cannot be used; None where it can, or where there is none to use."""
+        return None if self._box_error is None else str(self._box_error)
+
+    def warm_up(self) -> None:
+        """Lamps on, and every camera's first frames seen and forgotten: exposure and lamps settle meanwhile."""
+        with self._busy:
+            self._lights_on()
+            deadline_s = time.monotonic() + self.config.shot.timeout_s
+            for feed in self._feeds.values():
+                # a camera that waits for triggers sends nothing by itself: that is no reason to wait for it
+                feed.wait_frames(self.config.shot.warm_up_frames, deadline_s)
+            self._look(deadline_s + self.config.shot.timeout_s)
+
+    def look(self, only: Collection[str] | None = None) -> Mapping[str, ImageRgb]:
+        """A picture of each camera (``only``: of these, which alone are waited for) that has one, of no particular
+        moment."""
+        with self._busy:
+            self._lights_on()
+            frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s, only)
+            return {name: frame.image for name, frame in frames.items()}
+
+    def shoot(self) -> Shot:
+        """One synchronised shot. Never raises for a device: the shot's faults say what is wrong."""
+        with self._busy:
+            self._lights_on()
+            self._glance()
+            release = self._release()
+            frames = self._collect(release)
+            shot = self._judge(release, frames)
+            self._last_seen |= {name: frame for name, frame in frames.items() if frame is not None}
+            return shot
+
+    def take_plates(self) -> Plates:
+        """Takes the clean plates of the empty studio and keeps them. Raises ShotFailed, the old plates then stay."""
+        with self._busy:
+            self._lights_on()
+            self._silent_until_s.clear()
+            taken: dict[str, list[ImageRgb]] = {name: [] for name in self.config.names}
+            for _ in range(self.config.shot.plates):
+                frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s)
+                for name, frame in frames.items():
+                    taken[name].append(frame.image)
+            faults = [*self._box_faults(), *self._plate_faults(taken)]
+            if faults:
+                raise ShotFailed(faults)
+            images = {name: tuple(images) for name, images in taken.items()}
+            self.plates = write_plates(self.config.plates_folder, images)
+            return self.plates
+
+    def _open_box(self) -> None:
+        trigger = self.config.trigger
+        if trigger is None or self._box is not None:
+            return
+        try:
+            self._box = TriggerBox(trigger.port, baud=trigger.baud)
+            for camera in self.config.cameras:
+                if camera.channel is not None:
+                    self._box.set_delay(camera.channel, camera.delay_us)
+            self._box_error = None
+        except TriggerError as error:
+            self._drop_box(error)
+
+    def _drop_box(self, error: TriggerError) -> None:
+        if self._box is not None:
+            self._box.close()
+        self._box, self._box_error = None, error
+
+    def _try_box(self, act: Callable[[TriggerBox], object]) -> bool:
+        """Whether the box did it. A box that did not is given up; the next shot tries to open it again."""
+        if self._box is None:
+            return False
+        try:
+            act(self._box)
+        except TriggerError as error:
+            self._drop_box(error)
+            return False
+        return True
+
+    def _box_faults(self) -> list[Fault]:
+        return [] if self._box_error is None else [Fault("trigger", None, str(self._box_error))]
+
+    def _lights_on(self) -> None:
+        self._open_box()
+        mask = sum(1 << output for output in self.config.lights.outputs)
+        if mask == 0 or self._box is None:
+            return
+        before: list[int] = []
+        if self._try_box(lambda box: before.append(box.status().lights)) and before != [mask]:
+            self._try_box(lambda box: box.set_lights(mask))
+            time.sleep(self.config.lights.settle_s)
+
+    def _glance(self) -> None:
+        """Notes the picture that each camera shows before the release: the same one after it is a frozen stream."""
+        now_s = time.monotonic()
+        running = {name: s.period_s for name, feed in self._feeds.items() if (s := feed.state()).period_s is not None}
+        for name in running:
+            self._feeds[name].want(now_s)
+            self._feeds[name].due(now_s)
+        for name, period_s in running.items():
+            assert period_s is not None
+            limit_s = min(_LIVE_WAIT_PERIODS * period_s, self.config.shot.timeout_s)
+            frame = self._feeds[name].collect(now_s, now_s + limit_s)
+            if frame is not None:
+                self._last_seen[name] = frame
+
+    def _look(self, deadline_s: float, only: Collection[str] | None = None) -> dict[str, Frame]:
+        """The next frame of every camera; those that wait for a trigger get one when no live view comes.
+
+        One that gave nothing the last time is not waited for again until ``_SILENT_S`` have passed; what it sends while
+        others are waited for is taken."""
+        now_s = time.monotonic()
+        feeds = {name: feed for name, feed in self._feeds.items() if only is None or name in only}
+        for feed in feeds.values():
+            feed.want(now_s)
+            feed.due(now_s)
+            feed.trigger()
+        awaited = [name for name in feeds if self._silent_until_s.get(name, 0.0) <= now_s]
+        early_s = now_s + (deadline_s - now_s) / 4
+        missing = [n for n in awaited if feeds[n].collect(now_s, early_s) is None and feeds[n].state().opened]
+        if any(feeds[name].camera.trigger == "external" for name in missing) and self._fire() is not None:
+            for name in missing:
+                feeds[name].collect(now_s, deadline_s)
+        frames = {name: feed.collect(now_s, 0.0) for name, feed in feeds.items()}
+        for feed in feeds.values():
+            feed.unwant()
+        found = {name: frame for name, frame in frames.items() if frame is not None}
+        silent = {name: time.monotonic() + _SILENT_S for name in awaited if name not in found}
+        self._silent_until_s = {n: s for n, s in self._silent_until_s.items() if n not in found} | silent
+        self._last_seen |= found
+        return found
+
+    def _fire(self) -> Fired | None:
+        """Arms and fires the box; None, with the error kept, where it does not."""
+        trigger = self.config.trigger
+        mask = sum(1 << c.channel for c in self.config.cameras if c.trigger == "external" and c.channel is not None)
+        fired: list[Fired] = []
+
+        def act(box: TriggerBox) -> None:
+            assert trigger is not None, "there is a box"
+            box.synchronise()
+            box.arm(trigger.window_s)
+            time.sleep(_ARM_TO_FIRE_S)
+            fired.append(box.fire(mask, trigger.pulse_us))
+
+        return fired[0] if self._try_box(act) else None
+
+    def _release(self) -> _Release:
+        """The moment of the shot: the box's, or with no box in rig.toml the command to the cameras."""
+        now_s = time.monotonic()
+        for feed in self._feeds.values():
+            feed.want(now_s)
+        if self.config.trigger is not None:
+            fired = self._fire()
+            if fired is None:
+                return _Release(time.monotonic(), 0.0, False, tuple(self._box_faults()))
+            for feed in self._feeds.values():
+                if feed.camera.trigger == "software":
+                    feed.trigger()
+            late_s = fired.time_s - fired.asked_s - fired.uncertainty_s
+            faults: tuple[Fault, ...] = ()
+            if late_s > self.config.shot.skew_most_ms / 1000:
+                faults = (Fault("late-trigger", None, f"the box fired {late_s * 1000:.0f} ms after the command"),)
+            return _Release(fired.time_s, fired.uncertainty_s, True, faults)
+        for feed in self._feeds.values():
+            feed.trigger()
+        return _Release(now_s, 0.0, True)
+
+    def _due_s(self, camera: CameraConfig, release: _Release) -> float:
+        delay_s = camera.delay_us * 1e-6 if camera.trigger == "external" else 0.0
+        return release.time_s + delay_s + camera.latency_ms / 1000
+
+    def _collect(self, release: _Release) -> dict[str, Frame | None]:
+        timeout_s = self.config.shot.timeout_s if release.fired else min(_DIAGNOSIS_S, self.config.shot.timeout_s)
+        due_s = {name: self._due_s(feed.camera, release) for name, feed in self._feeds.items()}
+        for name, feed in self._feeds.items():
+            feed.due(due_s[name] - release.uncertainty_s)
+        # A broken camera has nothing to wait for; those that are open share one deadline.
+        deadline_s = max(due_s.values(), default=release.time_s) + timeout_s
+        frames = {
+            name: feed.collect(due_s[name] - release.uncertainty_s, deadline_s if feed.state().opened else 0.0)
+            for name, feed in self._feeds.items()
+        }
+        for feed in self._feeds.values():
+            feed.unwant()
+        return frames
+
+    def _judge(self, release: _Release, frames: Mapping[str, Frame | None]) -> Shot:
+        periods_s = {name: feed.state().period_s for name, feed in self._feeds.items()}
+        timings = {
+            name: Timing(
+                self._due_s(feed.camera, release), periods_s[name], feed.camera.trigger == "external", not feed.live
+            )
+            for name, feed in self._feeds.items()
+        }
+        certificate, late = certify(
+            frames,
+            timings,
+            trigger_s=release.time_s if release.fired else None,
+            trigger_utc=_utc(release.time_s),
+            uncertainty_s=release.uncertainty_s,
+            skew_most_s=self.config.shot.skew_most_ms / 1000,
+        )
+        images = {name: frame.image for name, frame in frames.items() if frame is not None}
+        checks = examine(images, self.plates)
+        faults = [
+            *release.faults,
+            *self._missing(frames, release.fired),
+            *late,
+            *self._still(images),
+            *self._sizes(images),
+            *judge(images, checks, self.plates, self.config.shot),
+            *self._notes(images),
+        ]
+        return Shot(images, certificate, checks, _without_consequences(faults))
+
+    def _missing(self, frames: Mapping[str, Frame | None], fired: bool) -> list[Fault]:
+        faults = [Fault("missing", name, why) for name, why in self._broken.items()]
+        for name, frame in frames.items():
+            state = self._feeds[name].state()
+            waits = self._feeds[name].camera.trigger == "external" and state.period_s is None
+            if frame is not None or (not fired and state.opened and waits):
+                continue  # a camera that waits for a trigger that never came is not at fault
+            timeout_s = self.config.shot.timeout_s if fired else min(_DIAGNOSIS_S, self.config.shot.timeout_s)
+            faults.append(Fault("missing", name, state.error or f"no frame within {timeout_s:g} s of the release"))
+        return faults
+
+    def _still(self, images: Mapping[str, ImageRgb]) -> list[Fault]:
+        return [
+            Fault("frozen", name, "its picture is the one before the release, to the last bit")
+            for name, image in images.items()
+            if self._feeds[name].live and name in self._last_seen and np.array_equal(self._last_seen[name].image, image)
+        ]
+
+    def _sizes(self, images: Mapping[str, ImageRgb]) -> list[Fault]:
+        if self.rig is None:
+            return []
+        faults = []
+        for name, image in images.items():
+            if name not in self.rig:
+                faults.append(Fault("size", name, "it is not in the calibration"))
+                continue
+            lens = self.rig[name].intrinsics
+            if image.shape[:2] != (lens.height, lens.width):
+                sizes = f"{image.shape[1]} x {image.shape[0]}, calibrated {lens.width} x {lens.height}"
+                faults.append(Fault("size", name, sizes))
+        return faults
+
+    def _notes(self, images: Mapping[str, ImageRgb]) -> list[Fault]:
+        unmet = {name: feed.state().unmet for name, feed in self._feeds.items()}
+        notes = [Fault("setting", name, line) for name, lines in unmet.items() for line in lines]
+        missing = [name for name in images if name not in self.plates]
+        return notes + [Fault("plates", name, "take clean plates of the empty studio") for name in missing]
+
+    def _plate_faults(self, taken: Mapping[str, list[ImageRgb]]) -> list[Fault]:
+        faults = []
+        wanted = self.config.shot.plates
+        for name, images in taken.items():
+            if len(images) < wanted:
+                state = self._feeds[name].state() if name in self._feeds else None
+                why = self._broken.get(name) or (state.error if state is not None else None)
+                faults.append(Fault("missing", name, why or f"{len(images)} of {wanted} frames came"))
+                continue
+            if self._feeds[name].live and any(np.array_equal(images[0], other) for other in images[1:2]):
+                faults.append(Fault("frozen", name, "two clean plates are equal to the last bit"))
+            if disturbed(images, noise_of(images) or 0.0):
+                faults.append(Fault("disturbed", name, "something moved between the clean plates; take them again"))
+        first = {name: images[0] for name, images in taken.items() if images}
+        dark = judge(first, examine(first, NO_PLATES), NO_PLATES, self.config.shot)
+        return faults + [fault for fault in dark if fault.is_error]
+
+
+def _without_consequences(faults: list[Fault]) -> tuple[Fault, ...]:
+    """Leaves out what another fault explains: a camera in the dark is not also out of focus or elsewhere."""
+    dark = {fault.camera for fault in faults if fault.code == "dark"}
+    return tuple(fault for fault in faults if not (fault.camera in dark and fault.code in ("blurred", "view")))
+
+
+def _utc(monotonic_s: float) -> str:
+    return datetime.fromtimestamp(time.time() + monotonic_s - time.monotonic(), UTC).isoformat(timespec="milliseconds")

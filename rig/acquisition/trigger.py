@@ -1,0 +1,266 @@
+"""The trigger box: its line protocol (docs/trigger-protocol.md) and the client that drives one over pyserial.
+
+A request is ``@SS BODY*CCCC\\n`` and its reply ``#SS BODY*CCCC\\n``: SS is a sequence number (two hex digits), CCCC the
+CRC-16/CCITT-FALSE of ``SS BODY``. The start character resynchronises a receiver at any moment, so noise between lines
+costs nothing; a damaged line is dropped in silence and the client sends it again under the same sequence number, which
+the box answers from memory without acting twice. Requests and replies start differently so that an echo is no reply.
+"""
+
+import string
+import threading
+import time
+from dataclasses import dataclass
+
+import serial
+
+from rig.errors import EigenheadError
+from rig.formats.trigger_lines import BAUD, CLOCK_PERIOD_US, PROTOCOL, REPLY, REQUEST, LineReader, encode_line
+
+BUSY_S = 1.5  # the longest delay and the longest pulse, 1 s in all, with room for the lines between
+
+
+class TriggerError(EigenheadError):
+    """The trigger box could not do what was asked; the base of everything this module raises."""
+
+
+class TriggerUnplugged(TriggerError):
+    """The serial port is not there, or went away."""
+
+    def __init__(self, port: str, why: str) -> None:
+        super().__init__(f"trigger box: {port} is unplugged or cannot be opened ({why}); check its USB cable and power")
+
+
+class TriggerSilent(TriggerError):
+    """The port is there, but nothing answers."""
+
+    def __init__(self, port: str, body: str, waited_s: float) -> None:
+        super().__init__(
+            f"trigger box: no answer on {port} to {body.split()[0]} within {waited_s:.1f} s; check that the box "
+            "has power and that rig.toml names its port and baud rate"
+        )
+
+
+class WrongDevice(TriggerError):
+    """Something else than a trigger box is on the port."""
+
+    def __init__(self, port: str, said: str) -> None:
+        super().__init__(
+            f"trigger box: the device on {port} does not speak {PROTOCOL} (it said {said!r}); "
+            "put the box's own port from /dev/serial/by-id into rig.toml"
+        )
+
+
+class TriggerRefused(TriggerError):
+    """The box understood and refused: ``code`` is one of UNKNOWN, ARGUMENT, NOT-ARMED, BUSY."""
+
+    def __init__(self, body: str, code: str) -> None:
+        self.code = code
+        super().__init__(f"trigger box: refused {body!r}: {code}")
+
+
+@dataclass(frozen=True, slots=True)
+class BoxIdentity:
+    """What IDENTIFY answers."""
+
+    firmware: str
+    serial: str
+    channels: int
+    lights: int
+
+
+@dataclass(frozen=True, slots=True)
+class BoxStatus:
+    """What STATUS answers. ``bad_lines`` counts lines that the box dropped: noise on the cable."""
+
+    state: str
+    shots: int
+    lights: int
+    bad_lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class BoxClock:
+    """Host time (time.monotonic, s) at box microsecond ``box_us``, and half the width of what is known of it."""
+
+    host_s: float
+    box_us: int
+    uncertainty_s: float
+
+    def host_from_box(self, box_us: int) -> float:
+        """Host time of a box time less than 35 minutes away, across the wrap of the 32-bit counter."""
+        difference = (box_us - self.box_us + CLOCK_PERIOD_US // 2) % CLOCK_PERIOD_US - CLOCK_PERIOD_US // 2
+        return self.host_s + difference * 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Fired:
+    """One release: when the box raised its outputs (time.monotonic, s), how well that is known, and the box's count."""
+
+    time_s: float
+    uncertainty_s: float
+    asked_s: float
+    shot: int
+
+
+class TriggerBox:
+    """Client of one box. Every method raises TriggerError; a method that returns was acknowledged by the box.
+
+    ``port`` is a serial port (a /dev/serial/by-id path survives a reboot) or the pty of a simulated box. Opening waits
+    up to ``boot_s``: many boards restart when their port is opened and need two seconds until they listen.
+    """
+
+    def __init__(
+        self, port: str, *, baud: int = BAUD, reply_timeout_s: float = 0.25, attempts: int = 4, boot_s: float = 3.0
+    ) -> None:
+        self.port = port
+        self._reply_timeout_s = reply_timeout_s
+        self._attempts = attempts
+        self._lock = threading.Lock()
+        self._reader = LineReader(REPLY)
+        self._sequence = time.monotonic_ns() & 0xFF
+        self._clock: BoxClock | None = None
+        try:
+            # exclusive: two programs that fire the same box would each believe in their own shot
+            self._serial = serial.Serial(port, baud, timeout=0.05, write_timeout=1.0, exclusive=True)
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise TriggerUnplugged(port, _first_line(error)) from error
+        try:
+            self.identity = self._identify(boot_s)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "TriggerBox":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Lets the port go. Safe to call twice and on an unplugged cable."""
+        # pyserial's close restores nothing that could fail, but an unplugged descriptor may still raise
+        try:
+            self._serial.close()
+        except (serial.SerialException, OSError):
+            return
+
+    def set_delay(self, channel: int, delay_us: int) -> None:
+        """Delay of one output behind the release, 0 to 500,000 us."""
+        self._command(f"DELAY {channel} {delay_us}")
+
+    def set_lights(self, mask: int) -> None:
+        """Switches the light outputs: bit n is light n."""
+        self._command(f"LIGHTS {mask:X}")
+
+    def arm(self, window_s: float) -> None:
+        """Allows one FIRE within ``window_s``; the box disarms itself when it has passed."""
+        self._command(f"ARM {round(window_s * 1000)}")
+
+    def disarm(self) -> None:
+        """Takes the permission back."""
+        self._command("DISARM")
+
+    def fire(self, mask: int, pulse_us: int) -> Fired:
+        """Raises the outputs of ``mask``, each after its delay, for ``pulse_us``. Needs a box that is armed."""
+        clock = self._clock or self.synchronise()
+        asked_s = time.monotonic()
+        words = self._command(f"FIRE {mask:X} {pulse_us}")
+        box_us, shot = _integers("FIRE", words, 2)
+        return Fired(clock.host_from_box(box_us), clock.uncertainty_s, asked_s, shot)
+
+    def status(self) -> BoxStatus:
+        """State (IDLE, ARMED or FIRING), shots since power-up, lights, and lines lost to noise."""
+        fields = _fields(self._command("STATUS"))
+        try:
+            return BoxStatus(fields["STATE"], int(fields["SHOTS"]), int(fields["LIGHTS"], 16), int(fields["BAD"]))
+        except (KeyError, ValueError) as error:
+            raise WrongDevice(self.port, f"STATUS {fields}") from error
+
+    def synchronise(self, rounds: int = 5) -> BoxClock:
+        """Compares the box's clock with time.monotonic.
+
+        Cristian's method (Distributed Computing 3, 1989): the box read its clock within the round trip; the shortest
+        of several bounds it best. Half that trip is the uncertainty.
+        """
+        best: BoxClock | None = None
+        for _ in range(rounds):
+            sent_s = time.monotonic()
+            (box_us,) = _integers("CLOCK", self._command("CLOCK"), 1)
+            half_s = (time.monotonic() - sent_s) / 2
+            if best is None or half_s < best.uncertainty_s:
+                best = BoxClock(sent_s + half_s, box_us, half_s)
+        assert best is not None, "rounds is at least 1"
+        self._clock = best
+        return best
+
+    def _identify(self, boot_s: float) -> BoxIdentity:
+        attempts = max(1, round(boot_s / self._reply_timeout_s))
+        words = self._command("IDENTIFY", attempts=attempts)
+        fields = _fields(words)
+        if not words or words[0] != PROTOCOL:
+            raise WrongDevice(self.port, " ".join(words))
+        try:
+            return BoxIdentity(fields["FW"], fields["ID"], int(fields["CH"]), int(fields["LI"]))
+        except (KeyError, ValueError) as error:
+            raise WrongDevice(self.port, " ".join(words)) from error
+
+    def _command(self, body: str, attempts: int | None = None) -> list[str]:
+        """Sends ``body`` until it is answered, and again while the box is busy releasing; the words after OK."""
+        until_s = time.monotonic() + BUSY_S
+        while True:
+            with self._lock:
+                self._sequence = (self._sequence + 1) & 0xFF
+                answer = self._exchange(self._sequence, body, attempts or self._attempts)
+            words = answer.split()
+            if words[:2] != ["ERR", "BUSY"] or time.monotonic() > until_s:
+                break
+            time.sleep(0.005)
+        if words and words[0] == "OK":
+            return words[1:]
+        if len(words) >= 2 and words[0] == "ERR":
+            raise TriggerRefused(body, words[1])
+        raise WrongDevice(self.port, answer)
+
+    def _exchange(self, sequence: int, body: str, attempts: int) -> str:
+        line = encode_line(REQUEST, sequence, body)
+        try:
+            for _ in range(attempts):
+                self._serial.write(line)
+                answer = self._await_reply(sequence)
+                if answer is not None:
+                    return answer
+        except (serial.SerialException, OSError, TypeError) as error:
+            # pyserial raises TypeError where another thread closed the port under a read
+            raise TriggerUnplugged(self.port, _first_line(error)) from error
+        said = bytes(self._reader.stray).decode("ascii", "replace").strip()
+        if said and sum(character in string.printable for character in said) > len(said) // 2:
+            raise WrongDevice(self.port, said[-60:])
+        raise TriggerSilent(self.port, body, attempts * self._reply_timeout_s)
+
+    def _await_reply(self, sequence: int) -> str | None:
+        deadline_s = time.monotonic() + self._reply_timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            self._serial.timeout = min(left_s, 0.05)
+            data = self._serial.read(max(1, self._serial.in_waiting))
+            for answered, body in self._reader.feed(data):
+                if answered == sequence:
+                    return body
+        return None
+
+
+def _integers(command: str, words: list[str], count: int) -> list[int]:
+    try:
+        numbers = [int(word) for word in words[:count]]
+    except ValueError:
+        numbers = []
+    if len(numbers) < count:
+        raise TriggerRefused(command, f"answered {' '.join(words)!r}, which is no answer")
+    return numbers
+
+
+def _fields(words: list[str]) -> dict[str, str]:
+    return dict(word.split("=", 1) for word in words if "=" in word)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

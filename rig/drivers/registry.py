@@ -1,0 +1,19 @@
+"""The driver that rig.toml names for a camera; its module, and with it any vendor's package, is imported on use."""
+
+import importlib
+from pathlib import Path
+from typing import Protocol, cast, runtime_checkable
+
+from rig.drivers.base import Driver
+from rig.formats.rig_toml import CameraConfig
+
+
+@runtime_checkable
+class _DriverModule(Protocol):
+    def make(self, camera: CameraConfig, folder: Path) -> Driver: ...
+
+
+def driver_for(camera: CameraConfig, folder: Path) -> Driver:
+    """The camera's driver, not opened yet. ``folder`` is where rig.toml lies. Raises DriverMissing."""
+    module = cast(_DriverModule, importlib.import_module(f".{camera.driver}", __package__))
+    return module.make(camera, folder)

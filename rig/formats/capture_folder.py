@@ -1,0 +1,170 @@
+"""One synchronised shot of every camera, and the folder that holds it.
+
+cameras.json                       (or a COLMAP, caliscope or aniposelib file: rig.formats.cameras_file)
+images/<camera>.png|jpg|jpeg|tif|webp
+background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
+features.json                      optional
+masks/<camera>.png                 optional; then background/ may be absent
+"""
+
+import hashlib
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.capture import Capture, Features
+from rig.errors import InputError
+from rig.formats.cameras_file import find_rig_file, read_rig_file, rig_file_parts
+from rig.formats.cameras_json import write_rig
+from rig.formats.features_json import document_from_features, features_from_bytes
+from rig.formats.images import decode_image_file, write_image
+from rig.plausibility import rig_faults
+from rig.rig import Rig
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+
+
+PLATES_MOST = 32  # clean plates read per camera
+
+
+def read_capture(folder: Path) -> tuple[Capture, Rig]:
+    """Reads a capture folder. Raises InputError that names every fault in it."""
+    faults: list[str] = []
+    folder = capture_root(folder)
+    rig_file = find_rig_file(folder)
+    if rig_file is None:
+        raise InputError(folder.name, ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+    try:
+        rig = read_rig_file(rig_file)
+    except InputError as error:
+        raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+    faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
+    capture = read_shot(folder, rig, faults)
+    if faults:
+        raise InputError("capture", faults)
+    digests = dict(capture.digests)
+    for path in rig_file_parts(rig_file):
+        digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
+    ordered = dict(sorted(digests.items()))
+    return Capture(capture.images, capture.backgrounds, capture.masks, capture.features, ordered), rig
+
+
+def capture_root(folder: Path) -> Path:
+    """``folder``, or the single folder in it: an archive may hold one enclosing folder."""
+    if not folder.is_dir():
+        raise InputError(str(folder.name or folder), ["is no folder; give the capture folder that holds cameras.json"])
+    entries = [entry for entry in folder.iterdir() if not entry.name.startswith((".", "__MACOSX"))]
+    return entries[0] if len(entries) == 1 and entries[0].is_dir() and entries[0].name != "sparse" else folder
+
+
+def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
+    """The images of a folder for a known rig; appends every fault to ``faults``."""
+    jobs: list[tuple[str, str, Path]] = []
+    for camera in rig:
+        image = _image_file(folder / "images", camera.name, faults)
+        mask = _image_file(folder / "masks", camera.name, faults)
+        plates = _plate_files(folder / "background", camera.name, faults)
+        if image is None:
+            faults.append(f"images/{camera.name}.png is missing (or .jpg, .jpeg, .tif, .webp)")
+        if not plates and mask is None:
+            faults.append(
+                f"background/{camera.name}.png is missing: a clean plate, or masks/{camera.name}.png, is needed"
+            )
+        found = [("images", image), ("masks", mask), *(("background", plate) for plate in plates)]
+        jobs += [(kind, camera.name, path) for kind, path in found if path is not None]
+    with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
+        decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig), jobs))
+    images: dict[str, np.ndarray] = {}
+    masks: dict[str, np.ndarray] = {}
+    backgrounds: dict[str, list[np.ndarray]] = {}
+    digests: dict[str, str] = {}
+    for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
+        if fault or pixels is None:
+            faults.append(fault)
+            continue
+        digests[path.relative_to(folder).as_posix()] = digest
+        if kind == "images":
+            images[name] = pixels
+        elif kind == "masks":
+            masks[name] = pixels
+        else:
+            backgrounds.setdefault(name, []).append(pixels)
+    features: Features = {}
+    if (folder / "features.json").is_file():
+        data = (folder / "features.json").read_bytes()
+        digests["features.json"] = hashlib.sha256(data).hexdigest()
+        features = features_from_bytes(data, rig, faults)
+    return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
+
+
+def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
+    """Writes a capture folder of PNG files; every file under a temporary name first."""
+    write_rig(rig, folder / "cameras.json")
+    files: list[tuple[Path, np.ndarray]] = []
+    for name, image in capture.images.items():
+        files.append((folder / "images" / f"{name}.png", image))
+    for name, plates in capture.backgrounds.items():
+        several = len(plates) > 1
+        for i, plate in enumerate(plates):
+            files.append((folder / "background" / (f"{name}/{i:03}.png" if several else f"{name}.png"), plate))
+    for name, mask in capture.masks.items():
+        files.append((folder / "masks" / f"{name}.png", mask.astype(np.uint8) * 255))
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        list(pool.map(lambda file: write_image(*file), files))
+    if capture.features:
+        text = json.dumps(document_from_features(capture.features), indent=1)
+        write_atomically(folder / "features.json", text.encode())
+
+
+def _decode(folder: Path, kind: str, name: str, path: Path, *, rig: Rig) -> tuple[np.ndarray | None, str, str]:
+    k = rig[name].intrinsics
+    where = path.relative_to(folder).as_posix()
+    pixels, digest, fault = decode_image_file(path, where, grey=kind == "masks")
+    if pixels is not None and pixels.shape[:2] != (k.height, k.width):
+        height, width = pixels.shape[:2]
+        return None, "", size_fault(where, (width, height), (k.width, k.height))
+    if pixels is not None and kind == "masks":
+        pixels = pixels > 0
+        if not pixels.any():
+            return None, "", f"{where} is empty: no pixel belongs to the subject"
+    if pixels is not None:
+        pixels.setflags(write=False)
+    return pixels, digest, fault
+
+
+def size_fault(where: str, size: tuple[int, int], wanted: tuple[int, int]) -> str:
+    """A sentence for a picture that is not of its camera's size (width, height)."""
+    fault = f"{where} is {size[0]} x {size[1]} pixels, but its camera is {wanted[0]} x {wanted[1]}"
+    return f"{fault}: it was turned by 90 degrees; turn it back" if size == wanted[::-1] else fault
+
+
+def stray_faults(folder: Path, rig: Rig) -> list[str]:
+    """Pictures, masks and clean plates that belong to no camera of the rig."""
+    files = [path for kind in ("images", "masks", "background") for path in _listed(folder / kind)]
+    return [
+        f"{path.relative_to(folder).as_posix()} has no camera: the rig has {', '.join(rig.names)}"
+        for path in files
+        if path.stem not in rig
+    ]
+
+
+def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
+    found = [path for path in _listed(folder) if path.stem == stem and path.is_file()]
+    if len(found) > 1:
+        faults.append(f"{folder.name}/ holds {' and '.join(path.name for path in found)}: which one is meant?")
+    return found[0] if found else None
+
+
+def _plate_files(folder: Path, stem: str, faults: list[str]) -> list[Path]:
+    single = _image_file(folder, stem, faults)
+    several = _listed(folder / stem)[:PLATES_MOST]
+    return [single] if single is not None else several
+
+
+def _listed(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))

@@ -1,0 +1,236 @@
+"""COLMAP models, text and binary (https://colmap.github.io/format.html; parameter order of
+``src/colmap/sensor/models.h``).
+
+COLMAP puts pixel (0.5, 0.5) at the centre of the top-left pixel, this project (0, 0): half a pixel is taken off on the
+way in and added on the way out. Its scale is free and taken as millimetres."""
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
+from rig.formats.cameras_json import CAMERAS_MOST
+from rig.formats.foreign import judged_rig, parsed
+from rig.geometry import vector_from_rotation
+from rig.rig import Rig
+
+# name: (number in the binary file, parameter names in their order). Fisheye and other models have no counterpart here.
+COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
+    "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k1")),
+    "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+}
+
+
+COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
+
+
+def read_colmap(folder: Path, suffix: str = ".bin") -> Rig:
+    """The rig in a COLMAP model: every image is a camera of this project, named after the image file."""
+    files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
+    subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
+    parsers: tuple[Callable[..., Any], ...] = (
+        (_binary_cameras, _binary_images) if suffix == ".bin" else (_text_cameras, _text_images)
+    )
+    cameras, images = (parsed(path, parse) for path, parse in zip(files, parsers, strict=True))
+    names = _image_names([image["name"] for image in images])
+    faults: list[str] = []
+    entries = []
+    for name, image in zip(names, images, strict=True):
+        camera = cameras.get(image["camera"])
+        if camera is None:
+            faults.append(f"image {name!r} names camera {image['camera']}, which cameras{suffix} lacks")
+            continue
+        entries.append(_colmap_entry(name, image, camera, faults))
+    return judged_rig(entries, subject, faults)
+
+
+def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = ".png") -> None:
+    """Writes ``cameras``, ``images`` and an empty ``points3D``; images are called ``<camera><suffix>``."""
+    end = ".bin" if binary else ".txt"
+    encode = _binary_model if binary else _text_model
+    for kind, data in zip(("cameras", "images", "points3D"), encode(rig, suffix), strict=True):
+        write_atomically(folder / f"{kind}{end}", data)
+
+
+class _Records:
+    """Little-endian records read one after the other; ``struct.error`` where the bytes end too early."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self.at += struct.calcsize("<" + layout)
+        return values
+
+    def count(self, least_bytes: int) -> int:
+        """A count whose records can still fit in the file; a larger one is damage, found before it costs anything."""
+        (count,) = self.take("Q")
+        if count * least_bytes > len(self.data) - self.at:
+            raise ValueError(f"promises {count} records, more than the file can hold")
+        return count
+
+    def skip(self, size: int) -> None:
+        self.at += size
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise ValueError("a name has no end")
+        text = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
+        return text
+
+
+def _binary_cameras(data: bytes) -> dict[int, dict[str, Any]]:
+    records = _Records(data)
+    cameras = {}
+    for _ in range(records.count(24)):
+        number, model, width, height = records.take("iiQQ")
+        name = COLMAP_NAMES.get(model)
+        if name is None:
+            raise ValueError(_model_fault(f"number {model}", number))
+        values = records.take(f"{len(COLMAP_MODELS[name][1])}d")
+        cameras[number] = {"model": name, "width": width, "height": height, "values": values}
+    return cameras
+
+
+def _binary_images(data: bytes) -> list[dict[str, Any]]:
+    records = _Records(data)
+    images = []
+    for _ in range(_limited(records.count(73))):
+        _, *pose, camera = records.take("i7di")
+        images.append({"pose": pose, "camera": camera, "name": records.text()})
+        records.skip(24 * records.count(24))
+    return images
+
+
+def _text_cameras(data: bytes) -> dict[int, dict[str, Any]]:
+    cameras = {}
+    for line in _text_lines(data):
+        if not line.split():
+            continue
+        number, name, width, height, *values = line.split()
+        if name not in COLMAP_MODELS:
+            raise ValueError(_model_fault(repr(name)[:60], number))
+        wanted = len(COLMAP_MODELS[name][1])
+        if len(values) != wanted:
+            raise ValueError(f"camera {number[:20]} has {len(values)} parameters; {name} has {wanted}")
+        numbers = tuple(float(value) for value in values)
+        cameras[int(number)] = {"model": name, "width": int(width), "height": int(height), "values": numbers}
+    return cameras
+
+
+def _text_images(data: bytes) -> list[dict[str, Any]]:
+    images = []
+    lines = _text_lines(data)
+    for line in lines:
+        if not line.split():
+            continue
+        words = line.split(maxsplit=9)
+        if len(words) != 10:
+            raise ValueError(f"an image line has {len(words)} entries, wanted 10")
+        pose = [float(word) for word in words[1:8]]
+        images.append({"pose": pose, "camera": int(words[8]), "name": words[9].strip()})
+        next(lines, "")  # its 2D points
+        _limited(len(images))
+    return images
+
+
+def _text_lines(data: bytes) -> Iterator[str]:
+    return (line for line in data.decode("utf-8").splitlines() if not line.lstrip().startswith("#"))
+
+
+def _limited(count: int) -> int:
+    if count > CAMERAS_MOST:
+        raise ValueError(f"{count} images; a rig has at most {CAMERAS_MOST} cameras, one image each")
+    return count
+
+
+def _model_fault(model: str, number: Any) -> str:
+    return f"camera {number!s:.20} has the model {model}; known are {', '.join(COLMAP_MODELS)}"
+
+
+def _image_names(files: list[str]) -> list[str]:
+    """Camera names: the images' stems or, where those repeat (``cam00/shot.png``), the folders they lie in."""
+    paths = [Path(file.replace("\\", "/")) for file in files]
+    stems = [path.stem for path in paths]
+    folders = [path.parent.name for path in paths]
+    return folders if len(set(stems)) < len(stems) and all(folders) else stems
+
+
+def _colmap_entry(name: str, image: dict[str, Any], camera: dict[str, Any], faults: list[str]) -> dict[str, Any]:
+    parameters = dict(zip(COLMAP_MODELS[camera["model"]][1], camera["values"], strict=True))
+    if any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
+        faults.append(f"image {name!r}: k4, k5, k6 of FULL_OPENCV are not zero; calibrate with k1 k2 p1 p2 k3 only")
+    focal = parameters.get("f", 0.0)
+    w, x, y, z = _unit_quaternion(image["pose"][:4])
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return {
+        "name": name,
+        "width": camera["width"],
+        "height": camera["height"],
+        "intrinsics": {
+            "fx": parameters.get("fx", focal),
+            "fy": parameters.get("fy", focal),
+            "cx": parameters["cx"] - 0.5,
+            "cy": parameters["cy"] - 0.5,
+        },
+        "distortion": {key: parameters.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")},
+        "camera_from_world": {"rotation": rotation, "translation": list(image["pose"][4:])},
+    }
+
+
+def _unit_quaternion(values: list[float]) -> tuple[float, ...]:
+    length = math.hypot(*values)
+    # A length far from 1 is no rotation; NaN is named by the document's own check.
+    return tuple(value / length for value in values) if 0.9 < length < 1.1 else (math.nan,) * 4
+
+
+def _colmap_parameters(camera: Camera) -> list[float]:
+    k, d = camera.intrinsics, camera.intrinsics.distortion
+    return [k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, d.k1, d.k2, d.p1, d.p2, d.k3, 0.0, 0.0, 0.0]
+
+
+def _colmap_pose(camera: Camera) -> list[float]:
+    vector = vector_from_rotation(camera.camera_from_world.rotation)
+    angle = float(np.linalg.norm(vector))
+    imaginary = vector * (math.sin(angle / 2) / angle if angle > 1e-12 else 0.5)
+    return [math.cos(angle / 2), *imaginary.tolist(), *camera.camera_from_world.translation.tolist()]
+
+
+def _text_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    for number, camera in enumerate(rig, start=1):
+        k = camera.intrinsics
+        parameters = " ".join(map(repr, _colmap_parameters(camera)))
+        cameras.append(f"{number} FULL_OPENCV {k.width} {k.height} {parameters}")
+        images += [f"{number} {' '.join(map(repr, _colmap_pose(camera)))} {number} {camera.name}{suffix}", ""]
+    points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
+    return "\n".join([*cameras, ""]).encode(), "\n".join([*images, ""]).encode(), points.encode()
+
+
+def _binary_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
+    count = struct.pack("<Q", len(rig))
+    cameras, images = [count], [count]
+    model = COLMAP_MODELS["FULL_OPENCV"][0]
+    for number, camera in enumerate(rig, start=1):
+        k = camera.intrinsics
+        cameras.append(struct.pack("<iiQQ12d", number, model, k.width, k.height, *_colmap_parameters(camera)))
+        images.append(struct.pack("<i7di", number, *_colmap_pose(camera), number))
+        images.append(f"{camera.name}{suffix}".encode() + b"\0" + struct.pack("<Q", 0))
+    return b"".join(cameras), b"".join(images), struct.pack("<Q", 0)

@@ -1,0 +1,69 @@
+"""PLY as the contract fixes it. The writer is our own: trimesh writes neither the extra vertex properties nor the same
+bytes in
+every version."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rig.atomic_write import write_atomically
+from rig.mesh import Mesh
+
+PLY_VERTEX = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    + [(name, "u1") for name in ("red", "green", "blue")]
+    + [("quality", "<f4"), ("views", "u1")]
+)
+
+
+PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+
+
+PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+
+
+def ply_bytes(
+    mesh: Mesh,
+    *,
+    normals: Float[np.ndarray, "v 3"],
+    colours: UInt8[np.ndarray, "v 3"],
+    quality: Float[np.ndarray, " v"],
+    views: UInt8[np.ndarray, " v"],
+    part: UInt8[np.ndarray, " v"] | None = None,
+    comments: Sequence[str] = (),
+) -> bytes:
+    """Binary little-endian PLY. ``quality`` is the standard deviation (mm), ``views`` how many images coloured it,
+    ``part`` what a vertex belongs to (a property more, where it is given)."""
+    kind = PLY_VERTEX if part is None else np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
+    vertices = np.empty(len(mesh.vertices), kind)
+    for i, axis in enumerate("xyz"):
+        vertices[axis] = mesh.vertices[:, i]
+        vertices["n" + axis] = normals[:, i]
+    for i, channel in enumerate(("red", "green", "blue")):
+        vertices[channel] = colours[:, i]
+    vertices["quality"], vertices["views"] = quality, views
+    if part is not None:
+        vertices["part"] = part
+    faces = np.empty(len(mesh.faces), PLY_FACE)
+    faces["count"], faces["corners"] = 3, mesh.faces
+    properties = [f"property {PLY_TYPES[kind[name].str]} {name}" for name in kind.names or ()]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {comment}" for comment in comments),
+        f"element vertex {len(vertices)}",
+        *properties,
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
+    return "\n".join(header).encode("ascii") + vertices.tobytes() + faces.tobytes()
+
+
+def write_ply(path: Path, mesh: Mesh, **properties: Any) -> None:
+    """``ply_bytes`` to a file, under a temporary name first."""
+    write_atomically(path, ply_bytes(mesh, **properties))

@@ -1,0 +1,285 @@
+"""rig.toml: which cameras, trigger box and lights make up a rig, and what a good shot is.
+
+Every table is a frozen dataclass whose fields are the keys; unknown keys are refused with the nearest known one. A
+camera is named by what survives a reboot (serial number, /dev/v4l/by-id or by-path, address), never by an index:
+indices swap. deploy/rig.example.toml shows every key.
+"""
+
+import dataclasses
+import difflib
+import re
+import tomllib
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rig.errors import InputError
+from rig.formats.cameras_json import name_fault
+
+FORMAT = "eigenhead-rig/1"
+DriverName = Literal["opencv", "gphoto", "genicam", "replay", "simulated"]
+TriggerMode = Literal["external", "software", "free"]
+
+# Kernel numbers are given out in the order of discovery, so they change with a reboot or another port.
+_INDEXED_CAMERA = re.compile(r"\d{1,2}|/dev/video\d+|usb:\d+,\d+|(fake_?|cam(era)?)?#\d+", re.IGNORECASE)
+_INDEXED_PORT = re.compile(r"\d{1,2}|/dev/tty(USB|ACM|S)\d+|COM\d+", re.IGNORECASE)
+
+_CAMERA_BOUNDS = {
+    "delay_us": (0, 500_000),
+    "latency_ms": (0, 60_000),
+    "width": (1, 65_536),
+    "height": (1, 65_536),
+    "fps": (0.01, 1000),
+    "exposure_ms": (0.001, 60_000),
+    "gain_db": (-60, 60),
+    "white_balance_k": (1000, 20_000),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraConfig:
+    """One [[cameras]] table. What is None is left as the camera has it."""
+
+    name: str
+    driver: DriverName
+    identity: str
+    trigger: TriggerMode = "external"  # external: the box's output; software: a command at the shot; free: it runs
+    channel: int | None = None  # output of the trigger box
+    delay_us: int = 0  # of that output
+    latency_ms: float = 0.0  # from exposure to arrival: readout and transport, by `rig check`
+    pixel_format: str | None = None
+    width: int | None = None
+    height: int | None = None
+    fps: float | None = None
+    exposure_ms: float | None = None
+    gain_db: float | None = None
+    white_balance_k: int | None = None
+    rotation_deg: Literal[0, 90, 180, 270] = 0  # clockwise, of the picture, to stand upright
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TriggerConfig:
+    """[trigger]: the box. ``port`` is a path under /dev/serial/by-id, or a link that a udev rule makes."""
+
+    port: str
+    baud: int = 115200
+    pulse_us: int = 1000
+    window_s: float = 5.0  # the box disarms itself after it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightsConfig:
+    """[lights]: which light outputs of the box are on during a shot."""
+
+    outputs: tuple[int, ...] = ()
+    settle_s: float = 0.3  # halogen and LED drivers reach their level well within it
+    keep_on: bool = False  # after the session
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShotConfig:
+    """[shot]: how long to wait and what to accept."""
+
+    timeout_s: float = 2.0
+    open_timeout_s: float = 10.0
+    warm_up_frames: int = 3
+    plates: int = 5
+    skew_most_ms: float = 40.0  # in which a head that drifts at 25 mm/s moves 1 mm
+    clipped_most: float = 0.05  # share of pixels at 255 in every channel
+    dark_below: float = 0.25  # brightness relative to the clean plates
+    blur_most_px: float = 2.5  # standard deviation of the edge spread
+    moved_most_px: float = 1.0  # of the background against the clean plates
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigConfig:
+    """A whole rig.toml. ``folder`` is where it lies: relative paths in it start there."""
+
+    format: Literal["eigenhead-rig/1"]
+    cameras: tuple[CameraConfig, ...]
+    name: str = "rig"
+    calibration: str | None = None  # cameras.json
+    plates: str = "plates"  # folder of the clean plates
+    front: str | None = None
+    trigger: TriggerConfig | None = None
+    lights: LightsConfig = LightsConfig()
+    shot: ShotConfig = ShotConfig()
+    folder: Path = dataclasses.field(default=Path(), metadata={"key": False})
+
+    @property
+    def plates_folder(self) -> Path:
+        """Where the clean plates are kept."""
+        return self.folder / self.plates
+
+    @property
+    def calibration_file(self) -> Path | None:
+        """The calibration that this rig uses, if it names one."""
+        return None if self.calibration is None else self.folder / self.calibration
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Camera names in the file's order."""
+        return tuple(camera.name for camera in self.cameras)
+
+
+def read_rig_config(path: Path) -> RigConfig:
+    """Reads rig.toml. Raises InputError that names every fault."""
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(
+            str(path), [f"cannot be read ({error.strerror}); start from deploy/rig.example.toml"]
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(path.name, [f"is no TOML: {error}"]) from error
+    return rig_config_from_document(document, path.parent, path.name)
+
+
+def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject: str = "rig.toml") -> RigConfig:
+    """A rig from parsed TOML. Raises InputError that names every fault."""
+    faults: list[str] = []
+    config = _read_table(RigConfig, document, "", faults)
+    if config is not None:
+        faults.extend(_rig_faults(config))
+    if faults or config is None:
+        raise InputError(subject, faults)
+    return dataclasses.replace(config, folder=folder)
+
+
+def _rig_faults(config: RigConfig) -> list[str]:
+    faults: list[str] = []
+    if not config.cameras:
+        faults.append("cameras: none; add one [[cameras]] table each")
+    if config.front is not None and config.front not in config.names:
+        faults.append(f"front: {config.front!r} is no camera of this rig{_nearest(config.front, config.names)}")
+    for what in ("name", "identity", "channel"):
+        faults.extend(_doubles(config, what))
+    for camera in config.cameras:
+        faults.extend(f"cameras.{camera.name}: {fault}" for fault in _camera_faults(camera, config.trigger))
+    if config.trigger is not None:
+        faults.extend(f"trigger: {fault}" for fault in _trigger_faults(config.trigger))
+    faults.extend(
+        f"lights.outputs: {output} is no output; 0 to 3" for output in config.lights.outputs if output not in range(4)
+    )
+    faults.extend(f"shot.{fault}" for fault in _shot_faults(config.shot))
+    return faults
+
+
+def _doubles(config: RigConfig, what: str) -> list[str]:
+    users: dict[Any, list[str]] = {}
+    for camera in config.cameras:
+        if what == "identity" and camera.driver in ("replay", "simulated"):
+            continue  # one file holds all of them
+        users.setdefault(getattr(camera, what), []).append(camera.name)
+    return [
+        f"cameras: {what} {value!r} is used by {len(names)} cameras ({', '.join(names)})"
+        for value, names in users.items()
+        if len(names) > 1 and value is not None
+    ]
+
+
+def _camera_faults(camera: CameraConfig, trigger: TriggerConfig | None) -> list[str]:
+    faults: list[str] = []
+    fault = name_fault(camera.name)
+    if fault:
+        faults.append(f"name: {fault}")
+    if not camera.identity.strip():
+        faults.append("identity: empty")
+    if _INDEXED_CAMERA.fullmatch(camera.identity.strip()):
+        faults.append(
+            f"identity: {camera.identity!r} is an index, which may be another camera after a reboot; "
+            "give its serial number, its path under /dev/v4l/by-id or by-path, or its address"
+        )
+    if camera.channel is not None and camera.channel not in range(12):
+        faults.append(f"channel: {camera.channel} is no output of the trigger box; 0 to 11")
+    if camera.channel is not None and trigger is None:
+        faults.append("channel: there is no [trigger] table")
+    for key, (least, most) in _CAMERA_BOUNDS.items():
+        value = getattr(camera, key)
+        if value is not None and not least <= value <= most:
+            faults.append(f"{key}: {value} is not between {least} and {most}")
+    return faults
+
+
+def _trigger_faults(trigger: TriggerConfig) -> list[str]:
+    faults: list[str] = []
+    if _INDEXED_PORT.fullmatch(trigger.port.strip()):
+        faults.append(
+            f"port: {trigger.port!r} is an index, which may be another device after a reboot; "
+            "give its path under /dev/serial/by-id"
+        )
+    if not 1 <= trigger.pulse_us <= 500_000:
+        faults.append(f"pulse_us: {trigger.pulse_us} is not between 1 and 500000")
+    if not 0.1 <= trigger.window_s <= 60:
+        faults.append(f"window_s: {trigger.window_s} is not between 0.1 and 60")
+    return faults
+
+
+def _shot_faults(shot: ShotConfig) -> list[str]:
+    least = {"warm_up_frames": 1, "plates": 1}
+    return [
+        f"{field.name}: {getattr(shot, field.name)} is too small; at least {least.get(field.name, 0)}"
+        for field in dataclasses.fields(shot)
+        if getattr(shot, field.name) < least.get(field.name, 1e-9)
+    ]
+
+
+def _read_table(kind: type, table: Any, where: str, faults: list[str]) -> Any:
+    """A dataclass from a table; None, with the faults noted, where a value is missing or of a wrong type."""
+    if not isinstance(table, Mapping):
+        faults.append(f"{where or 'document'}: is no table")
+        return None
+    fields = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("key", True)}
+    hints = typing.get_type_hints(kind)
+    prefix = f"{where}." if where else ""
+    before = len(faults)
+    faults.extend(f"{prefix}{key}: no such key{_nearest(key, fields)}" for key in table if key not in fields)
+    values: dict[str, Any] = {}
+    for name, field in fields.items():
+        if name in table:
+            values[name] = _read_value(hints[name], table[name], prefix + name, faults)
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            faults.append(f"{prefix}{name}: missing{_allowed(hints[name])}")
+    return kind(**values) if len(faults) == before else None
+
+
+def _read_value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        if value not in arguments or isinstance(value, bool):
+            faults.append(f"{where}: {value!r} is not allowed{_allowed(hint)}{_nearest(value, arguments)}")
+        return value
+    if origin in (types.UnionType, typing.Union):
+        return _read_value(arguments[0], value, where, faults)
+    if origin is tuple:
+        if not isinstance(value, list):
+            faults.append(f"{where}: is no list")
+            return ()
+        return tuple(_read_value(arguments[0], v, _item(where, v, i), faults) for i, v in enumerate(value))
+    if dataclasses.is_dataclass(hint):
+        return _read_table(typing.cast(type, hint), value, where, faults)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
+        faults.append(f"{where}: {value!r} is no {_WORDS.get(hint, hint)}")
+    return value
+
+
+_WORDS = {str: "text", int: "whole number", float: "number", bool: "true or false"}
+
+
+def _item(where: str, value: Any, index: int) -> str:
+    name = value.get("name") if isinstance(value, Mapping) else None
+    return f"{where}.{name}" if isinstance(name, str) else f"{where}[{index}]"
+
+
+def _allowed(hint: Any) -> str:
+    return f"; one of {', '.join(map(str, typing.get_args(hint)))}" if typing.get_origin(hint) is Literal else ""
+
+
+def _nearest(word: Any, known: Iterable[Any]) -> str:
+    near = difflib.get_close_matches(str(word), [str(k) for k in known], n=1, cutoff=0.5)
+    return f"; did you mean {near[0]!r}?" if near else ""

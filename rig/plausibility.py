@@ -1,0 +1,106 @@
+"""What can be said against a rig before a picture of it is looked at: every fault at once, each with its remedy."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.camera import Camera
+from rig.geometry import RigidTransform
+from rig.rig import Rig
+
+ONE_PLACE_MM = 1e-3
+LEAST_SPREAD_MM = 20.0  # of the camera centres; a rig of two metres whose file is in metres has 2
+LENS_GROWTH_LEAST, LENS_GROWTH_MOST = 0.4, 1.5  # distorted by undistorted radius: 0.6 at 100 degrees of a barrel lens
+LENS_LOST_MOST = 0.1  # share of the picture's middle that no ray meets
+MIDDLE = (
+    0.6  # of width and height: where boards are shown and subjects stand; beyond it a good calibration may fold over
+)
+GRID = (9, 7)
+CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
+
+
+def rig_faults(rig: Rig) -> list[str]:
+    """Faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base line."""
+    faults = [fault for camera in rig if (fault := _lens_fault(camera))]
+    convention = _convention_fault(rig)
+    return faults + ([convention] if convention else _spread_faults(rig))
+
+
+def _lens_fault(camera: Camera) -> str | None:
+    k = camera.intrinsics
+    edge = 0.5 * (1.0 - MIDDLE)
+    sides = zip((k.width, k.height), GRID, strict=True)
+    columns, rows = (np.linspace(edge * size, (1.0 - edge) * size - 1, count) for size, count in sides)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    distorted = np.linalg.norm((pixels - (k.cx, k.cy)) / (k.fx, k.fy), axis=1)
+    with np.errstate(all="ignore"):
+        radius = np.linalg.norm(camera.undistort(pixels), axis=1)
+    lost = float(np.mean(~np.isfinite(radius)))
+    growth = distorted[radius > 1e-6] / radius[radius > 1e-6]
+    if lost <= LENS_LOST_MOST and (growth > LENS_GROWTH_LEAST).all() and (growth < LENS_GROWTH_MOST).all():
+        return None
+    d = k.distortion
+    told = f"k1 = {d.k1:g}, k2 = {d.k2:g}, p1 = {d.p1:g}, p2 = {d.p2:g}, k3 = {d.k3:g}"
+    what = f"no ray meets {lost:.0%} of its middle" if lost > LENS_LOST_MOST else "it bends it out of all shape"
+    return f"{camera.name}: the lens is absurd ({told}; {what}): calibrate it again"
+
+
+def _spread_faults(rig: Rig) -> list[str]:
+    centres = np.stack([camera.centre_world for camera in rig])
+    spread = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+    if spread < ONE_PLACE_MM:
+        return ["every camera stands at one place: nothing can be measured without a base line; calibrate the rig"]
+    if spread < LEAST_SPREAD_MM:
+        return [
+            f"the cameras stand within {spread:.3g} mm of each other: their translations look like metres, "
+            "and millimetres are wanted; multiply them by 1000"
+        ]
+    return []
+
+
+def _convention_fault(rig: Rig) -> str | None:
+    """Poses that look at no common point as they are written, and all at one when read in another convention."""
+    if _share_looking_at_one_point(rig) > DIVERGING_MOST:
+        return None
+    for other, remedy in _CONVENTIONS.items():
+        read = Rig(tuple(replace(camera, camera_from_world=remedy[0](camera.camera_from_world)) for camera in rig))
+        if _share_looking_at_one_point(read) >= CONVERGING_LEAST:
+            return (
+                f"camera_from_world holds {other}: as written the cameras look at no common point, "
+                f"and read so they do; {remedy[1]}"
+            )
+    return None
+
+
+def _share_looking_at_one_point(rig: Rig) -> float:
+    """Share of the cameras that have the point nearest to all optical axes in their picture."""
+    point: Float[np.ndarray, "1 3"] = rig.centre_world()[None]
+    seen = 0
+    for camera in rig:
+        with np.errstate(all="ignore"):
+            column, row = camera.project(point)[0]
+        seen += bool(0 <= column <= camera.intrinsics.width - 1 and 0 <= row <= camera.intrinsics.height - 1)
+    return seen / len(rig)
+
+
+_GL = np.diag([1.0, -1.0, -1.0])
+_CONVENTIONS = {
+    "world_from_camera": (lambda pose: pose.inverse(), "write the inverse of each pose"),
+    "the camera's place in translation": (
+        lambda pose: RigidTransform(pose.rotation, -pose.rotation @ pose.translation),
+        "write -rotation @ place",
+    ),
+    "the rotation transposed": (
+        lambda pose: RigidTransform(pose.rotation.T, pose.translation),
+        "transpose each rotation",
+    ),
+    "camera axes with y up and z backwards": (
+        lambda pose: RigidTransform(_GL @ pose.rotation, _GL @ pose.translation),
+        "negate the second and third row of each pose (x right, y down, z forward)",
+    ),
+    "world_from_camera with y up and z backwards": (
+        lambda pose: RigidTransform(_GL @ pose.inverse().rotation, _GL @ pose.inverse().translation),
+        "write the inverse of each pose, its second and third row negated",
+    ),
+}

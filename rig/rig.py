@@ -1,0 +1,54 @@
+"""A rig: named calibrated cameras."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """The cameras, in the order of their file."""
+
+    cameras: tuple[Camera, ...]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[Camera]:
+        return iter(self.cameras)
+
+    def __getitem__(self, name: str) -> Camera:
+        return next(camera for camera in self.cameras if camera.name == name)
+
+    def __contains__(self, name: object) -> bool:
+        return any(camera.name == name for camera in self.cameras)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(camera.name for camera in self.cameras)
+
+    def subset(self, names: Iterable[str]) -> "Rig":
+        kept = set(names)
+        return Rig(tuple(camera for camera in self.cameras if camera.name in kept))
+
+    def scaled(self, factor: float) -> "Rig":
+        return Rig(tuple(replace(camera, intrinsics=camera.intrinsics.scaled(factor)) for camera in self.cameras))
+
+    def centre_world(self) -> Float[np.ndarray, " 3"]:
+        """The point nearest to all optical axes (least squares): where the subject is meant to be."""
+        normal, right = np.zeros((3, 3)), np.zeros(3)
+        for camera in self.cameras:
+            off_axis = np.eye(3) - np.outer(camera.axis_world, camera.axis_world)
+            normal += off_axis
+            right += off_axis @ camera.centre_world
+        return np.linalg.solve(normal + 1e-9 * np.eye(3), right)
+
+    def front_camera(self) -> str:
+        """The camera in the middle of the fan: the one whose direction is nearest to the mean of all directions."""
+        directions = np.stack([camera.centre_world for camera in self.cameras]) - self.centre_world()
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return self.cameras[int(np.argmax(directions @ directions.mean(axis=0)))].name

@@ -1,0 +1,92 @@
+"""A simulated capture on disk: the folder that the contract fixes, and its truth beside it."""
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.formats.cameras_json import write_rig
+from rig.formats.capture_folder import write_capture
+from rig.formats.images import write_image
+from rig.formats.ply import write_ply
+from rig.studio.scene.simulate import SimulatedCapture
+
+
+def simulate_to_folder(
+    out: Path, simulated: SimulatedCapture, *, seed: int | None = None, features: bool = True
+) -> Path:
+    """Writes the capture folder ``out`` and ``<out>.truth``; returns the latter.
+
+    The truth holds head.ply (world frame, mm, colours as lit), face_mask.npy and colour_mask.npy (a boolean a vertex),
+    silhouettes/ (subject with hair and clothes, coverage of at least a half), head_silhouettes/ (bare head),
+    coverage/ (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz
+    (points that two or more cameras see, of head, hair and clothes), cameras.json (where the cameras were) and
+    meta.json.
+    """
+    capture = simulated.capture
+    if not features:
+        capture = type(capture)(capture.images, capture.backgrounds, capture.masks)
+    write_capture(out, capture, simulated.rig)
+    truth = out.with_name(out.name + ".truth")
+    write_truth(truth, simulated, seed=seed)
+    return truth
+
+
+def write_truth(folder: Path, simulated: SimulatedCapture, *, seed: int | None = None) -> None:
+    """The truth folder alone."""
+    scene = simulated.scene
+    count = len(scene.head.vertices)
+    face = np.ones(count, bool) if scene.face_region is None else np.asarray(scene.face_region)
+    nothing = np.zeros(count)
+    folder.mkdir(parents=True, exist_ok=True)
+    assert scene.head.colours is not None
+    write_ply(
+        folder / "head.ply",
+        scene.head,
+        normals=scene.head.normals(),
+        colours=scene.head.colours,
+        quality=nothing,
+        views=nothing.astype(np.uint8),
+        comments=("simulated truth, unit mm, frame world",),
+    )
+    np.save(folder / "face_mask.npy", face)
+    np.save(folder / "colour_mask.npy", face & scene.photographed)
+    for name, view in scene.views.items():
+        write_image(folder / "silhouettes" / f"{name}.png", view.mask.astype(np.uint8) * 255)
+        write_image(folder / "head_silhouettes" / f"{name}.png", scene.head_masks[name].astype(np.uint8) * 255)
+        coverage = np.rint(255 * np.clip(view.subject[:, :, 3], 0, 1)).astype(np.uint8)
+        write_image(folder / "coverage" / f"{name}.png", coverage)
+        write_image(folder / "parts" / f"{name}.png", scene.parts[name])
+    write_atomically(folder / "visible.npz", _npz_bytes(scene.visible.arrays()))
+    write_rig(scene.true_rig, folder / "cameras.json")
+    write_atomically(folder / "meta.json", json.dumps(_meta(simulated, int(face.sum()), seed), indent=1).encode())
+
+
+def _npz_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def _meta(simulated: SimulatedCapture, face_vertices: int, seed: int | None) -> dict[str, object]:
+    scene = simulated.scene
+    pose = scene.world_from_head
+    return {
+        "name": scene.name,
+        "subject": scene.name,
+        "seed": seed,
+        "hairstyle": list(scene.preset.hairstyle),
+        "features": bool(simulated.capture.features),
+        "vertices": len(scene.head.vertices),
+        "face_vertices": face_vertices,
+        "world_from_head": {
+            "scale": pose.scale,
+            "rotation": pose.rotation.tolist(),
+            "translation": (pose.translation / pose.scale).tolist(),  # x_world = s (R x_head + t)
+        },
+        "landmarks_world": {name: point.tolist() for name, point in scene.landmarks_world.items()},
+        "faults": [{"kind": f.kind, "camera": f.camera, "amount": f.strength} for f in simulated.faults],
+    }

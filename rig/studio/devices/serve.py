@@ -1,0 +1,336 @@
+"""The simulated studio as a set of real devices: motion-JPEG streams on loopback and a trigger box on a pty.
+
+The opencv driver and the serial client run unchanged against it. What the cameras see is the caller's: an
+``ImageSource`` for the empty studio and one with the subject seated; this module adds lamps, cables, triggers and
+what can go wrong with them.
+"""
+
+import json
+import threading
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.atomic_write import write_atomically
+from rig.errors import InputError
+from rig.formats.cameras_json import write_rig
+from rig.studio.devices.sources import ImageSource, SceneImages
+from rig.studio.devices.streams import Film, StreamServer
+from rig.studio.devices.trigger_box import LIGHTS, BoxLogic, Release, SimulatedTriggerBox
+from rig.studio.scene.simulate import Scene
+from rig.studio.sensor.faults import fault_parts
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+
+STUDIO = "simulated studio"  # the name in rig.toml
+KINDS = {
+    "dropped": "the next triggered frame of the camera gets lost",
+    "late-trigger": "the output of the camera (no camera: every output) rises late (amount: seconds)",
+    "frozen": "the camera sends the picture that it sent last over and over",
+    "hung": "the camera keeps the connection and sends nothing",
+    "swapped": "the cables of the camera and of the one after it are swapped",
+    "bumped": "the camera was knocked (amount: pixels)",
+    "lights-off": "the lamps stay dark whatever the box says",
+    "dark": "the camera's picture is all but black (amount: what is left of the light)",
+    "unplugged": "the cable of the trigger box is out",
+}
+DEFAULT_AMOUNT = {"late-trigger": 0.15, "bumped": 8.0, "dark": 0.01}
+AMBIENT = 0.08  # of a picture's values, with the lamps off
+_TAKES_LEAST = 2  # two that take turns are never alike
+_JPEG = [
+    cv2.IMWRITE_JPEG_QUALITY,
+    95,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,  # subsampled colour would smear the silhouette by a pixel
+]
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceFault:
+    """A fault of ``KINDS``. ``camera`` None: the whole rig."""
+
+    kind: str
+    camera: str | None = None
+    amount: float | None = None
+
+    @property
+    def strength(self) -> float:
+        """The amount, or the kind's usual one."""
+        return self.amount if self.amount is not None else DEFAULT_AMOUNT.get(self.kind, 0.0)
+
+
+def device_fault_from_text(text: str) -> DeviceFault:
+    """``kind[:camera][=amount]``. Raises InputError; ``StudioDevices.inject`` judges whether a studio can do it."""
+    kind, camera, amount = fault_parts(text)
+    if kind not in KINDS:
+        raise InputError("fault", [f"{kind!r} is none of {', '.join(KINDS)}"])
+    return DeviceFault(kind, camera, amount)
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """Everything that a camera's picture depends on."""
+
+    camera: str
+    seated: bool
+    light: float
+    bump_px: float
+
+
+class StudioDevices:
+    """Eleven (or any number of) streams and a box; ``folder`` receives rig.toml and the link to the box's port.
+
+    ``takes`` is how many pictures of the empty studio, each with noise of its own, the live view shows in turn; more
+    clean plates than that would repeat themselves. A context manager; ``close`` leaves no thread, port or link.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        names: Sequence[str],
+        empty: ImageSource,
+        seated: ImageSource,
+        *,
+        fps: float = 4.0,
+        takes: int = 5,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        calibration: str | None = None,
+    ) -> None:
+        self.folder = folder
+        self.names = tuple(names)
+        self.present = False
+        self.faults: tuple[DeviceFault, ...] = ()
+        self._sources = {False: empty, True: seated}
+        self._takes = takes
+        self._calibration = calibration
+        self._lamps = 0
+        self._films: dict[_Look, Film] = {}
+        self._busy = threading.RLock()
+        self.box: SimulatedTriggerBox | None = None
+        self._started_s = time.monotonic()
+        self.streams = StreamServer(names, self._answer, fps=fps, host=host, port=port)
+        try:
+            self._plug_in()
+            self._refresh()
+            self.write_rig()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "StudioDevices":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the streams and the box. Safe to call twice."""
+        if self.box is not None:
+            self.box.close()
+        self.streams.close()
+
+    @property
+    def port_link(self) -> Path:
+        """Where rig.toml finds the trigger box."""
+        return self.folder.resolve() / "trigger-box"
+
+    def seat(self, present: bool) -> None:
+        """The subject takes the seat, or leaves it. Returns when every camera sees it."""
+        with self._busy:
+            self.present = present
+            self._refresh()
+
+    def inject(self, fault: DeviceFault) -> None:
+        """Something goes wrong from now on. Raises InputError for what this studio cannot do."""
+        faults = []
+        if fault.kind not in KINDS:
+            faults.append(f"kind: {fault.kind!r} is none of {', '.join(KINDS)}")
+        needs_camera = fault.kind not in ("late-trigger", "lights-off", "unplugged")
+        if fault.camera not in (*self.names, None) or (fault.camera is None and needs_camera):
+            faults.append(f"camera: {fault.camera!r} is none of {', '.join(self.names)}")
+        if faults:
+            raise InputError("fault", faults)
+        with self._busy:
+            self.faults = (*self.faults, fault)
+            self._apply()
+
+    def clear(self) -> None:
+        """Everything is well again."""
+        with self._busy:
+            self.faults = ()
+            self._apply()
+
+    def write_rig(self) -> Path:
+        """rig.toml of this studio; its path."""
+        text = [
+            'format = "eigenhead-rig/1"',
+            f"name = {json.dumps(STUDIO)}",
+            *([] if self._calibration is None else [f"calibration = {json.dumps(self._calibration)}"]),
+            f"\n[trigger]\nport = {json.dumps(str(self.port_link))}",
+            "\n[lights]\noutputs = [0, 1]\nsettle_s = 0.3",
+            # frames of a loopback are stamped by programs that wait for a processor, not by hardware
+            f"\n[shot]\nplates = {self._takes}\nskew_most_ms = 60",
+        ]
+        for channel, name in enumerate(self.names):
+            identity = json.dumps(self.streams.url(name))
+            text.append(
+                f'\n[[cameras]]\nname = "{name}"\ndriver = "opencv"\nidentity = {identity}\nchannel = {channel}'
+            )
+        path = self.folder / "rig.toml"
+        write_atomically(path, ("\n".join(text) + "\n").encode())
+        return path
+
+    def _plug_in(self) -> None:
+        self.box = SimulatedTriggerBox(self.port_link, BoxLogic(self._on_release, self._on_lights, self.streams.arm))
+
+    def _apply(self) -> None:
+        """Brings every device into the state that the list of faults says."""
+        kinds = {(fault.kind, fault.camera) for fault in self.faults}
+        views = {name: name for name in self.names}
+        for kind, camera in kinds:
+            if kind == "swapped" and camera is not None:
+                other = self.names[(self.names.index(camera) + 1) % len(self.names)]
+                views[camera], views[other] = views[other], views[camera]
+        self.streams.connect(views)
+        for name in self.names:
+            self.streams.freeze(name, ("frozen", name) in kinds)
+            self.streams.hang(name, ("hung", name) in kinds)
+            self.streams.drop_next(name, ("dropped", name) in kinds)
+        unplugged = any(kind == "unplugged" for kind, _ in kinds)
+        if unplugged and self.box is not None:
+            self.box.unplug()
+            self.box = None
+            self._lamps = 0  # the box has its power from the same cable, and the lamps are switched by it
+        elif not unplugged and self.box is None:
+            self._plug_in()
+        self._refresh()
+
+    def _on_release(self, release: Release) -> None:
+        late_s = {name: self._strength("late-trigger", name) for name in self.names}
+        channels = {channel: name for channel, name in enumerate(self.names)}
+        self.streams.release(
+            {
+                channels[channel]: release.time_s + delay_s + late_s[channels[channel]]
+                for channel, delay_s in release.delays_s.items()
+                if channel in channels
+            }
+        )
+
+    def _on_lights(self, mask: int) -> None:
+        self._lamps = mask
+        for name in self.names:
+            self.streams.show(name, self._films[self._look(name)])
+
+    def _strength(self, kind: str, camera: str) -> float:
+        return max((f.strength for f in self.faults if f.kind == kind and f.camera in (camera, None)), default=0.0)
+
+    def _look(self, camera: str, lamps: int | None = None) -> _Look:
+        lit = (self._lamps if lamps is None else lamps) != 0 and not any(f.kind == "lights-off" for f in self.faults)
+        dark = any(f.kind == "dark" and f.camera == camera for f in self.faults)
+        light = (1.0 if lit else AMBIENT) * (self._strength("dark", camera) if dark else 1.0)
+        return _Look(camera, self.present, light, self._strength("bumped", camera))
+
+    def _refresh(self) -> None:
+        """Develops what the cameras see now, with the lamps on and off, before anybody looks."""
+        with ThreadPoolExecutor(2) as pool:
+            films = [film for films in pool.map(self._films_of, self.names) for film in films.items()]
+        # The empty studio comes back with every subject that leaves: its films are kept, theirs are not.
+        self._films = {look: film for look, film in self._films.items() if not look.seated} | dict(films)
+        for name in self.names:
+            self.streams.show(name, self._films[self._look(name)])
+
+    def _films_of(self, camera: str) -> dict[_Look, Film]:
+        """The films of one camera with the lamps off and on."""
+        looks = [self._look(camera, lamps) for lamps in (0, (1 << LIGHTS) - 1)]
+        if all(look in self._films for look in looks):
+            return {look: self._films[look] for look in looks}
+        live = _TAKES_LEAST if self.present else self._takes  # clean plates are taken of the empty studio alone
+        now_s = time.monotonic() - self._started_s
+        takes = [self._sources[self.present](camera, now_s + i) for i in range(live + _TAKES_LEAST)]
+        films: dict[_Look, Film] = {}
+        for look in looks:
+            rng = np.random.default_rng(zlib.crc32(repr(look).encode()))
+            jpegs = tuple(_develop(take, look, rng) for take in takes)
+            films[look] = Film(jpegs[:live], jpegs[live:])
+        return films
+
+    def _answer(self, method: str, path: str, query: Mapping[str, str]) -> tuple[int, str]:
+        """The studio's own page and controls: GET /, POST /subject?present=1, POST and DELETE /faults."""
+        try:
+            if (method, path) == ("GET", "/"):
+                return 200, self._page()
+            if (method, path) == ("POST", "/subject"):
+                self.seat(query.get("present", "1") not in ("0", "no", "false"))
+                return 200, self._state()
+            if (method, path) == ("POST", "/faults"):
+                amount = query.get("amount")
+                self.inject(
+                    DeviceFault(query.get("kind", ""), query.get("camera"), None if amount is None else float(amount))
+                )
+                return 200, self._state()
+            if (method, path) == ("DELETE", "/faults"):
+                self.clear()
+                return 200, self._state()
+        except (InputError, ValueError) as error:
+            return 422, f"{error}\n"
+        return 404, f"no {method} {path} here; GET / shows what there is\n"
+
+    def _state(self) -> str:
+        seat = "subject seated" if self.present else "empty"
+        faults = ", ".join(" ".join(filter(None, (f.kind, f.camera))) for f in self.faults) or "none"
+        return f"{seat}; lights {self._lamps:04b}; faults: {faults}\n"
+
+    def _page(self) -> str:
+        views = "".join(
+            f'<figure><img src="/{n}.mjpeg" width="300"><figcaption>{n}</figcaption></figure>' for n in self.names
+        )
+        kinds = "".join(f"<li><b>{kind}</b>: {what}</li>" for kind, what in KINDS.items())
+        style = "figure{display:inline-block;margin:4px}body{font-family:sans-serif}"
+        return (
+            f"<!doctype html><title>simulated studio</title><style>{style}</style><p>{self._state()}</p>{views}"
+            "<p>POST /subject?present=1|0<br>POST /faults?kind=KIND&amp;camera=NAME&amp;amount=N<br>DELETE /faults</p>"
+            f"<ul>{kinds}</ul>"
+        )
+
+
+def serve_scene(
+    folder: Path, scene: Scene, *, fps: float = 4.0, host: str = "127.0.0.1", port: int = 0
+) -> StudioDevices:
+    """The devices of a drawn scene, the chair still empty; ``folder`` receives rig.toml and cameras.json."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_rig(scene.rig, folder / "cameras.json")
+    empty, seated = SceneImages(scene, seated=False, seed=1), SceneImages(scene, seated=True, seed=2)
+    return StudioDevices(
+        folder, scene.rig.names, empty, seated, fps=fps, host=host, port=port, calibration="cameras.json"
+    )
+
+
+def _develop(image: ImageRgb, look: _Look, rng: np.random.Generator) -> bytes:
+    """A JPEG file of ``image`` with less light and a bump."""
+    if look.bump_px:
+        image = _bumped(image, look.bump_px)
+    if look.light < 1:
+        # the read noise of the sensor, one value, does not go with the light
+        dim = image * np.float32(look.light) + rng.standard_normal(image.shape, np.float32)
+        image = np.clip(np.round(dim), 0, 255).astype(np.uint8)
+    done, data = cv2.imencode(".jpg", image[:, :, ::-1], _JPEG)
+    assert done
+    return data.tobytes()
+
+
+def _bumped(image: ImageRgb, amount_px: float) -> ImageRgb:
+    """The picture of a knocked camera: shifted along (0.8, 0.6), and turned by a third of ``amount_px`` at its edge."""
+    height, width = image.shape[:2]
+    turn_deg = float(np.degrees(2 * amount_px / (3 * width)))
+    warp = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, 1.0)
+    warp[:, 2] += (0.8 * amount_px, 0.6 * amount_px)
+    moved = cv2.warpAffine(image, warp, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(moved, np.uint8)

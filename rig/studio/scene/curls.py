@@ -1,0 +1,33 @@
+"""Curls: ridges that wind over a surface of hair, with dark valleys between them."""
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.studio.sensor.noise import waves
+
+RIDGE_SHARE = 0.5  # how high curls stand, against the distance from one to the next
+VALLEY = 0.45  # tone between curls, where little light falls
+
+
+def curled(
+    vertices: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    curl_mm: float,
+    amount: Float[np.ndarray, " v"],
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
+    """The surface with curls on it, and its shade: where a random field is near zero a ridge winds along.
+
+    Args:
+        vertices: Of the smooth surface (mm), a few to each curl.
+        normals: Unit, outward.
+        curl_mm: From curl to curl.
+        amount: 0 (none) to 1, per vertex.
+        rng: Draws the ridges.
+    """
+    swirl = waves(rng, vertices, 1.6 * curl_mm, 2.6 * curl_mm)
+    ridge = np.exp(-((swirl / 0.5) ** 2))
+    tuft = 0.3 * waves(rng, vertices, 3.0 * curl_mm, 6.0 * curl_mm)
+    height = amount * curl_mm * RIDGE_SHARE * (1.4 * ridge - 0.7 + tuft)
+    shade = 1.0 + amount * (VALLEY + (1.15 - VALLEY) * ridge - 1.0)
+    return vertices + height[:, None] * normals, shade

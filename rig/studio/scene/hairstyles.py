@@ -1,0 +1,55 @@
+"""Looks by name, so that a capture can be asked for with this hair or that: long, curly, a fringe, a beard, a cap."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+
+from rig.errors import InputError
+from rig.studio.scene.hair import HairStyle
+from rig.studio.scene.subject import Colour, Look
+
+CAP_TONE: Colour = (0.035, 0.06, 0.14)  # navy
+
+Change = Callable[[Look], Look]
+
+
+def _hair(**changes: float | bool) -> Change:
+    return lambda look: replace(look, hair=replace(look.hair or HairStyle(), **changes))
+
+
+def _beard(look: Look) -> Look:
+    tone = (look.hair or HairStyle()).tone
+    return replace(look, beard=HairStyle(thickness_mm=13.0, curl_mm=5.0, strands=3500, strand_mm=10.0, stray_mm=1.2,
+                                         tone=tone))  # fmt: skip
+
+
+def _cap(look: Look) -> Look:
+    under = (
+        replace(look.hair, thickness_mm=7.0, fringe_mm=0.0, lumps=0.1, strands=800, stray_mm=0.6) if look.hair else None
+    )
+    return replace(look, hair=under, cap=CAP_TONE)
+
+
+HAIRSTYLES: Mapping[str, Change] = MappingProxyType({
+    "short": _hair(thickness_mm=12.0, over_ears=False, fringe_mm=0.0),
+    "over-ears": _hair(thickness_mm=20.0, over_ears=True, fringe_mm=0.0),
+    "long": _hair(thickness_mm=13.0, over_ears=True, fringe_mm=0.0, lumps=0.12, stray_mm=1.6, hanging_mm=150.0),
+    "curly": _hair(thickness_mm=22.0, fringe_mm=0.0, lumps=0.2, curl_mm=9.0, strand_mm=14.0),
+    "fringe": _hair(thickness_mm=13.0, over_ears=True, fringe_mm=30.0, lumps=0.12),
+    "bun": _hair(thickness_mm=6.0, over_ears=False, fringe_mm=0.0, lumps=0.08, strands=1800, bun_mm=33.0),
+    "beard": _beard,
+    "bald": lambda look: replace(look, hair=None),
+    "cap": _cap,
+    "glasses": lambda look: replace(look, glasses=True),
+})  # fmt: skip
+"""What each name changes of a look. Cap and glasses count as clothes in the truth, a beard as hair. Glasses are rims
+without panes: the pipeline asks studios for that."""
+
+
+def restyled(look: Look, names: Sequence[str]) -> Look:
+    """The look with the named changes, one after the other: ``curly,beard``. Raises InputError."""
+    if unknown := [name for name in names if name not in HAIRSTYLES]:
+        raise InputError("hair", [f"{name} is not one of {', '.join(HAIRSTYLES)}" for name in unknown])
+    for name in names:
+        look = HAIRSTYLES[name](look)
+    return look

@@ -1,0 +1,152 @@
+"""What is worn on the head: a cap with a visor, and glasses. Glasses are rims without panes: a studio asks for that."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rig.errors import InputError
+from rig.mesh import face_normals
+from rig.studio.scene.anatomy import Anatomy
+from rig.studio.scene.grids import grid_faces
+from rig.studio.scene.hair import COLUMNS, LOWEST_DEG, ROWS, outer_radius
+
+Surface = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]
+AnySurface = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]  # in lists, where each has its own counts
+
+CAP_ROWS = 60
+CAP_AHEAD, CAP_BEHIND = (92.0, 76.0), (-100.0, 0.0)  # depth and height of the rim before and behind the ears, mm
+CAP_MM = 4.0  # from hair to cloth
+PANELS, SEAM_MM = 6, 0.9
+VISOR_DEG, VISOR_MM, VISOR_THICK_MM = 62.0, 66.0, 2.4
+RIM_MM, TEMPLE_MM = 1.7, 2.0  # radii of the tubes of glasses
+SIDES = 10  # of a tube
+
+
+def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
+    """A cap over a head and its hair, if any (head frame, mm)."""
+    centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
+    radius = outer_radius(head - centre, open_ears=True)
+    if hair is not None:
+        radius = np.maximum(radius, outer_radius(hair - centre, open_ears=False))
+    azimuth = np.arange(COLUMNS) * 2 * np.pi / COLUMNS
+    elevation = np.radians(np.linspace(90.0, LOWEST_DEG, ROWS))
+    directions = _directions(elevation[:, None], azimuth[None, :])
+    surface = (centre + (radius + CAP_MM * body.unit)[:, :, None] * directions - body.ears) / body.unit
+    slope = (CAP_AHEAD[1] - CAP_BEHIND[1]) / (CAP_AHEAD[0] - CAP_BEHIND[0])
+    above = surface[:, :, 1] - (CAP_AHEAD[1] + slope * (surface[:, :, 2] - CAP_AHEAD[0]))
+    crown = np.empty((CAP_ROWS, COLUMNS, 3))
+    for c in range(COLUMNS):  # down to where this meridian meets the plane of the rim
+        lowest = np.interp(0.0, -above[:, c], np.arange(ROWS))
+        at = np.linspace(0.0, lowest, CAP_ROWS)
+        for axis in range(3):
+            crown[:, c, axis] = np.interp(at, np.arange(ROWS), surface[:, c, axis])
+    crown = body.ears + body.unit * crown
+    seam = np.exp(-((((azimuth * PANELS / (2 * np.pi) + 0.5) % 1.0 - 0.5) * 30.0) ** 2))
+    crown -= SEAM_MM * (seam[:, None] * directions[ROWS // 3])[None] * np.linspace(0, 1, CAP_ROWS)[:, None, None]
+    hem = crown[-1:] - 5.0 * body.unit * directions[ROWS // 2][None]
+    grid = np.concatenate([crown, hem])
+    shell = grid.reshape(-1, 3), _outward(grid.reshape(-1, 3), grid_faces(CAP_ROWS + 1, COLUMNS), centre)
+    return joined([shell, _visor(crown[-1], azimuth, body)])
+
+
+def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body: Anatomy) -> Surface:
+    """Two sheets that bend down to both sides, closed along the front edge."""
+    turn = (azimuth + np.pi) % (2 * np.pi) - np.pi
+    front = np.flatnonzero(np.abs(turn) < np.radians(VISOR_DEG))
+    front = front[np.argsort(turn[front])]
+    share = turn[front] / np.radians(VISOR_DEG)
+    reach = VISOR_MM * body.unit * np.sqrt(np.maximum(1.0 - share**4, 0.0))
+    t = np.concatenate([np.linspace(-0.06, 1.0, 16), [1.0]])[:, None]
+    drop = 6.0 + 10.0 * t**2 + 12.0 * share**2 * t
+    top = rim[front] + np.stack([0.06 * reach * share * t, -drop * t * body.unit, reach * t], axis=-1)
+    under = top - np.array([0.0, VISOR_THICK_MM, 0.0])
+    grid = np.concatenate([top[:-1], under[-1:], under[-2::-1]])
+    faces = grid_faces(len(grid), len(front), closed=False)
+    vertices = grid.reshape(-1, 3)
+    upward = face_normals(vertices, faces)[: 10 * len(front), 1].sum()
+    return vertices, faces if upward > 0 else faces[:, ::-1]
+
+
+def glasses(head: Float[np.ndarray, "v 3"], body: Anatomy) -> AnySurface:
+    """Two rims, a bridge and two temples, laid out from landmarks (head frame, mm).
+
+    Raises InputError for a head without landmarks.
+    """
+    marks = body.landmarks
+    if not marks:
+        raise InputError("glasses", ["glasses are laid out from landmarks, which this head does not have"])
+    plane_z = max(float(marks["glabella"][2]) + 2.0, float(marks["endocanthion_left"][2]) + 16.0)
+    pieces, inner = [], {}
+    for side, sign in (("right", -1.0), ("left", 1.0)):
+        corner, nose = marks[f"exocanthion_{side}"], marks[f"endocanthion_{side}"]
+        centre = np.array([(corner[0] + nose[0]) / 2 + 1.5 * sign, (corner[1] + nose[1]) / 2 - 3.0, plane_z])
+        turn = np.arange(72) * 2 * np.pi / 72
+        ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        ring = np.sign(ring) * np.abs(ring) ** 0.75 * (25.0, 19.0)  # a rounded rectangle
+        path = centre + np.column_stack([sign * ring, -0.004 * (ring[:, 0] + 25.0) ** 2])
+        pieces.append(_tube(path, RIM_MM, np.array([0.0, 0.0, 1.0]), closed=True))
+        inner[side] = path[np.argmin(sign * path[:, 0] + 0.3 * np.abs(path[:, 1] - centre[1] - 8.0))]
+        outer = path[np.argmax(sign * path[:, 0] + 0.2 * path[:, 1])]
+        pieces.append(_tube(_temple(head, body, outer, sign), TEMPLE_MM, np.array([0.0, 1.0, 0.0]), closed=False))
+    t = np.linspace(0.0, 1.0, 16)[:, None]
+    arch = 4 * t * (1 - t) * np.array([0.0, 3.0, 5.0])
+    bridge = (1 - t) * inner["right"] + t * inner["left"] + arch
+    return joined([*pieces, _tube(bridge, RIM_MM, np.array([0.0, 0.0, 1.0]), closed=False)])
+
+
+def _temple(
+    head: Float[np.ndarray, "v 3"], body: Anatomy, start: Float[np.ndarray, " 3"], sign: float
+) -> Float[np.ndarray, "n 3"]:
+    """From the rim back beside the temple, over the ear and down behind it."""
+    over = body.ears + np.array([0.0, 14.0, -4.0]) * body.unit
+    between = np.abs(head[:, 1] - over[1]) < 6.0
+    between &= (head[:, 2] > over[2] + 10.0) & (head[:, 2] < start[2] - 15.0)
+    beside = float((sign * head[between, 0]).max()) + 1.5 if between.any() else body.half_breadth
+    over[0] = sign * max(beside, body.half_breadth - 2.0)
+    knee = start + np.array([sign * 4.0, 0.0, -4.0])
+    knee[0] = sign * max(sign * knee[0], beside)
+    end = over + np.array([-3.0 * sign, -26.0, -22.0]) * body.unit
+    corners = np.array([start, knee, over, end])
+    t = np.concatenate([np.linspace(0, 1, 5)[:-1], np.linspace(1, 2, 24)[:-1], np.linspace(2, 3, 10)])
+    return np.stack([np.interp(t, np.arange(4), corners[:, axis]) for axis in range(3)], axis=1)
+
+
+def _tube(
+    path: Float[np.ndarray, "n 3"], radius_mm: float, reference: Float[np.ndarray, " 3"], *, closed: bool
+) -> Surface:
+    """A round tube about a path; ``reference`` is never along it."""
+    tangent = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
+    across = np.cross(tangent, reference)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    other = np.cross(across, tangent)
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    turn = np.arange(SIDES) * 2 * np.pi / SIDES
+    ring = np.cos(turn)[None, :, None] * across[:, None] + np.sin(turn)[None, :, None] * other[:, None]
+    grid = path[:, None] + radius_mm * ring
+    if closed:
+        grid = np.concatenate([grid, grid[:1]])
+    else:  # a point closes each end
+        grid = np.concatenate([np.repeat(path[:1, None], SIDES, 1), grid, np.repeat(path[-1:, None], SIDES, 1)])
+    vertices, faces = grid.reshape(-1, 3), grid_faces(len(grid), SIDES)
+    middle = np.concatenate([path, path[:1]]) if closed else np.concatenate([path[:1], path, path[-1:]])
+    out = ((vertices - np.repeat(middle, SIDES, axis=0))[faces[:, 0]] * face_normals(vertices, faces)).sum()
+    return vertices, faces if out > 0 else faces[:, ::-1]
+
+
+def joined(surfaces: list[AnySurface]) -> AnySurface:
+    """Several surfaces as one."""
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces])
+    faces = [faces + start for (_, faces), start in zip(surfaces, starts[:-1], strict=True)]
+    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
+
+
+def _directions(elevation: Float[np.ndarray, "r 1"], azimuth: Float[np.ndarray, "1 c"]) -> Float[np.ndarray, "r c 3"]:
+    ring = np.cos(elevation)
+    up = np.broadcast_to(np.sin(elevation), (len(elevation), azimuth.shape[1]))
+    return np.stack([ring * np.sin(azimuth), up, ring * np.cos(azimuth)], axis=-1)
+
+
+def _outward(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], centre: Float[np.ndarray, " 3"]
+) -> Int[np.ndarray, "f 3"]:
+    away = (face_normals(vertices, faces) * (vertices - centre)[faces[:, 0]]).sum()
+    return faces if away > 0 else faces[:, ::-1]

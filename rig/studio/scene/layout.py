@@ -1,0 +1,68 @@
+"""Where eleven cameras stand: the default rig, and the four arrangements of section 5.3.
+
+Azimuth is counted from the front towards the subject's left, elevation upwards. The world's origin is in the middle of
+the head, y up, z towards the front camera.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rig.camera import Camera, Distortion, Intrinsics
+from rig.geometry import look_at
+from rig.rig import Rig
+
+DISTANCE_MM = 1200.0
+WIDTH, HEIGHT = 1024, 768
+FOCAL_PX = 2200.0  # a head of 250 mm fills 60 % of the height
+LENS_SEED = 2003
+
+DEFAULT_DIRECTIONS_DEG = (
+    (0, 0), (0, 38), (0, -36), (-35, 16), (35, 16), (-38, -24), (38, -24), (-65, 4), (65, 4), (-90, 2), (90, 2),
+)  # fmt: skip
+
+# Section 5.3: azimuth 0 to 90 degrees, mirrored, and elevation -40 to 40. The paper shows the four only as pictures.
+ARRANGEMENTS_DEG = {
+    "a": (
+        (0, 0), (-30, 0), (60, 0), (-90, 0), (0, 38), (30, 38), (-60, 38), (90, 38), (0, -38), (45, -38), (-90, -38),
+    ),
+    "b": (
+        (0, 0), (0, 30), (0, -30), (-40, 12), (45, -12), (50, 28), (-45, -28), (85, 6), (-90, -8), (-80, 20), (78, -22),
+    ),
+    "c": (
+        (0, -40), (0, -20), (0, 0), (0, 20), (0, 40), (-20, -30), (20, -10), (-20, 10), (20, 30), (28, 0), (-10, 0),
+    ),
+    "d": (
+        (0, 0), (-30, 0), (50, 20), (-55, -20), (65, 0), (-72, 30), (75, -30), (-80, 8), (85, 25), (-88, -15), (90, 0),
+    ),
+}  # fmt: skip
+
+
+def default_layout() -> Rig:
+    """Eleven cameras on the front hemisphere, 1.2 m away; cam00 looks at the face from the front."""
+    return rig_from_directions(DEFAULT_DIRECTIONS_DEG)
+
+
+def arrangement(name: str) -> Rig:
+    """One of the paper's four arrangements of section 5.3: "a" even, "b" informative, "c" vertical, "d" to the side."""
+    return rig_from_directions(ARRANGEMENTS_DEG[name])
+
+
+def rig_from_directions(directions_deg: Sequence[tuple[int | float, int | float]], seed: int = LENS_SEED) -> Rig:
+    """Cameras at (azimuth, elevation) in degrees, each with a lens and a mounting a little of its own."""
+    rng = np.random.default_rng(seed)
+    return Rig(tuple(_camera(f"cam{i:02}", *direction, rng) for i, direction in enumerate(directions_deg)))
+
+
+def _camera(name: str, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Camera:
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    direction = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    centre = DISTANCE_MM * rng.uniform(0.97, 1.03) * direction + rng.normal(0, 12, 3)
+    target = rng.normal(0, 6, 3) + np.array([0.0, 5.0, 0.0])
+    tilt = rng.normal(0, 0.02)  # nobody mounts a camera upright to the degree
+    up = np.array([np.sin(tilt) * np.cos(azimuth), np.cos(tilt), -np.sin(tilt) * np.sin(azimuth)])
+    focal = FOCAL_PX * rng.uniform(0.97, 1.03)
+    lens = Distortion(*(rng.uniform(-1, 1, 4) * (0.08, 0.02, 8e-4, 8e-4)))
+    cx, cy = rng.uniform(-12, 12, 2) + np.array([WIDTH - 1, HEIGHT - 1]) / 2
+    intrinsics = Intrinsics(WIDTH, HEIGHT, focal, focal * rng.uniform(0.999, 1.001), cx, cy, lens)
+    return Camera(name, intrinsics, look_at(centre, target, up))

@@ -1,0 +1,107 @@
+"""Soft light on the subject, with the shadows that it throws on itself.
+
+The lamps are soft boxes over a dome; the dome is sampled in ``DIRECTIONS`` directions, each with a depth map that says
+which vertices it reaches. Their number makes the shadows soft; irradiance is per vertex.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rig.camera import Camera, Intrinsics
+from rig.geometry import look_at
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+
+DIRECTIONS = 24
+MAP_PX = 176
+LAMP_DISTANCE_MM = 5000.0
+BIAS_MM = 3.0  # a surface does not shade itself for the coarseness of the map, 2.5 mm a pixel
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """A soft box. ``towards``: from the subject, world axes of a rig with y up and z to the front. Linear RGB."""
+
+    towards: tuple[float, float, float]
+    colour: tuple[float, float, float]
+    sharpness: float  # exponent of the cosine about ``towards``
+
+
+LAMPS = (
+    Lamp((-0.45, 0.75, 0.85), (1.25, 1.20, 1.12), 9.0),  # key, above on the subject's right
+    Lamp((0.85, 0.35, 0.65), (0.62, 0.64, 0.68), 5.0),  # fill, on the left
+    Lamp((0.0, 1.0, -0.25), (0.40, 0.40, 0.42), 5.0),  # top, separates the hair from the backdrop
+)
+AMBIENT = (0.34, 0.34, 0.35)
+
+
+def lamp_directions() -> Float[np.ndarray, "l 3"]:
+    towards = np.array([lamp.towards for lamp in LAMPS])
+    return towards / np.linalg.norm(towards, axis=1, keepdims=True)
+
+
+def dome() -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
+    """Directions, spread evenly over the sphere above -45 degrees, and the linear RGB that each sends."""
+    index = np.arange(DIRECTIONS) + 0.5
+    y = 1.0 - index / DIRECTIONS * 1.7
+    angle = index * np.pi * (3.0 - np.sqrt(5.0))
+    ring = np.sqrt(1.0 - y**2)
+    directions = np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
+    sent = np.tile(np.array(AMBIENT) / DIRECTIONS * 2.4, (DIRECTIONS, 1))
+    for lamp, towards in zip(LAMPS, lamp_directions(), strict=True):
+        lobe = np.maximum(directions @ towards, 0.0) ** lamp.sharpness
+        sent += lobe[:, None] / lobe.sum() * np.array(lamp.colour)
+    return directions, sent
+
+
+def irradiance(
+    renderer: Renderer,
+    receivers: Sequence[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]],
+    casters: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]],
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Linear RGB at each receiver's (vertices, unit normals), shaded by the ``casters``' triangles; world frame."""
+    directions, sent = dome()
+    vertices, faces = casters
+    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
+    rig = Rig(tuple(_lamp_camera(i, direction, centre, radius) for i, direction in enumerate(directions)))
+    depth = renderer.depth(rig, vertices, faces)
+    found = [np.zeros((len(points), 3)) for points, _ in receivers]
+    for camera, direction, colour in zip(rig, directions, sent, strict=True):
+        image = depth[camera.name]
+        for light, (points, normals) in zip(found, receivers, strict=True):
+            cosine = normals @ direction
+            facing = np.flatnonzero(cosine > 0)
+            reached = _reached(camera, image, points[facing] + 1.5 * normals[facing])
+            light[facing] += (cosine[facing] * reached)[:, None] * colour
+    return found
+
+
+def _lamp_camera(
+    index: int, direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"], radius: float
+) -> Camera:
+    up = np.array([0.0, 0.0, 1.0]) if abs(direction[1]) > 0.9 else np.array([0.0, 1.0, 0.0])
+    focal = 0.5 * MAP_PX * LAMP_DISTANCE_MM / (1.05 * radius)
+    intrinsics = Intrinsics(MAP_PX, MAP_PX, focal, focal, (MAP_PX - 1) / 2, (MAP_PX - 1) / 2)
+    return Camera(f"lamp{index:02}", intrinsics, look_at(centre + LAMP_DISTANCE_MM * direction, centre, up))
+
+
+def _reached(
+    camera: Camera, depth: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    """Share of the four nearest pixels of the depth map, weighted bilinearly, that the point is not behind."""
+    k = camera.intrinsics
+    seen = camera.camera_from_world.apply(points)
+    x = np.clip(seen[:, 0] / seen[:, 2] * k.fx + k.cx, 0, k.width - 1.001)
+    y = np.clip(seen[:, 1] / seen[:, 2] * k.fy + k.cy, 0, k.height - 1.001)
+    left, top = x.astype(int), y.astype(int)
+    across, down = x - left, y - top
+    limit = seen[:, 2] - BIAS_MM
+    share = np.zeros(len(points))
+    for dy, wy in ((0, 1 - down), (1, down)):
+        for dx, wx in ((0, 1 - across), (1, across)):
+            share += wx * wy * (depth[top + dy, left + dx] > limit)
+    return share

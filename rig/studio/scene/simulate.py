@@ -1,0 +1,348 @@
+"""A capture of the simulated studio, with its truth.
+
+``build_scene`` draws and lights everything once; ``shoot`` takes the pictures, with the faults asked for. A device that
+serves pictures one by one keeps the scene and calls ``view_light`` and ``sensor.expose``.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from rig.camera import Camera
+from rig.capture import Capture
+from rig.colour_space import srgb_from_linear
+from rig.errors import InputError
+from rig.geometry import RigidTransform, Similarity, rotation_from_vector
+from rig.mesh import Mesh
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+from rig.studio.scene.backdrop import backdrop, chair
+from rig.studio.scene.hairstyles import restyled
+from rig.studio.scene.subject import Look, Subject, dress, random_look, random_pose
+from rig.studio.scene.visible import VisiblePoints, part_masks, visible_points
+from rig.studio.sensor.faults import Fault
+from rig.studio.sensor.preset import Preset
+from rig.studio.sensor.sensor import Sensor, drift, expose, focus, rolled
+
+CAMOUFLAGE = (0.13, 0.10, 0.08)  # linear RGB, a dark brown that hair, shirt and backdrop may share
+CLICKED_VIEWS = 4  # section 4.2: feature points are picked in 3 to 4 images
+HIDDEN_MM = 4.0  # a landmark this far behind the nearest surface is not seen
+THREADS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """What one camera looks at: the subject's linear light times coverage, and coverage; the backdrop's light."""
+
+    subject: Float[np.ndarray, "h w 4"]
+    backdrop: Float[np.ndarray, "h w 3"]
+    sensor: Sensor
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "h w"]:
+        return self.subject[:, :, 3] >= 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """A lit studio with a subject in it. ``rig`` is what calibration says, ``true_rig`` where the cameras are."""
+
+    rig: Rig
+    true_rig: Rig
+    views: Mapping[str, View]
+    head: Mesh  # world frame, colours as lit (sRGB)
+    face_region: Bool[np.ndarray, " v"] | None
+    photographed: Bool[np.ndarray, " v"]  # vertices of the head that a camera sees, not under hair
+    head_masks: Mapping[str, Bool[np.ndarray, "h w"]]  # of the bare head
+    landmarks_world: Mapping[str, Float[np.ndarray, " 3"]]
+    landmarks_seen: Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]  # true pixels, by landmark and camera
+    world_from_head: Similarity
+    visible: VisiblePoints
+    parts: Mapping[str, UInt8[np.ndarray, "h w"]]  # 0 background, 1 skin, 2 hair, 3 clothes
+    preset: Preset
+    name: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedCapture:
+    """The pictures, the rig as calibrated, and the scene, which holds the truth."""
+
+    capture: Capture
+    rig: Rig
+    scene: Scene
+    faults: tuple[Fault, ...]
+
+    @property
+    def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]:
+        """True silhouettes, hair and clothes included: coverage of at least a half."""
+        return {name: view.mask for name, view in self.scene.views.items()}
+
+
+def simulate(
+    subject: Subject,
+    rig: Rig,
+    preset: Preset,
+    rng: np.random.Generator,
+    *,
+    renderer: Renderer,
+    look: Look | None = None,
+    world_from_head: Similarity | None = None,
+    faults: Sequence[Fault] = (),
+) -> SimulatedCapture:
+    """One capture of ``subject`` by ``rig``. Look and pose are drawn where none is given."""
+    scene_rng, shot_rng = rng.spawn(2)
+    faults = tuple(_settled(fault, rig, shot_rng) for fault in faults)
+    scene = build_scene(
+        subject, rig, preset, scene_rng, renderer=renderer, look=look, world_from_head=world_from_head, faults=faults
+    )
+    return SimulatedCapture(shoot(scene, shot_rng, faults), rig, scene, faults)
+
+
+def build_scene(
+    subject: Subject,
+    rig: Rig,
+    preset: Preset,
+    rng: np.random.Generator,
+    *,
+    renderer: Renderer,
+    look: Look | None = None,
+    world_from_head: Similarity | None = None,
+    faults: Sequence[Fault] = (),
+) -> Scene:
+    """Dresses, lights and draws the subject, and paints the backdrops."""
+    look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
+    look = _worn(look or random_look(look_rng), preset, faults)
+    pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
+    dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng)
+    true_rig = Rig(tuple(_knocked(camera, faults, set_rng) for camera in rig))
+    light = renderer.photograph(true_rig, (*dressed.worn, dressed.head), dressed.gallery, samples=preset.samples)
+    if preset.rolling_ms > 0:
+        light = _rolling(true_rig, light, pose.translation, preset, rng.spawn(1)[0])
+    head = dressed.head
+    colours = np.rint(255 * srgb_from_linear(renderer.vertex_radiance(head, dressed.gallery))).astype(np.uint8)
+    with renderer.silhouette_set(true_rig, head.faces) as silhouettes:
+        head_masks = silhouettes.masks(head.vertices)
+    coarse = true_rig.scaled(0.5)  # enough to tell what hides what
+    depth = renderer.depth(coarse, *dressed.solid)
+    marks = {name: pose.apply(point[None])[0] for name, point in subject.landmarks.items()}
+    views = _views(true_rig, light, preset, faults, set_rng)
+    masks = {name: view.mask for name, view in views.items()}
+    return Scene(
+        rig=rig,
+        true_rig=true_rig,
+        views=views,
+        head=Mesh(head.vertices, head.faces, colours),
+        face_region=subject.face_region,
+        photographed=_photographed(coarse, depth, head.vertices, head.normals),
+        head_masks=head_masks,
+        landmarks_world=marks,
+        landmarks_seen=_seen_landmarks(coarse, true_rig, depth, marks),
+        world_from_head=pose,
+        visible=visible_points(true_rig, dressed.surfaces, renderer=renderer, rng=rng.spawn(1)[0]),
+        parts=part_masks(true_rig, dressed.surfaces, masks, renderer=renderer),
+        preset=preset,
+        name=subject.name,
+    )
+
+
+def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[np.ndarray, "h w 3"]:
+    """The light on one camera's sensor (float32), with the subject or without."""
+    light = view.backdrop
+    if subject:
+        light = view.subject[:, :, :3] + (1 - view.subject[:, :, 3:]) * light
+    return focus(light * np.float32(gain), view.sensor)
+
+
+def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) -> Capture:
+    """Clean plates, then the shot. ``faults`` name their cameras (``simulate`` draws those that do not)."""
+    names = scene.rig.names
+    click_rng, *rngs = rng.spawn(1 + len(names))
+
+    def one(
+        name: str, own: np.random.Generator
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[UInt8[np.ndarray, "_ _ 3"], ...]]:
+        return _picture(scene.views[name], scene.preset, [f for f in faults if f.camera in (None, name)], own)
+
+    with ThreadPoolExecutor(THREADS) as pool:  # numpy and cv2 work outside the interpreter lock
+        taken = dict(zip(names, pool.map(one, names, rngs), strict=True))
+    source = {name: name for name in names}
+    for fault in faults:
+        if fault.kind == "swapped" and fault.camera:
+            other = names[(names.index(fault.camera) + 1) % len(names)]
+            source[fault.camera], source[other] = source[other], source[fault.camera]
+    return Capture(
+        images={name: taken[source[name]][0] for name in names},
+        backgrounds={name: taken[source[name]][1] for name in names},
+        masks=_wrong_masks(scene, faults),
+        features=click(scene, click_rng),
+    )
+
+
+def click(scene: Scene, rng: np.random.Generator) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
+    """Feature points as an operator picks them: in up to four views that see them best, with the preset's noise."""
+    clicked: dict[str, dict[str, np.ndarray]] = {}
+    for landmark, views in scene.landmarks_seen.items():
+        for name in list(views)[:CLICKED_VIEWS]:
+            k = scene.rig[name].intrinsics
+            point = views[name] + rng.normal(0, 1, 2) * scene.preset.feature_noise_px
+            clicked.setdefault(landmark, {})[name] = np.clip(point, 0, (k.width - 1, k.height - 1))
+    return {landmark: views for landmark, views in clicked.items() if len(views) >= 2}
+
+
+def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
+    if fault.camera is not None and fault.camera not in rig:
+        raise InputError("fault", [f"{fault.kind}: the rig has no camera {fault.camera}, only {', '.join(rig.names)}"])
+    drawn = rig.names[rng.integers(len(rig))]
+    alone = fault.kind in ("frozen", "dark", "bumped", "swapped", "chair", "wrong-mask", "blurred")
+    return replace(fault, camera=drawn) if alone and fault.camera is None else fault
+
+
+def _worn(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
+    look = restyled(look, preset.hairstyle)
+    if not preset.hair:
+        look = replace(look, hair=None, beard=None)
+    if not preset.texture:
+        look = replace(look, texture=False, stubble=0.0)
+    if any(fault.kind == "camouflage" for fault in faults):
+        look = replace(look, cloth=CAMOUFLAGE, hair=look.hair and replace(look.hair, tone=CAMOUFLAGE))
+    return look
+
+
+def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) -> Camera:
+    for fault in faults:
+        if fault.kind == "bumped" and fault.camera == camera.name:
+            axis = rng.normal(0, 1, 3)
+            turn = rotation_from_vector(np.radians(fault.strength) * axis / np.linalg.norm(axis))
+            camera = replace(camera, camera_from_world=RigidTransform(turn, np.zeros(3)) @ camera.camera_from_world)
+    return camera
+
+
+def _rolling(
+    rig: Rig,
+    light: Mapping[str, Float[np.ndarray, "h w 4"]],
+    at_world: Float[np.ndarray, " 3"],
+    preset: Preset,
+    rng: np.random.Generator,
+) -> dict[str, Float[np.ndarray, "h w 4"]]:
+    """The subject sways while the rows are read, and each camera sees that from its own side. The truth is its place
+    at the middle row. Motion across the image is that of the head's origin; nearer parts move by a tenth more."""
+    direction = rng.standard_normal(3)
+    sway_mm = direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
+    shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
+    return {name: rolled(light[name], shift_px) for name, shift_px in shifts.items()}
+
+
+def _views(
+    rig: Rig,
+    light: Mapping[str, Float[np.ndarray, "h w 4"]],
+    preset: Preset,
+    faults: Sequence[Fault],
+    rng: np.random.Generator,
+) -> dict[str, View]:
+    colour = CAMOUFLAGE if any(fault.kind == "camouflage" for fault in faults) else None
+
+    def one(camera: Camera, own: np.random.Generator) -> View:
+        blur = [fault.strength for fault in faults if fault.kind == "blurred" and fault.camera == camera.name]
+        gains = np.exp(own.normal(0, preset.exposure_spread) + own.normal(0, preset.white_balance_spread, 3))
+        red, green, blue = gains.tolist()
+        sensor = Sensor((red, green, blue), preset.vignetting, blur[0] if blur else preset.defocus_px, preset.noise)
+        behind = backdrop(camera.intrinsics, own, preset.backdrop_unevenness, colour)
+        return View(light[camera.name], behind, sensor)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return dict(zip(rig.names, pool.map(one, rig, rng.spawn(len(rig))), strict=True))
+
+
+def _picture(
+    view: View, preset: Preset, faults: Sequence[Fault], rng: np.random.Generator
+) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[UInt8[np.ndarray, "_ _ 3"], ...]]:
+    """The shot and the clean plates of one camera."""
+    kinds = {fault.kind: fault for fault in faults}
+    plate_view = shot_view = view
+    if "chair" in kinds:
+        plate_view, shot_view = _with_chair(view, rng)
+    if "shadow" in kinds:
+        shot_view = replace(shot_view, backdrop=_shadowed(shot_view, kinds["shadow"].strength))
+    empty = view_light(plate_view, subject=False)
+    plates = tuple(expose(empty, view.sensor, rng) for _ in range(preset.plates))
+    if "frozen" in kinds:
+        return plates[-1].copy(), plates
+    gain = 1.0
+    for fault in faults:
+        gain *= (
+            1 + fault.strength
+            if fault.kind == "exposure"
+            else fault.strength
+            if fault.kind in ("dark", "lights-off")
+            else 1
+        )
+    light = view_light(shot_view, gain=gain) * drift(empty.shape[:2], preset.light_drift, rng)
+    return expose(light, view.sensor, rng), plates
+
+
+def _with_chair(view: View, rng: np.random.Generator) -> tuple[View, View]:
+    height, width = view.backdrop.shape[:2]
+    thing = chair(width, height, rng)
+    shift = round(0.06 * width)
+    moved = np.roll(thing, shift if thing[:, : width // 2, 3].any() else -shift, axis=1)
+    return tuple(replace(view, backdrop=t[:, :, :3] + (1 - t[:, :, 3:]) * view.backdrop) for t in (thing, moved))  # type: ignore[return-value]
+
+
+def _shadowed(view: View, amount: float) -> Float[np.ndarray, "h w 3"]:
+    height, width = view.backdrop.shape[:2]
+    move = np.array([[1, 0, 0.05 * width], [0, 1, 0.04 * height]], np.float32)
+    alpha = cv2.warpAffine(
+        np.ascontiguousarray(view.subject[:, :, 3]), move, (width, height), borderMode=cv2.BORDER_REPLICATE
+    )
+    return view.backdrop * (1 - amount * cv2.GaussianBlur(alpha, (0, 0), 0.03 * width))[:, :, None]
+
+
+def _wrong_masks(scene: Scene, faults: Sequence[Fault]) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """What an operator's slip leaves: the mirrored mask, a fifth of the image off."""
+    wrong = [fault.camera for fault in faults if fault.kind == "wrong-mask" and fault.camera]
+    masks = {name: scene.views[name].mask[:, ::-1] for name in wrong}
+    return {name: np.roll(mask, mask.shape[1] // 5, axis=1) for name, mask in masks.items()}
+
+
+def _photographed(
+    rig: Rig,
+    depth: Mapping[str, Float[np.ndarray, "h w"]],
+    vertices: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+) -> Bool[np.ndarray, " v"]:
+    """Vertices that at least one camera sees, not at a grazing angle and not behind hair."""
+    seen = np.zeros(len(vertices), bool)
+    for camera in rig:
+        towards = camera.centre_world - vertices
+        facing = (normals * towards).sum(axis=1) > 0.2 * np.linalg.norm(towards, axis=1)
+        seen |= facing & _unhidden(camera, depth[camera.name], vertices, 1.5)
+    return seen
+
+
+def _unhidden(
+    camera: Camera, depth: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"], slack_mm: float
+) -> Bool[np.ndarray, " n"]:
+    k = camera.intrinsics
+    at = np.rint(np.nan_to_num(camera.project(points), nan=-9.0))
+    inside = np.all((at >= 0) & (at < np.array([k.width, k.height])), axis=1)
+    column, row = np.where(inside[:, None], at, 0).astype(int).T
+    z = camera.camera_from_world.apply(points)[:, 2]
+    return inside & (z < depth[row, column] + slack_mm)
+
+
+def _seen_landmarks(
+    coarse: Rig, rig: Rig, depth: Mapping[str, Float[np.ndarray, "h w"]], marks: Mapping[str, Float[np.ndarray, " 3"]]
+) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
+    """True pixels of each landmark in the cameras that see it, those nearest to the front first."""
+    front = rig[rig.front_camera()].centre_world - rig.centre_world()
+    by_angle = sorted(rig, key=lambda c: -float(np.dot(c.centre_world - rig.centre_world(), front)))
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for landmark, point in marks.items():
+        for camera in by_angle:
+            if bool(_unhidden(coarse[camera.name], depth[camera.name], point[None], HIDDEN_MM).all()):
+                found.setdefault(landmark, {})[camera.name] = camera.project(point[None])[0]
+    return found

@@ -1,0 +1,121 @@
+"""Skin colour per vertex: an even tone, blotches, and the features that are laid out from landmarks."""
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.studio.scene.anatomy import Anatomy, Landmarks
+
+BROW = np.array([0.035, 0.022, 0.015])
+LIP = np.array([0.40, 0.13, 0.12])
+
+
+def skin_paint(
+    vertices: Float[np.ndarray, "v 3"],
+    body: Anatomy,
+    tone: tuple[float, float, float],
+    stubble: float,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "v 4"]:
+    """Linear albedo and strength of the grain, head frame."""
+    paint = np.ones((len(vertices), 4))
+    paint[:, :3] = np.array(tone) * (1 + _blotches(vertices, rng) * (0.5, 1.0, 1.0))
+    if body.landmarks:
+        _blush(paint, vertices, body.landmarks)
+        _beard(paint, vertices, body.landmarks, stubble)
+        _mouth(paint, vertices, body.landmarks)
+        for side in ("right", "left"):
+            _eye(paint, vertices, body.landmarks, side)
+    paint[:, :3] = np.maximum(paint[:, :3], 0.004)
+    return paint
+
+
+def _blotches(vertices: Float[np.ndarray, "v 3"], rng: np.random.Generator) -> Float[np.ndarray, "v 1"]:
+    """A sum of waves in random directions, 15 to 60 mm long, standard deviation about 0.06."""
+    waves = rng.normal(0, 1, (24, 3))
+    waves *= (2 * np.pi / rng.uniform(15, 60, (24, 1))) / np.linalg.norm(waves, axis=1, keepdims=True)
+    return 0.06 * np.sin(vertices @ waves.T + rng.uniform(0, 2 * np.pi, 24)).sum(axis=1, keepdims=True) / np.sqrt(12)
+
+
+def _mix(paint: Float[np.ndarray, "v 4"], share: Float[np.ndarray, " v"], colour: Float[np.ndarray, " 3"]) -> None:
+    paint[:, :3] += share[:, None] * (colour - paint[:, :3])
+
+
+def _step(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    t = np.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _blush(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> None:
+    for side, sign in (("right", -1), ("left", 1)):
+        cheek = (marks[f"exocanthion_{side}"] + marks[f"cheilion_{side}"]) / 2 + (8 * sign, -2, 0)
+        share = np.exp(-((vertices - cheek) ** 2).sum(axis=1) / 500)
+        paint[:, 1:3] *= 1 - 0.22 * share[:, None]
+    nose = np.exp(-((vertices - marks["pronasale"]) ** 2).sum(axis=1) / 260)
+    paint[:, 1:3] *= 1 - 0.15 * nose[:, None]
+
+
+def _beard(
+    paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks, stubble: float
+) -> None:
+    x, y, z = vertices.T
+    mouth, chin = marks["stomion"], marks["gnathion"]
+    share = _step(14, 2, y - mouth[1] - 0.004 * (x - mouth[0]) ** 2) * _step(-75, -45, z - chin[2])
+    share *= _step(-38, -14, y - chin[1]) * stubble
+    paint[:, :3] *= 1 - 0.42 * share[:, None]
+    paint[:, 3] += 1.6 * share
+
+
+def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks) -> None:
+    x, y, z = vertices.T
+    right, left, line = marks["cheilion_right"], marks["cheilion_left"], marks["stomion"]
+    half = (left[0] - right[0]) / 2
+    across = (x - (left[0] + right[0]) / 2) / half
+    bow = np.maximum(1 - across**2, 0)
+    top = line[1] + (marks["labiale_superius"][1] - line[1]) * bow * (1 - 0.25 * np.exp(-60 * across**2)) + 0.5
+    bottom = line[1] + (marks["labiale_inferius"][1] - line[1]) * bow - 3.0 * bow
+    inside = np.minimum(np.minimum(top - y, y - bottom), half * (1 - np.abs(across)))
+    front = z > min(right[2], left[2]) - 12
+    _mix(paint, 0.75 * front * _step(-0.9, 0.9, inside), LIP)
+    seam = np.exp(-(((y - line[1]) / 1.2) ** 2)) * (np.abs(across) < 0.95) * front
+    paint[:, :3] *= 1 - 0.55 * seam[:, None]
+
+
+def _eye(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks, side: str) -> None:
+    """Brow and eye."""
+    x, y, z = vertices.T
+    outer, inner = marks[f"exocanthion_{side}"], marks[f"endocanthion_{side}"]
+    span = outer[0] - inner[0]
+    lift = 0.62 * (marks["glabella"][1] - (outer[1] + inner[1]) / 2)
+    along = np.clip(
+        (x - inner[0] + 0.12 * span) / (1.42 * span), -0.2, 1.2
+    )  # 0 at the inner end of the brow, 1 outside
+    arch = outer[1] + lift * (1.0 + 1.2 * along * (1 - along) * 1.25 - 0.2 * along)
+    width = 4.4 - 2.8 * np.clip(along, 0, 1)
+    there = _step(-0.06, 0.06, along) * _step(1.06, 0.94, along) * (z > outer[2] - 18)
+    brow = there * _step(1.0, 0.4, np.abs(y - arch) / width)
+    _mix(paint, 0.85 * brow, BROW)
+    paint[:, 3] += 3.0 * brow
+    _open_eye(paint, vertices, inner, outer)
+
+
+def _open_eye(
+    paint: Float[np.ndarray, "v 4"],
+    vertices: Float[np.ndarray, "v 3"],
+    inner: Float[np.ndarray, " 3"],
+    outer: Float[np.ndarray, " 3"],
+) -> None:
+    """White, iris and pupil between the lids, and the upper lashes."""
+    x, y, z = vertices.T
+    t = np.clip((x - inner[0]) / (outer[0] - inner[0]), 0, 1)
+    bow = 4 * t * (1 - t)
+    off = y - (inner[1] + t * (outer[1] - inner[1]) + 1.4 * bow)
+    here = (t > 0.02) & (t < 0.98) & (z > outer[2] - 14)
+    opening = here * _step(0.6, -0.6, np.abs(off) - 4.0 * bow)
+    _mix(paint, opening, np.array([0.44, 0.40, 0.38]))
+    paint[:, 3] *= 1 - 0.8 * opening
+    middle = (inner + outer) / 2 + (0, 1.8, 0)
+    radius = np.hypot(x - middle[0], y - middle[1])
+    _mix(paint, opening * _step(6.0, 5.0, radius), np.array([0.09, 0.06, 0.035]))
+    _mix(paint, opening * _step(2.6, 1.8, radius), np.array([0.008, 0.008, 0.008]))
+    lash = here * _step(1.5, 0.5, np.abs(off - 4.2 * bow)) * _step(0.0, 0.15, t) * _step(1.0, 0.9, t)
+    paint[:, :3] *= 1 - 0.75 * lash[:, None]

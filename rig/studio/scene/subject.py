@@ -1,0 +1,250 @@
+"""Who sits in the studio: a head that the caller brings, and the looks drawn for it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import Mesh, vertex_normals
+from rig.render.photograph import NOISE_CELLS, Gallery, Grain, Part
+from rig.render.renderer import Renderer
+from rig.studio.scene.anatomy import Anatomy, Landmarks, anatomy
+from rig.studio.scene.beard import grow_beard
+from rig.studio.scene.clothes import shirt
+from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow
+from rig.studio.scene.headwear import cap, glasses
+from rig.studio.scene.lights import LAMPS, irradiance, lamp_directions
+from rig.studio.scene.long_hair import hang, knot
+from rig.studio.scene.skin_texture import skin_paint
+from rig.studio.sensor.noise import volume
+
+Colour = tuple[float, float, float]
+
+SKIN_TONES: tuple[Colour, ...] = (
+    (0.50, 0.32, 0.24),
+    (0.44, 0.27, 0.19),
+    (0.36, 0.21, 0.14),
+    (0.27, 0.15, 0.10),
+    (0.54, 0.37, 0.29),
+)
+HAIR_TONES: tuple[Colour, ...] = (
+    (0.05, 0.028, 0.016),
+    (0.10, 0.055, 0.028),
+    (0.17, 0.10, 0.05),
+    (0.02, 0.016, 0.014),
+    (0.30, 0.20, 0.10),
+)
+CLOTH_TONES: tuple[Colour, ...] = (
+    (0.16, 0.11, 0.20),
+    (0.30, 0.07, 0.07),
+    (0.08, 0.10, 0.13),
+    (0.42, 0.40, 0.36),
+    (0.28, 0.19, 0.07),
+)
+
+SKIN = Grain((3.6, 3.6, 3.6), (0.08, 0.03, 0.0, 0.0), (1.1, 1.1, 1.1), (0.10, 0.0, 0.0, 0.0), gloss=0.035)
+HAIR = Grain((5.0, 30.0, 5.0), (0.30, 0.0, 0.0, 0.0), (0.9, 14.0, 5.0), (0.0, 0.45, 0.0, 0.0), gloss=0.015)
+CLOTH = Grain((9.0, 9.0, 9.0), (0.0, 0.12, 0.0, 0.0), (1.3, 1.3, 1.3), (0.0, 0.0, 0.12, 0.0))
+FRAME_TONE: Colour = (0.025, 0.018, 0.014)
+FRAME = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), gloss=0.15)
+PLAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """A head in the head frame (mm). Landmarks may be missing, which leaves the skin without brows and lips."""
+
+    mesh: Mesh
+    landmarks: Landmarks = field(default_factory=dict)
+    face_region: Bool[np.ndarray, " v"] | None = None
+    name: str = "subject"
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Colours are linear RGB albedos."""
+
+    skin: Colour
+    cloth: Colour
+    hair: HairStyle | None
+    freckles: float = 0.3
+    stubble: float = 0.0
+    texture: bool = True
+    beard: HairStyle | None = None
+    cap: Colour | None = None
+    glasses: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """A part before it is placed and lit, head frame. ``shows``: head, hair or clothes."""
+
+    shows: str
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    places: Float[np.ndarray, "v 3"]
+    paint: Float[np.ndarray, "v 4"]
+    grain: Grain
+    one_sided: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dressed:
+    """The lit subject in the world frame: the bare head, and what it wears (hair first, which hides most of the rest).
+    ``solid`` are vertices and faces of all but the strands of hair, for occlusion; ``surfaces`` are the same by what
+    they are: head, hair, clothes."""
+
+    head: Part
+    worn: tuple[Part, ...]
+    gallery: Gallery
+    solid: tuple[Float[np.ndarray, "v 3"], np.ndarray]
+    surfaces: Mapping[str, Mesh]
+
+
+def random_look(rng: np.random.Generator) -> Look:
+    """One of the committed tones each, and one of a few hair styles."""
+    tone = HAIR_TONES[rng.integers(len(HAIR_TONES))]
+    over_ears = bool(rng.random() < 0.4)
+    hair = HairStyle(
+        thickness_mm=float(rng.uniform(9, 20) + 6 * over_ears),
+        over_ears=over_ears,
+        fringe_mm=float(rng.choice([0.0, 0.0, 8.0, 16.0])),
+        lumps=float(rng.uniform(0.15, 0.32)),
+        strand_mm=float(rng.uniform(14, 30)),
+        stray_mm=float(rng.uniform(1.2, 2.6)),
+        tone=tone,
+    )
+    skin, cloth = SKIN_TONES[rng.integers(len(SKIN_TONES))], CLOTH_TONES[rng.integers(len(CLOTH_TONES))]
+    return Look(skin, cloth, hair, float(rng.uniform(0, 0.6)), float(rng.choice([0.0, 0.0, 0.6, 1.0])))
+
+
+def random_pose(
+    centre_world: Float[np.ndarray, " 3"], spread_deg: float, spread_mm: float, rng: np.random.Generator
+) -> Similarity:
+    """world_from_head of a subject who sits where the cameras look, a little turned and off."""
+    rotation = rotation_from_vector(np.radians(rng.normal(0, spread_deg, 3)))
+    return Similarity(1.0, rotation, centre_world + rng.normal(0, spread_mm, 3))
+
+
+def dress(
+    renderer: Renderer,
+    subject: Subject,
+    look: Look,
+    world_from_head: Similarity,
+    *,
+    clothes: bool,
+    rng: np.random.Generator,
+) -> Dressed:
+    """Hair, clothes, paint and light for a head, in the world frame."""
+    hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng = rng.spawn(5)
+    head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
+    worn = shirt(head, body, cloth_rng) if clothes else None
+    hairs = _hairs(head, body, look, worn, hair_rng)
+    pieces = [_skin(head, body, look, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
+    pieces += [_hair_piece(hair, style) for hair, style in hairs]
+    if worn:
+        grain = CLOTH if look.texture else PLAIN
+        pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], look.cloth), grain, False))
+    pieces += _headwear(head, body, look, hairs[0][0] if look.hair else None)
+    placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
+    normals = [vertex_normals(*piece) for piece in placed]
+    solid = _joined(placed)
+    light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid)
+    parts = [
+        Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided)
+        for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light, strict=True)
+    ]
+    strands = [
+        _strand_part(hair, part, world_from_head, strand_rng)
+        for (hair, _), part in zip(hairs, parts[1:], strict=False)
+        if len(hair.strands)
+    ]
+    gallery = Gallery(
+        volume(noise_rng, NOISE_CELLS), lamp_directions()[:2], np.array([lamp.colour for lamp in LAMPS[:2]])
+    )
+    shown = [piece.shows for piece in pieces]
+    surfaces = {
+        name: Mesh(*_joined([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
+        for name in dict.fromkeys(("head", *shown))
+    }
+    return Dressed(parts[0], tuple(parts[1:] + strands), gallery, solid, surfaces)
+
+
+def _skin(head: Mesh, body: Anatomy, look: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
+    if not look.texture:
+        return Piece(
+            "head", head.vertices, head.faces, head.vertices, _even(head.vertices, look.skin), PLAIN, one_sided
+        )
+    paint = skin_paint(head.vertices, body, look.skin, look.stubble, rng)
+    return Piece(
+        "head", head.vertices, head.faces, head.vertices, paint, replace(SKIN, freckles=look.freckles), one_sided
+    )
+
+
+def _hairs(
+    head: Mesh,
+    body: Anatomy,
+    look: Look,
+    worn: tuple[Float[np.ndarray, "_ 3"], np.ndarray] | None,
+    rng: np.random.Generator,
+) -> list[tuple[Hair, HairStyle]]:
+    """All surfaces of hair, that of the scalp first."""
+    found: list[tuple[Hair, HairStyle]] = []
+    if look.hair:
+        scalp = grow(head.vertices, body, look.hair, rng)
+        found.append((scalp, look.hair))
+        if look.hair.hanging_mm:
+            solid = np.concatenate([head.vertices, worn[0]]) if worn else head.vertices
+            found.append((hang(scalp, solid, body, look.hair, rng), look.hair))
+        if look.hair.bun_mm:
+            found.append((knot(scalp, body, look.hair, rng), look.hair))
+    if look.beard:
+        found.append((grow_beard(head, body, look.beard, rng), look.beard))
+    return found
+
+
+def _hair_piece(hair: Hair, style: HairStyle) -> Piece:
+    paint = _even(hair.shell, style.tone)
+    paint[:, :3] *= hair.shade[:, None]
+    return Piece("hair", hair.shell, hair.shell_faces, hair.shell_points, paint, HAIR, hair.one_sided)
+
+
+def _headwear(head: Mesh, body: Anatomy, look: Look, scalp: Hair | None) -> list[Piece]:
+    found = []
+    if look.cap:
+        surface = cap(head.vertices, scalp.shell if scalp else None, body)
+        grain = CLOTH if look.texture else PLAIN
+        found.append(Piece("clothes", *surface, surface[0], _even(surface[0], look.cap), grain, False))
+    if look.glasses:
+        surface = glasses(head.vertices, body)
+        found.append(Piece("clothes", *surface, surface[0], _even(surface[0], FRAME_TONE), FRAME, False))
+    return found
+
+
+def _even(vertices: Float[np.ndarray, "v 3"], tone: Colour) -> Float[np.ndarray, "v 4"]:
+    return np.tile((*tone, 1.0), (len(vertices), 1))
+
+
+def _strand_part(hair: Hair, shell: Part, world_from_head: Similarity, rng: np.random.Generator) -> Part:
+    per_strand = 2 * STRAND_POINTS
+    shade = np.repeat(rng.uniform(0.7, 1.4, len(hair.roots) // per_strand), per_strand)[:, None]
+    vertices = world_from_head.apply(hair.strands)
+    return replace(
+        shell,
+        vertices=vertices,
+        faces=hair.strand_faces,
+        normals=shell.normals[hair.roots],
+        places=hair.strand_points,
+        paint=shell.paint[hair.roots],
+        irradiance=shell.irradiance[hair.roots] * shade,
+        grain=replace(shell.grain, gloss=0.0),
+        one_sided=False,
+    )
+
+
+def _joined(pieces: list[tuple[Float[np.ndarray, "_ 3"], np.ndarray]]) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
+    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in pieces])
+    faces = [faces + offset for (_, faces), offset in zip(pieces, offsets[:-1], strict=True)]
+    return np.concatenate([vertices for vertices, _ in pieces]), np.concatenate(faces)

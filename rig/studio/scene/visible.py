@@ -1,0 +1,118 @@
+"""What the cameras see of a subject, as points on its true surface: head, hair and clothes.
+
+A reconstruction of the whole visible surface is scored against these. Strands of hair are left out: they are thinner
+than a pixel, and the surface that they stand on is what a mesh can have.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from rig.camera import Camera
+from rig.mesh import Mesh, face_normals
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+
+PARTS = ("head", "hair", "clothes")
+AREA_MM2 = 2.25  # of surface for each point: 1.5 mm apart
+VIEWS_LEAST = 2  # what one camera alone sees has no depth
+LEAST_FACING = 0.1  # cosine: flatter than 84 degrees no camera tells where a surface is
+HIDDEN_MM = 0.5  # a nearer surface hides a point beyond this: the depth map's own rounding, and facets
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VisiblePoints:
+    """Points of the true surface that two or more cameras see, world frame, mm; ``part`` indexes ``PARTS``."""
+
+    points: Float32[np.ndarray, "n 3"]
+    normals: Float32[np.ndarray, "n 3"]  # unit, outwards
+    part: UInt8[np.ndarray, " n"]
+    views: UInt8[np.ndarray, " n"]  # cameras that see the point
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of ``visible.npz``; ``area`` is the surface (mm2) that a point stands for."""
+        counted = {"points": self.points, "normals": self.normals, "part": self.part, "views": self.views}
+        return counted | {"area": np.asarray(AREA_MM2, np.float32)}
+
+
+def visible_points(
+    rig: Rig, surfaces: Mapping[str, Mesh], *, renderer: Renderer, rng: np.random.Generator
+) -> VisiblePoints:
+    """Points of surfaces (by part, world frame), evenly over their area, that ``VIEWS_LEAST`` cameras see."""
+    drawn = [sample_surface(mesh, AREA_MM2, rng) for mesh in surfaces.values()]
+    points, normals = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
+    codes = np.array([PARTS.index(name) for name in surfaces], np.uint8)
+    part = np.repeat(codes, [len(points) for points, _ in drawn])
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in surfaces.values()])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(surfaces.values(), offsets, strict=False)])
+    depth = renderer.depth(rig, np.concatenate([mesh.vertices for mesh in surfaces.values()]), faces)
+    views = np.zeros(len(points), np.uint8)
+    for camera in rig:
+        views += sees(camera, depth[camera.name], points, normals)
+    kept = views >= VIEWS_LEAST
+    return VisiblePoints(points[kept].astype(np.float32), normals[kept].astype(np.float32), part[kept], views[kept])
+
+
+def part_masks(
+    rig: Rig,
+    surfaces: Mapping[str, Mesh],
+    masks: Mapping[str, Bool[np.ndarray, "_ _"]],
+    *,
+    renderer: Renderer,
+) -> dict[str, UInt8[np.ndarray, "_ _"]]:
+    """What every pixel shows, counted as in bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the ``masks``.
+
+    What no surface covers within a mask are strands: hair.
+    """
+    depth = {name: renderer.depth(rig, mesh.vertices, mesh.faces) for name, mesh in surfaces.items()}
+    codes = np.array([1 + PARTS.index(name) for name in surfaces], np.uint8)
+    found = {}
+    for camera in rig.names:
+        stack = np.stack([depth[name][camera] for name in surfaces])
+        nearest = codes[stack.argmin(axis=0)]
+        nearest[~np.isfinite(stack).any(axis=0)] = 1 + PARTS.index("hair")
+        found[camera] = np.where(masks[camera], nearest, np.uint8(0))
+    return found
+
+
+def sample_surface(
+    mesh: Mesh, area_mm2: float, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """One point for each ``area_mm2`` at random places of the surface, and the unit normals of their triangles."""
+    normals = face_normals(mesh.vertices, mesh.faces)
+    double = np.linalg.norm(normals, axis=1)
+    ends = np.cumsum(double / 2)
+    face = np.searchsorted(ends, rng.uniform(0, ends[-1], int(ends[-1] / area_mm2)))
+    a, b = rng.uniform(0, 1, (2, len(face), 1))
+    over = a + b > 1  # folds the parallelogram into its triangle
+    a, b = np.where(over, 1 - a, a), np.where(over, 1 - b, b)
+    corners = mesh.vertices[mesh.faces[face]]
+    points = corners[:, 0] + a * (corners[:, 1] - corners[:, 0]) + b * (corners[:, 2] - corners[:, 0])
+    return points, normals[face] / double[face, None]
+
+
+def sees(
+    camera: Camera,
+    depth: Float[np.ndarray, "h w"],
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+) -> np.ndarray:
+    """Which points a camera sees, of a surface that has ``depth`` (camera z, mm, inf where nothing) in it.
+
+    The map is read at the nearest pixel's centre, where the point's own tangent plane is a little nearer or farther.
+    """
+    k, pose = camera.intrinsics, camera.camera_from_world
+    at = np.rint(np.nan_to_num(camera.project(points), nan=-9.0))
+    framed = np.all((at >= 0) & (at < (k.width, k.height)), axis=1)
+    column, row = np.where(framed[:, None], at, 0).astype(int).T
+    towards = camera.centre_world - points
+    facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    rays = np.zeros_like(points)
+    rays[framed] = camera.rays_world(at[framed])
+    z = pose.apply(points)[:, 2]
+    slant = (normals * rays).sum(axis=1)
+    along = -(normals * towards).sum(axis=1) / np.where(np.abs(slant) > 1e-6, slant, 1.0)
+    own = np.where(np.abs(slant) > 1e-6, along * (rays @ pose.rotation[2]), z)
+    return framed & (facing > LEAST_FACING) & (own < depth[row, column] + HIDDEN_MM)

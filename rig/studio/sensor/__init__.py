@@ -1,0 +1,1 @@
+"""What a camera makes of the scene: lens and sensor noise, planted faults, presets."""

@@ -1,0 +1,52 @@
+"""How imperfect the simulated studio is. ``PRESET`` is what every benchmark uses."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """Shares are of full scale or of the light; lengths in the image are pixels."""
+
+    noise: float = (
+        0.015  # sensor noise at mid grey, standard deviation; grows with the light's square root (shot noise)
+    )
+    light_drift: float = (
+        0.02  # between clean plate and shot: of each camera's brightness, and of its slope over the image
+    )
+    defocus_px: float = 0.7  # standard deviation of the blur
+    hair: bool = True
+    hairstyle: tuple[str, ...] = ()  # names of ``scene.hairstyles``, in place of the hair that the seed draws
+    clothes: bool = True
+    texture: bool = True  # brows, lips, pores, freckles; False paints the skin in one colour
+    backdrop_unevenness: float = 1.0  # 0: one flat colour; 1: folds, panels, a gradient
+    plates: int = 2  # clean plates a camera: the least from which noise can be told
+    exposure_spread: float = 0.06  # between cameras, of brightness
+    white_balance_spread: float = 0.03  # between cameras, of each channel
+    vignetting: float = 0.12  # light lost in the corner of the image
+    pose_spread_deg: float = 5.0  # how the subject holds its head, standard deviation an axis
+    pose_spread_mm: float = 8.0
+    feature_noise_px: float = 1.5  # of clicked feature points, standard deviation an axis
+    rolling_ms: float = 0.0  # from the first row's readout to the last's; 0: all rows at once (global shutter)
+    sway_mm_s: float = 20.0  # how fast the subject moves meanwhile, in a direction of its own each time
+    samples: int = 4  # coverage samples a pixel
+
+
+PRESET = Preset()
+"""Noise 1.5 %, light drift 2 %, defocus 0.7 px, hair, uneven backdrop (issue 2, item 6)."""
+
+CLEAN = Preset(
+    noise=0.0,
+    light_drift=0.0,
+    defocus_px=0.0,
+    hair=False,
+    clothes=False,
+    backdrop_unevenness=0.0,
+    plates=1,
+    exposure_spread=0.0,
+    white_balance_spread=0.0,
+    vignetting=0.0,
+    pose_spread_deg=0.0,
+    pose_spread_mm=0.0,
+    feature_noise_px=0.0,
+)
+"""No imperfection at all: for telling what an imperfection costs."""

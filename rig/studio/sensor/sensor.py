@@ -1,0 +1,68 @@
+"""From linear light to an 8-bit photograph: lens blur, vignetting, gains, shot noise, the sRGB curve."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rig.colour_space import srgb_from_linear
+
+CURVE_STEPS = 1 << 12
+MID_GREY = 0.214  # linear light that sRGB writes as 50 %
+READ_SHARE = 0.1  # of mid grey's noise variance: what is there without light
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """One camera's own imperfections, the same in every picture it takes."""
+
+    gains: tuple[float, float, float]  # exposure times white balance, per channel
+    vignetting: float
+    defocus_px: float
+    noise: float
+
+
+def _curve() -> UInt8[np.ndarray, " n"]:
+    # Steps even in the square root of light: within a third of a grey level over the whole scale.
+    light = (np.arange(CURVE_STEPS) / (CURVE_STEPS - 1)) ** 2
+    return np.rint(255 * srgb_from_linear(light)).astype(np.uint8)
+
+
+_CURVE = _curve()
+
+
+def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarray, "h w 3"]:
+    """The light on the sensor: blurred by the lens, darker in the corners, times the camera's gains (float32)."""
+    light = cv2.GaussianBlur(linear, (0, 0), sensor.defocus_px) if sensor.defocus_px > 0 else linear
+    height, width = light.shape[:2]
+    y, x = np.ogrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
+    fall_off = (1.0 - sensor.vignetting * (x**2 + y**2) / 2.0).astype(np.float32)
+    return light * fall_off[:, :, None] * np.array(sensor.gains, np.float32)
+
+
+def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
+    """What a rolling shutter makes of a subject that moves by ``shift_px`` from the first row's readout to the last's:
+    each row shows it where it was then, the middle row where it is."""
+    height, width = subject.shape[:2]
+    across, down = shift_px / (height - 1)
+    source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(subject, source, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
+def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+    """One picture of the light on the sensor, with fresh noise."""
+    if sensor.noise > 0:
+        # The curve's slope at mid grey is 1.07, so that the noise there is ``noise`` of full scale in the picture.
+        variance = (sensor.noise / 1.07) ** 2 * (READ_SHARE + (1 - READ_SHARE) / MID_GREY * np.maximum(light, 0))
+        light = light + np.sqrt(variance) * rng.standard_normal(light.shape, np.float32)
+    step = np.sqrt(np.clip(light, 0.0, 1.0)) * np.float32(CURVE_STEPS - 1) + np.float32(0.5)
+    return _CURVE[step.astype(np.uint16)]
+
+
+def drift(shape: tuple[int, int], amount: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 1"]:
+    """Gain of the light between clean plate and shot: one factor and a slope over the image, each of this size."""
+    level, across, down = amount * rng.standard_normal(3)
+    y, x = np.ogrid[-1.0 : 1.0 : shape[0] * 1j, -1.0 : 1.0 : shape[1] * 1j]
+    return (1.0 + level + 0.5 * (across * x + down * y)).astype(np.float32)[:, :, None]

@@ -1,0 +1,96 @@
+"""``eigenhead reconstruct``: one capture without the service, in this process."""
+
+import json
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rig.errors import InputError
+from rig.formats.archive import extract_archive
+from server.cli.answers import CannotWrite
+from server.storage.result_folder import fresh_folder
+from server.tasks.progress import Course, Expectation
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
+
+Report = Callable[[str, float], None]
+
+
+def settings_document(path: Path | None, **given: str | dict[str, Any] | None) -> dict[str, Any]:
+    """Settings from a TOML or JSON file, then from options; tables are merged. Raises InputError."""
+    document: dict[str, Any] = {}
+    if path is not None:
+        try:
+            text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
+            document = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        except (OSError, ValueError) as error:
+            raise InputError(path.name, [f"cannot be read ({error})"]) from error
+        if not isinstance(document, dict):
+            raise InputError(path.name, ["is no table of settings"])
+    for name, value in given.items():
+        old = document.get(name)
+        if value is not None:
+            document[name] = old | value if isinstance(old, dict) and isinstance(value, dict) else value
+    return document
+
+
+def reconstruct_locally(
+    capture: Path, out: Path, *, model: str | None, settings: dict[str, Any], report: Report
+) -> dict[str, Any]:
+    """Reconstructs a capture folder or archive into ``out`` and returns report.json. What can be wrong with settings,
+    capture and ``out`` is found before anything heavy is loaded."""
+    from pipeline.settings import settings_from_document
+
+    chosen = settings_from_document(settings)
+    with _result_folder(out) as fresh, folder_of(capture) as folder:
+        _reconstruct_folder(folder, fresh, model=model, chosen=chosen, report=report)
+        document = json.loads((fresh / "report.json").read_text(encoding="utf-8"))
+    return document
+
+
+def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "Settings", report: Report) -> None:
+    from rig.formats.capture_folder import read_capture
+
+    shot, rig = read_capture(folder)
+    from pipeline.eigenheads.model import load_model
+    from pipeline.reconstruct import reconstruct
+    from pipeline.results.write import write_result
+    from rig.render.renderer import Renderer
+
+    course = Course(Expectation().of(chosen.method))
+
+    def tell(stage: str, fraction: float) -> None:
+        course.report(stage, fraction)
+        report(stage, course.progress())
+
+    tell("read", 0.0)
+    head_model = load_model(model or "default")
+    with Renderer.create() as renderer:
+        done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell)
+    tell("write", 0.0)
+    write_result(out, done, shot)
+
+
+@contextmanager
+def _result_folder(out: Path) -> Iterator[Path]:
+    with ExitStack() as stack:
+        try:
+            fresh = stack.enter_context(fresh_folder(out))
+        except OSError as error:
+            raise CannotWrite(out, error) from error
+        yield fresh
+
+
+@contextmanager
+def folder_of(capture: Path) -> Iterator[Path]:
+    """A capture folder, or what is in an archive of one for as long as it is needed. Raises InputError."""
+    if capture.is_dir():
+        yield capture
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        extract_archive(capture, Path(scratch) / "capture")
+        yield Path(scratch) / "capture"

@@ -1,0 +1,95 @@
+"""``eigenhead refine``: captures on disk to a refined calibration."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibration.silhouette_refinement.refine import TooFewCaptures, refine
+from calibration.silhouette_refinement.report import RefinementRun
+from calibration.silhouette_refinement.rims import Heads
+from pipeline.eigenheads.model import load_model, with_modes
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.reconstruct import align, without_moved_cameras
+from pipeline.settings import Settings
+from pipeline.silhouettes.segment import segment
+from rig.errors import InputError
+from rig.formats.cameras_json import read_rig
+from rig.formats.capture_folder import read_capture
+from rig.geometry import RigidTransform, Similarity
+from rig.rig import Rig
+from server.cli.reconstruct_local import folder_of
+
+Report = Callable[[str, float], None]
+
+
+def refine_locally(
+    captures: Sequence[Path], *, calibration: Path | None, focal: bool, model: str | None, report: Report
+) -> RefinementRun:
+    """Refines the calibration that the captures share, or ``calibration``, with the rims of ``model`` if it is given.
+
+    A camera that the drift watch calls moved takes no part in that capture: it needs the board. Raises InputError,
+    TooFewCaptures, and what the alignment of a head raises.
+    """
+    if len(captures) < 2:
+        raise TooFewCaptures(len(captures))
+    rig = None if calibration is None else read_rig(calibration)
+    settings = Settings()
+    head = None if model is None else load_model(model)
+    head = head and with_modes(head, min(settings.fitting.modes, len(head.modes)))
+    seen: list[Mapping[str, Silhouette]] = []
+    starts: list[Similarity] = []
+    moved: dict[str, list[str]] = {}
+    for number, path in enumerate(captures):
+        report("silhouettes", 0.5 * number / len(captures))
+        with folder_of(path) as folder:
+            capture, own = read_capture(folder)
+        rig = rig or own
+        faults = _differences(own, rig, same_poses=calibration is None)
+        if faults:
+            raise InputError(path.name, [*faults, "the captures must be of one rig, calibrated once"])
+        found = segment(capture, rig, settings.segmentation, report=_silent)
+        kept, warnings = without_moved_cameras(found, rig)
+        seen.append(kept)
+        if head is not None:
+            starts.append(align(head, capture, kept, rig, settings, rig.front_camera(), _silent)[0])
+        for name in (name for name in kept if warnings and kept[name] is not found[name]):
+            moved.setdefault(name, []).append(path.name)
+    assert rig is not None
+    refined = refine(
+        seen,
+        rig,
+        focal=focal,
+        heads=None if head is None else Heads(head, starts, settings.fitting),
+        report=lambda stage, fraction: report(stage, 0.5 + 0.5 * fraction),
+    )
+    told = [
+        f"{name} has moved in {', '.join(where)} and took no part there: calibrate with the board again, "
+        "for refinement is for fractions of a pixel"
+        for name, where in sorted(moved.items())
+    ]
+    return RefinementRun(refined, rig, tuple(path.name for path in captures), tuple(told))
+
+
+def _silent(stage: str, fraction: float) -> None:
+    """One progress bar is enough."""
+
+
+def _differences(own: Rig, rig: Rig, *, same_poses: bool) -> list[str]:
+    if set(own.names) != set(rig.names):
+        return [f"{name}: only in one of the two calibrations" for name in sorted(set(own.names) ^ set(rig.names))]
+    faults = []
+    for camera in own:
+        here, there = camera, rig[camera.name]
+        size, wanted = ((c.intrinsics.width, c.intrinsics.height) for c in (here, there))
+        if size != wanted:
+            faults.append(f"{camera.name}: pictures of {size[0]} x {size[1]}, calibrated for {wanted[0]} x {wanted[1]}")
+        elif same_poses and not _same_place(here.camera_from_world, there.camera_from_world):
+            faults.append(f"{camera.name}: stands elsewhere in its cameras.json than in the first capture's")
+    return faults
+
+
+def _same_place(one: RigidTransform, other: RigidTransform) -> bool:
+    return np.allclose(one.rotation, other.rotation, rtol=0, atol=1e-9) and np.allclose(
+        one.translation, other.translation, rtol=0, atol=1e-6
+    )

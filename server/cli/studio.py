@@ -1,0 +1,124 @@
+"""``eigenhead simulate --serve``: the simulated studio as devices, for as long as somebody tries things on it."""
+
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.eigenheads.model import load_model
+from rig.acquisition.commands import take_plates
+from rig.capture import Capture
+from rig.errors import InputError
+from rig.formats.rig_toml import read_rig_config
+from rig.render.renderer import Renderer
+from rig.studio.devices.folder import write_truth
+from rig.studio.devices.serve import STUDIO, StudioDevices, device_fault_from_text, serve_scene
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import SimulatedCapture, build_scene
+from rig.studio.sensor.preset import Preset
+from server.tasks.subjects import subject_of
+
+
+@dataclass(frozen=True, slots=True)
+class OpenStudio:
+    """Where an operator finds the devices of a studio that is being served."""
+
+    url: str
+    cameras: dict[str, str]
+    box: Path
+    terminal: str
+    rig: Path
+    truth: Path
+
+    @classmethod
+    def of(cls, devices: StudioDevices, truth: Path) -> "OpenStudio":
+        link = devices.port_link
+        cameras = {name: devices.streams.url(name) for name in devices.names}
+        return cls(devices.streams.address, cameras, link, str(link.readlink()), devices.folder / "rig.toml", truth)
+
+    def document(self) -> dict[str, object]:
+        """For ``--json``."""
+        return {
+            "url": self.url,
+            "cameras": self.cameras,
+            "trigger": {"port": str(self.box), "terminal": self.terminal},
+            "rig": str(self.rig),
+            "truth": str(self.truth),
+        }
+
+    def lines(self) -> list[str]:
+        """What is there, and what to try on it."""
+        first = next(iter(self.cameras))
+        return [
+            "The simulated studio is open; Ctrl-C closes it.",
+            "",
+            f"  page         {self.url}/",
+            f"  cameras      {len(self.cameras)}, {self.cameras[first]} and so on",
+            f"  trigger box  {self.box} ({self.terminal})",
+            f"  rig.toml     {self.rig}",
+            f"  truth        {self.truth}",
+            "",
+            "Clean plates are taken and the subject is seated. In another terminal:",
+            "",
+            f"  eigenhead rig check --rig {self.rig}",
+            f"  eigenhead rig capture --rig {self.rig} --out shots/one",
+            "  eigenhead reconstruct shots/one --out heads/one",
+            f"  eigenhead serve --rig {self.rig}",
+            f"  curl -X POST '{self.url}/subject?present=0'",
+            f"  curl -X POST '{self.url}/faults?kind=bumped&camera={first}'",
+            f"  curl -X DELETE {self.url}/faults",
+        ]
+
+
+def serve_studio(
+    folder: Path,
+    *,
+    subject: str,
+    seed: int,
+    preset: Preset,
+    faults: Sequence[str],
+    fps: float,
+    port: int,
+    ready: Callable[[OpenStudio], None],
+    report: Callable[[str, float], None],
+) -> None:
+    """Serves the subject that ``eigenhead simulate`` draws for the same seed, until SIGINT or SIGTERM.
+
+    ``folder`` receives rig.toml, cameras.json and clean plates, ``<folder>.truth`` the truth; ``ready`` is told once
+    everything can be used. Afterwards no thread, port or pseudo-terminal is left. Raises InputError for a folder that
+    is another rig's, a wrong fault or a port that is taken.
+    """
+    planted = [device_fault_from_text(text) for text in faults]
+    _check_folder(folder)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background jobs are started with SIGINT ignored
+        signal.signal(number, signal.default_int_handler)
+    rng = np.random.default_rng(seed)
+    report("draw", 0.0)
+    with Renderer.create() as renderer:
+        chosen = subject_of(subject, load_model(), rng)
+        scene = build_scene(chosen, default_layout(), preset, rng.spawn(1)[0], renderer=renderer)
+    truth = folder.with_name(folder.name + ".truth")
+    write_truth(truth, SimulatedCapture(Capture({}), scene.rig, scene, ()), seed=seed)
+    report("devices", 0.5)
+    with serve_scene(folder, scene, fps=fps, port=port) as devices:
+        report("clean plates", 0.7)
+        take_plates(read_rig_config(folder / "rig.toml"))
+        report("subject", 0.8)
+        devices.seat(True)
+        for fault in planted:
+            devices.inject(fault)
+        report("ready", 1.0)
+        ready(OpenStudio.of(devices, truth))
+        threading.Event().wait()
+
+
+def _check_folder(folder: Path) -> None:
+    """A rig.toml in it is overwritten only where a studio has written it."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    rig = folder / "rig.toml"
+    if not rig.is_file() or read_rig_config(rig).name != STUDIO:
+        raise InputError(str(folder), ["is there already and holds no simulated studio; name a folder that is not"])

@@ -1,0 +1,1 @@
+"""The API: routes, their documents, resumable uploads; and ``serve``, which composes the service."""

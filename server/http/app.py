@@ -1,0 +1,148 @@
+"""``create_app``: the API as an ASGI app."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from importlib.metadata import version
+from typing import Any
+
+import structlog
+from fastapi import FastAPI
+from fastapi.middleware.cors import CORSMiddleware
+from fastapi.routing import APIRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from server.http.routes import calibrations, captures, jobs, operations, rig, sessions, uploads
+from server.metrics import Metrics
+from server.services.health import check_egl
+from server.services.retention import sweep
+from server.services.service import Service, open_service
+from server.settings import ServiceSettings
+from server.storage.store import new_id
+from server.wire import problems
+
+LAG_EVERY_S = 0.02
+EXPOSED = ("Location", "ETag", "Upload-Offset", "Upload-Length", "Upload-Expires", "Tus-Resumable", "X-Request-Id")
+
+MountPages = Callable[[FastAPI, ServiceSettings], None]
+
+log = structlog.get_logger()
+
+
+def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None) -> FastAPI:
+    """The service's ASGI app, perhaps with pages for operators. Opens the data folder and the database at startup, not
+    on import."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        app.state.service = service = await asyncio.to_thread(open_service, settings, metrics)
+        tasks = [asyncio.create_task(_look_around(service))]
+        tasks += [asyncio.create_task(_sweep_forever(service)), asyncio.create_task(_measure_lag(metrics))]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            with suppress(asyncio.CancelledError):
+                await asyncio.gather(*tasks)
+            await asyncio.to_thread(service.close)
+
+    metrics = Metrics()
+    app = FastAPI(
+        title="eigenhead",
+        version=version("eigenhead"),
+        description="One shot of a calibrated camera rig in, a textured 3D head with its uncertainty out.",
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+    )
+    routers = [module.router for module in (captures, calibrations, jobs, sessions, uploads, rig, operations)]
+    for router in routers:
+        app.include_router(router)
+    problems.install(app, [route for router in routers for route in router.routes if isinstance(route, APIRoute)])
+    if mount_pages is not None:
+        mount_pages(app, settings)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["*"],
+            allow_headers=["*"],
+            expose_headers=EXPOSED,
+        )
+    app.add_middleware(Watch, metrics=metrics)
+    _name_problem(app)
+    return app
+
+
+class Watch:
+    """Gives every request an id, logs it, and counts it."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app, self._metrics = app, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request_id, began, status = new_id(), time.monotonic(), 500
+
+        async def send_with_id(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                message["headers"] = [*message.get("headers", []), (b"x-request-id", request_id.encode())]
+            await send(message)
+
+        with structlog.contextvars.bound_contextvars(request=request_id):
+            try:
+                await self._app(scope, receive, send_with_id)
+            finally:
+                route = getattr(scope.get("route"), "path", "other")
+                self._metrics.observe(scope["method"], route, status, began)
+                if route not in ("/healthz", "/readyz", "/metrics"):
+                    ms = round((time.monotonic() - began) * 1000, 1)
+                    log.info("request", method=scope["method"], path=scope["path"], status=status, ms=ms)
+
+
+async def _look_around(service: Service) -> None:
+    await service.threads.disk(check_egl, service)
+
+
+async def _sweep_forever(service: Service) -> None:
+    """A sweep now and every ``sweep_s``; a failing one is logged and tried again."""
+    while True:
+        try:
+            await service.threads.disk(sweep, service)
+        except Exception as error:  # a full or missing disk, a database that is away
+            log.error("sweep failed", error=str(error)[:300])
+        await asyncio.sleep(service.settings.sweep_s)
+
+
+async def _measure_lag(metrics: Metrics) -> None:
+    loop = asyncio.get_running_loop()
+    while True:
+        began = loop.time()
+        await asyncio.sleep(LAG_EVERY_S)
+        metrics.lag.observe(max(0.0, loop.time() - began - LAG_EVERY_S))
+
+
+def _name_problem(app: FastAPI) -> None:
+    """Puts the problem document into the OpenAPI description, in place of the framework's own error."""
+    original = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        document = original()
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        schemas["Problem"] = problems.PROBLEM_SCHEMA
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(unused, None)
+        for path in document["paths"].values():
+            for call in path.values():
+                for status, answer in call.get("responses", {}).items():
+                    if status[0] in "45" and problems.MEDIA_TYPE in answer.get("content", {}):
+                        answer["content"] = {problems.MEDIA_TYPE: answer["content"][problems.MEDIA_TYPE]}
+        return document
+
+    app.openapi = openapi

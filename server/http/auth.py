@@ -1,0 +1,62 @@
+"""Who a request is from: an API key in its Authorization header, or, on loopback and with no key made, the people at
+this machine. Requests that a web page elsewhere made a browser send are refused (the Host and Origin headers tell)."""
+
+from collections.abc import Callable
+from typing import Annotated
+
+from fastapi import Depends, Request
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from server.address import is_loopback
+from server.services.keys import LOCAL, SCOPES, Caller
+from server.services.service import Service
+from server.wire.problems import Problem
+
+bearer = HTTPBearer(auto_error=False, description="API key, eh_...; not needed on loopback while no key exists")
+
+
+def service_of(request: Request) -> Service:
+    return request.app.state.service
+
+
+ServiceOf = Annotated[Service, Depends(service_of)]
+
+
+def require(scope: str) -> Callable[..., Caller]:
+    """A dependency: the caller, if it may do ``scope``; else a 401 or 403 problem. Runs before a body is read."""
+
+    def authenticate(
+        request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
+    ) -> Caller:
+        caller = _caller(request, credentials)
+        if not caller.may(scope):
+            raise Problem(403, "scope-missing", f"This key may not do that: it lacks the scope {scope!r}.")
+        return caller
+
+    return authenticate
+
+
+def _caller(request: Request, credentials: HTTPAuthorizationCredentials | None) -> Caller:
+    service = service_of(request)
+    if credentials is not None:
+        caller = service.keys.caller(credentials.credentials)
+        if caller is not None:
+            return caller
+        detail = "Nobody here has this API key: it is misspelt, was removed, or is of another data folder."
+        raise Problem(401, "key-invalid", detail, headers={"WWW-Authenticate": 'Bearer error="invalid_token"'})
+    if service.settings.is_private and not service.keys.any():
+        _check_origin(request)
+        return Caller(LOCAL, frozenset(SCOPES))
+    detail = "An API key is needed: send 'Authorization: Bearer eh_...'."
+    raise Problem(401, "key-missing", detail, headers={"WWW-Authenticate": "Bearer"})
+
+
+def _check_origin(request: Request) -> None:
+    """Refuses what a foreign web page sends through a browser on this machine (CSRF, DNS rebinding)."""
+    origin = request.headers.get("origin")
+    names = [request.url.hostname or ""]
+    if origin is not None:
+        names.append(origin.partition("://")[2].rpartition(":")[0] or origin.partition("://")[2])
+    if not all(is_loopback(name) for name in names):
+        detail = "Without API keys the service answers only to its own machine; make a key with `eigenhead keys add`."
+        raise Problem(403, "foreign-origin", detail)

@@ -1,0 +1,96 @@
+"""Calibrations: from an archive of board pictures or from shots that the rig took; looked at, fetched, removed."""
+
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse
+from pydantic import ValidationError
+
+from server.http.auth import ServiceOf, require
+from server.http.schemas import CalibrationList, CalibrationOut, NewCalibration
+from server.services.keys import Caller
+from server.wire.multipart import check_length, described_form, receive_board_pictures
+from server.wire.problems import Problem, documented
+from server.wire.send_file import send_file
+
+router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"])
+Reader = Annotated[Caller, Depends(require("read"))]
+Taker = Annotated[Caller, Depends(require("capture"))]
+JSON_BYTES = 1 << 20
+
+BODY = described_form("archive of IMAGES/ and board.toml", ("label",))
+BODY["requestBody"]["content"]["application/json"] = {"schema": NewCalibration.model_json_schema()}
+
+
+@router.post("", status_code=202, responses=documented(400, 404, 413, 415, 507), openapi_extra=BODY)
+async def make_calibration(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CalibrationOut:
+    """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took of the board (JSON)."""
+    if request.headers.get("content-type", "").partition(";")[0].strip() == "application/json":
+        await service.threads.disk(check_length, request, service.store, service.settings)
+        wanted = _parsed(await _small_body(request))
+        made = await service.threads.check(service.calibrations.add_shots, wanted.board, wanted.captures, wanted.label)
+    else:
+        made = await receive_board_pictures(service, request)
+    response.headers["Location"] = f"/v1/calibrations/{made['id']}"
+    return CalibrationOut.model_validate(made)
+
+
+@router.get("", responses=documented())
+def list_calibrations(service: ServiceOf, caller: Reader) -> CalibrationList:
+    """Newest first."""
+    return CalibrationList.model_validate({"calibrations": service.calibrations.find()})
+
+
+@router.get("/{calibration_id}", responses=documented(404))
+def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> CalibrationOut:
+    return CalibrationOut.model_validate(service.calibrations.get(calibration_id))
+
+
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/json": {}}},
+    206: {"description": "Partial Content"},
+    304: {"description": "Not Modified"},
+    **documented(404, 409, 416),
+}
+
+
+@router.head("/{calibration_id}/cameras.json", include_in_schema=False)
+@router.get("/{calibration_id}/cameras.json", responses=FILE, response_class=FileResponse)
+def get_cameras(service: ServiceOf, caller: Reader, request: Request, calibration_id: str) -> Response:
+    return send_file(request, service.calibrations.file(calibration_id, "cameras.json"))
+
+
+@router.get(
+    "/{calibration_id}/report.html",
+    responses=FILE | {200: {"content": {"text/html": {}}}},
+    response_class=FileResponse,
+)
+def get_report(service: ServiceOf, caller: Reader, request: Request, calibration_id: str) -> Response:
+    """One self-contained page: residuals, coverage, uncertainty."""
+    return send_file(request, service.calibrations.file(calibration_id, "report.html"))
+
+
+@router.delete("/{calibration_id}", status_code=204, responses=documented(404, 409))
+def remove_calibration(service: ServiceOf, caller: Taker, calibration_id: str) -> None:
+    """A calibration in use stays in use: what is removed are its pictures and its report."""
+    service.calibrations.remove(calibration_id)
+
+
+async def _small_body(request: Request) -> bytes:
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > JSON_BYTES:
+            raise Problem(413, "body-too-large", f"A JSON body may have {JSON_BYTES:,} bytes.")
+    return bytes(body)
+
+
+def _parsed(body: bytes) -> NewCalibration:
+    try:
+        return NewCalibration.model_validate(json.loads(body))
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from error
+    except (ValueError, RecursionError) as error:
+        raise Problem(422, "invalid-request", "The body is no JSON.", [str(error)[:200]]) from error

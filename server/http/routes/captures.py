@@ -1,0 +1,157 @@
+"""Captures: taken with the rig or uploaded, looked at, given feature points, removed."""
+
+import json
+from functools import partial
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi.responses import FileResponse
+
+from rig.errors import InputError
+from server.http.auth import ServiceOf, require
+from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures
+from server.services.captures import About
+from server.services.jobs import Work
+from server.services.keys import Caller
+from server.wire.multipart import ARCHIVE, described_form, receive_capture
+from server.wire.problems import documented
+from server.wire.send_file import send_file
+
+router = APIRouter(prefix="/v1", tags=["captures"])
+Reader = Annotated[Caller, Depends(require("read"))]
+Taker = Annotated[Caller, Depends(require("capture"))]
+
+FIELDS = ("session", "label", "expression")
+
+
+@router.post("/captures", status_code=201, responses=documented(400, 404, 413, 415, 507))
+def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response: Response) -> CaptureOut:
+    """Triggers the rig now; answers once every camera delivered (201) or the fault is known (503).
+
+    ``board``: pictures of the calibration board, from the cameras that deliver, for ``POST /v1/calibrations``."""
+    about = About(wanted.session, wanted.label, wanted.expression)
+    return _created(service.captures.take(about, seed=wanted.seed, board=wanted.board), response)
+
+
+@router.post(
+    "/captures/uploads",
+    status_code=201,
+    responses=documented(400, 404, 413, 415, 507),
+    openapi_extra=described_form(ARCHIVE, FIELDS),
+)
+async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
+    """Takes a capture folder as an archive; 422 names every fault in it, and then nothing of it is kept."""
+    record, _ = await receive_capture(service, request)
+    return _created(record, response)
+
+
+@router.get("/captures", responses=documented(400))
+def list_captures(
+    service: ServiceOf,
+    caller: Reader,
+    session: Annotated[str | None, Query(max_length=64)] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    before: Annotated[str | None, Query(max_length=64, description="only captures older than this id")] = None,
+) -> CaptureList:
+    """Newest first."""
+    found = service.captures.find(session=session, limit=limit, before=before)
+    return CaptureList.model_validate({"captures": found})
+
+
+@router.get("/captures/{capture_id}", responses=documented(404))
+def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureOut:
+    return CaptureOut.model_validate(service.store.capture(capture_id))
+
+
+@router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))
+def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: CaptureEdit) -> CaptureOut:
+    """Another label, expression or session."""
+    changed = service.captures.edit(capture_id, wanted.model_dump(exclude_unset=True))
+    return CaptureOut.model_validate(changed)
+
+
+IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"content": {f"image/{kind}": {} for kind in ("png", "jpeg", "tiff", "webp")}},
+    206: {
+        "description": "Partial Content",
+        "content": {f"image/{kind}": {} for kind in ("png", "jpeg", "tiff", "webp")},
+    },
+    304: {"description": "Not Modified"},
+    **documented(404, 416),
+}
+
+
+@router.head("/captures/{capture_id}/images/{camera}", include_in_schema=False)
+@router.get("/captures/{capture_id}/images/{camera}", responses=IMAGE_RESPONSES, response_class=FileResponse)
+def get_image(service: ServiceOf, caller: Reader, request: Request, capture_id: str, camera: str) -> Response:
+    return send_file(request, service.captures.image(capture_id, "images", camera))
+
+
+@router.head("/captures/{capture_id}/backgrounds/{camera}", include_in_schema=False)
+@router.get("/captures/{capture_id}/backgrounds/{camera}", responses=IMAGE_RESPONSES, response_class=FileResponse)
+def get_background(service: ServiceOf, caller: Reader, request: Request, capture_id: str, camera: str) -> Response:
+    """The first clean plate of a camera."""
+    return send_file(request, service.captures.image(capture_id, "background", camera))
+
+
+@router.put("/captures/{capture_id}/features", responses=documented(400, 404, 409, 413, 415, 507))
+def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: NewFeatures) -> CaptureOut:
+    """Stores feature points; 422 names every point that the capture cannot have. Jobs made from now on use them."""
+    return CaptureOut.model_validate(service.captures.put_features(capture_id, features.model_dump()))
+
+
+@router.get("/captures/{capture_id}/features", responses=documented(404))
+def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeatures:
+    return NewFeatures(points=service.captures.features(capture_id))
+
+
+@router.delete("/captures/{capture_id}", status_code=204, responses=documented(404, 409))
+def delete_capture(service: ServiceOf, caller: Taker, capture_id: str) -> None:
+    """Removes a capture with its images; its jobs and their results stay. 409 while a job needs it."""
+    service.captures.remove(capture_id)
+
+
+@router.post(
+    "/reconstructions",
+    status_code=202,
+    tags=["jobs"],
+    responses=documented(400, 404, 409, 413, 415, 507),
+    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model"), settings="JSON object"),
+)
+async def reconstruct_upload(
+    service: ServiceOf,
+    caller: Annotated[Caller, Depends(require("submit"))],
+    request: Request,
+    response: Response,
+) -> JobOut:
+    """Upload and job in one call."""
+    record, fields = await receive_capture(service, request)
+    try:
+        wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")))
+        key = request.headers.get("idempotency-key")
+        submit = partial(service.jobs.submit, record["id"], wanted, key=caller.key, idempotency_key=key)
+        job = await service.threads.disk(submit)
+    except BaseException:
+        service.store.remove_capture(record["id"])
+        raise
+    if job["capture_id"] != record["id"]:  # the key's first call made the job; this upload is not needed
+        service.store.remove_capture(record["id"])
+    response.headers["Location"] = f"/v1/jobs/{job['id']}"
+    return JobOut.model_validate(job)
+
+
+def _settings_of(text: str | None) -> dict[str, Any] | None:
+    if not text:
+        return None
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError("settings", [f"is no JSON ({error})"]) from error
+    if not isinstance(document, dict):
+        raise InputError("settings", ["is no JSON object"])
+    return document
+
+
+def _created(record: dict[str, Any], response: Response) -> CaptureOut:
+    response.headers["Location"] = f"/v1/captures/{record['id']}"
+    return CaptureOut.model_validate(record)

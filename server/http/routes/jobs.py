@@ -1,0 +1,160 @@
+"""Jobs: submitted, watched, cancelled, restarted; and the files that they made."""
+
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+from urllib.parse import quote
+
+import anyio
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.responses import FileResponse, StreamingResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from server.http.auth import ServiceOf, require
+from server.http.schemas import JobList, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
+from server.services.jobs import FINISHED, Work
+from server.services.keys import Caller
+from server.wire.problems import documented
+from server.wire.send_file import media_type, send_archive, send_file
+
+router = APIRouter(prefix="/v1", tags=["jobs"])
+Reader = Annotated[Caller, Depends(require("read"))]
+Submitter = Annotated[Caller, Depends(require("submit"))]
+Idempotency = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1, max_length=200)]
+
+
+@router.post("/jobs", status_code=202, responses=documented(400, 404, 409, 413, 415, 507))
+def submit_job(
+    service: ServiceOf, caller: Submitter, wanted: NewJob, response: Response, idempotency_key: Idempotency = None
+) -> JobOut:
+    """Queues a reconstruction. The same Idempotency-Key with the same request returns the first job."""
+    job = service.jobs.submit(
+        wanted.capture_id,
+        Work(wanted.model, wanted.settings),
+        key=caller.key,
+        idempotency_key=idempotency_key,
+        queue=wanted.queue,
+        priority=wanted.priority,
+    )
+    return _accepted(job, response)
+
+
+@router.post("/sessions/{session_id}/jobs", status_code=202, responses=documented(400, 404, 413, 415, 507))
+def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wanted: NewSessionJobs) -> JobList:
+    """Queues a reconstruction of every capture of a session."""
+    work = Work(wanted.model, wanted.settings)
+    jobs = service.jobs.submit_session(session_id, work, key=caller.key, priority=wanted.priority)
+    return JobList.model_validate({"jobs": jobs})
+
+
+@router.get("/jobs", responses=documented(400))
+def list_jobs(
+    service: ServiceOf,
+    caller: Reader,
+    state: State | None = None,
+    capture: Annotated[str | None, Query(max_length=64)] = None,
+    session: Annotated[str | None, Query(max_length=64)] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    offset: Annotated[int, Query(ge=0, le=1_000_000)] = 0,
+) -> JobList:
+    """Newest first."""
+    jobs = service.jobs.find(state=state, capture=capture, session=session, limit=limit, offset=offset)
+    return JobList.model_validate({"jobs": jobs})
+
+
+@router.get("/jobs/{job_id}", responses=documented(404))
+def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
+    return JobOut.model_validate(service.jobs.get(job_id))
+
+
+def known_job(service: ServiceOf, caller: Reader, job_id: str) -> str:
+    """A stream's 404 must come before its first byte."""
+    service.jobs.state(job_id)
+    return job_id
+
+
+@router.get("/jobs/{job_id}/events", response_class=EventSourceResponse, responses=documented(404))
+async def job_events(
+    service: ServiceOf,
+    job: Annotated[str, Depends(known_job)],
+    last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", max_length=40)] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """``progress`` events (state, stage, progress, eta_s) and at the end one ``end`` event with the whole job.
+
+    ``Last-Event-ID`` resumes after that event.
+    """
+    seq = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
+    while True:
+        state = await service.threads.disk(service.jobs.state, job)  # asked first: the last events are already there
+        for event in await service.threads.disk(service.jobs.events.since, job, min(seq, 2**31 - 1)):
+            seq = event.seq
+            yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
+        if state in FINISHED:
+            yield ServerSentEvent(event="end", id=str(seq), data=await service.threads.disk(service.jobs.get, job))
+            return
+        await anyio.sleep(service.settings.poll_s)
+
+
+@router.post("/jobs/{job_id}/cancel", responses=documented(404))
+def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
+    """Takes effect within a second in any stage; a finished job stays as it is."""
+    return JobOut.model_validate(service.cancel(job_id))
+
+
+@router.post("/jobs/{job_id}/restart", status_code=202, responses=documented(400, 404, 413, 415, 507))
+def restart_job(
+    service: ServiceOf, caller: Submitter, job_id: str, response: Response, wanted: Restart | None = None
+) -> JobOut:
+    """A new job for the same capture, perhaps with another model or settings; ``restart_of`` names the old one."""
+    work = Work(wanted.model, wanted.settings) if wanted else Work()
+    return _accepted(service.jobs.restart(job_id, work, key=caller.key), response)
+
+
+@router.delete("/jobs/{job_id}", status_code=204, responses=documented(404, 409))
+def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
+    """Removes a finished job with its result."""
+    service.jobs.delete(job_id)
+
+
+ARCHIVE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/zip": {}}},
+    304: {"description": "Not Modified"},
+    **documented(404, 409),
+}
+RESULT = {
+    200: {
+        "content": {"application/octet-stream": {}, "model/gltf-binary": {}, "application/json": {}, "image/png": {}}
+    },
+    206: {"description": "Partial Content"},
+    304: {"description": "Not Modified"},
+    **documented(404, 409, 416),
+}
+
+
+@router.get("/jobs/{job_id}/result", responses=documented(404, 409))
+def list_result(service: ServiceOf, caller: Reader, job_id: str) -> ResultList:
+    """Every file of a job's result; each is fetched at its ``url``, all of them as ``all.zip``."""
+    files = [
+        {"name": name, "url": f"/v1/jobs/{job_id}/result/{quote(name)}", "media_type": media_type(name), **file}
+        for name, file in service.jobs.files(job_id).items()
+    ]
+    return ResultList.model_validate({"job_id": job_id, "files": files})
+
+
+@router.head("/jobs/{job_id}/result/all.zip", include_in_schema=False)
+@router.get("/jobs/{job_id}/result/all.zip", responses=ARCHIVE, response_class=StreamingResponse)
+def get_archive(service: ServiceOf, caller: Reader, request: Request, job_id: str) -> Response:
+    """Every file of the result in one archive, made while it is sent."""
+    return send_archive(request, service.store.folder("jobs", job_id) / "result", service.jobs.files(job_id))
+
+
+@router.head("/jobs/{job_id}/result/{name:path}", include_in_schema=False)
+@router.get("/jobs/{job_id}/result/{name:path}", responses=RESULT, response_class=FileResponse)
+def get_result(service: ServiceOf, caller: Reader, request: Request, job_id: str, name: str) -> Response:
+    """head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so on; ``GET .../result`` lists
+    what there is."""
+    return send_file(request, service.jobs.result_file(job_id, name))
+
+
+def _accepted(job: dict[str, Any], response: Response) -> JobOut:
+    response.headers["Location"] = f"/v1/jobs/{job['id']}"
+    return JobOut.model_validate(job)

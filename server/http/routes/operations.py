@@ -1,0 +1,101 @@
+"""Health, readiness, metrics, models, keys, webhooks."""
+
+from importlib.metadata import version
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Response
+
+from server.http.auth import ServiceOf, require
+from server.http.schemas import (
+    Health,
+    KeyList,
+    KeyOut,
+    ModelList,
+    NewKey,
+    NewKeyOut,
+    NewWebhook,
+    NewWebhookOut,
+    Ready,
+    WebhookList,
+)
+from server.metrics import MEDIA_TYPE
+from server.services.health import exposition, readiness
+from server.services.keys import Caller
+from server.wire.problems import Problem, documented
+
+router = APIRouter()
+Reader = Annotated[Caller, Depends(require("read"))]
+Admin = Annotated[Caller, Depends(require("admin"))]
+
+
+@router.get("/healthz", tags=["operations"])
+async def healthz() -> Health:
+    """The process answers."""
+    return Health(status="ok", version=version("eigenhead"))
+
+
+@router.get("/readyz", tags=["operations"], responses={503: {"model": Ready, "description": "Not ready"}})
+def readyz(service: ServiceOf, response: Response) -> Ready:
+    """The service can take work: EGL, disk, database, a worker, the rig. 503 with the same document where it cannot."""
+    checks = readiness(service)
+    ready = all(check.ok for check in checks.values())
+    response.status_code = 200 if ready else 503
+    return Ready(ready=ready, checks=checks)
+
+
+@router.get(
+    "/metrics",
+    tags=["operations"],
+    response_class=Response,
+    responses={200: {"content": {MEDIA_TYPE: {"schema": {"type": "string"}}}}, **documented()},
+)
+def metrics(service: ServiceOf, caller: Reader) -> Response:
+    """Prometheus text format."""
+    return Response(exposition(service), media_type=MEDIA_TYPE)
+
+
+@router.get("/v1/models", tags=["models"], responses=documented())
+def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
+    from pipeline.eigenheads.model import list_models, model_path
+
+    default = model_path("default").resolve()
+    models = [
+        {"id": name, "name": name, "bytes": path.stat().st_size, "default": path.resolve() == default}
+        for name, path in list_models().items()
+    ]
+    return ModelList.model_validate({"models": models})
+
+
+@router.post("/v1/keys", status_code=201, tags=["access"], responses=documented(400, 413, 415, 507))
+def add_key(service: ServiceOf, caller: Admin, wanted: NewKey) -> NewKeyOut:
+    key = service.keys.add(wanted.name, tuple(wanted.scopes))
+    return NewKeyOut(id=key.split("_")[1], key=key)
+
+
+@router.get("/v1/keys", tags=["access"], responses=documented())
+def list_keys(service: ServiceOf, caller: Admin) -> KeyList:
+    return KeyList(keys=[KeyOut(id=key.id, name=key.name, scopes=list(key.scopes)) for key in service.keys.all()])
+
+
+@router.delete("/v1/keys/{key_id}", status_code=204, tags=["access"], responses=documented(404, 409))
+def remove_key(service: ServiceOf, caller: Admin, key_id: str) -> None:
+    """A key cannot remove itself, so that the last one does not go by accident and leave the service keyless."""
+    if key_id == caller.key:
+        raise Problem(409, "own-key", "A key cannot remove itself; use another, or `eigenhead keys remove`.")
+    service.keys.remove(key_id)
+
+
+@router.post("/v1/webhooks", status_code=201, tags=["webhooks"], responses=documented(400, 413, 415, 507))
+def add_webhook(service: ServiceOf, caller: Admin, wanted: NewWebhook) -> NewWebhookOut:
+    """Signed messages about ended jobs go to this address (standardwebhooks.com)."""
+    return NewWebhookOut.model_validate(service.webhooks.add(wanted.url))
+
+
+@router.get("/v1/webhooks", tags=["webhooks"], responses=documented())
+def list_webhooks(service: ServiceOf, caller: Admin) -> WebhookList:
+    return WebhookList.model_validate({"webhooks": service.webhooks.all()})
+
+
+@router.delete("/v1/webhooks/{webhook_id}", status_code=204, tags=["webhooks"], responses=documented(404))
+def remove_webhook(service: ServiceOf, caller: Admin, webhook_id: str) -> None:
+    service.webhooks.remove(webhook_id)

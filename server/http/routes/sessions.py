@@ -1,0 +1,46 @@
+"""Sessions: one subject's captures, and their erasure."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Response
+
+from server.http.auth import ServiceOf, require
+from server.http.schemas import NewSession, SessionEdit, SessionList, SessionOut
+from server.services.keys import Caller
+from server.wire.problems import documented
+
+router = APIRouter(prefix="/v1", tags=["sessions"])
+Reader = Annotated[Caller, Depends(require("read"))]
+Taker = Annotated[Caller, Depends(require("capture"))]
+
+
+@router.post("/sessions", status_code=201, responses=documented(400, 413, 415, 507))
+def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response: Response) -> SessionOut:
+    made = service.sessions.add(wanted.label, wanted.consent)
+    response.headers["Location"] = f"/v1/sessions/{made['id']}"
+    return SessionOut.model_validate(made)
+
+
+@router.get("/sessions", responses=documented())
+def list_sessions(service: ServiceOf, caller: Reader) -> SessionList:
+    """Newest first."""
+    return SessionList.model_validate({"sessions": service.sessions.find()})
+
+
+@router.get("/sessions/{session_id}", responses=documented(404))
+def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionOut:
+    return SessionOut.model_validate(service.sessions.get(session_id))
+
+
+@router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
+def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
+    """Another label or consent note."""
+    given = {name: text for name, text in wanted.model_dump(exclude_unset=True).items() if text is not None}
+    return SessionOut.model_validate(service.sessions.edit(session_id, given))
+
+
+@router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))
+def erase_session(service: ServiceOf, caller: Taker, session_id: str) -> None:
+    """Erases a subject: cancels the jobs, then removes images, results, caches and what the job database holds of
+    them."""
+    service.sessions.erase(session_id)

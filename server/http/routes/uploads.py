@@ -1,0 +1,172 @@
+"""Resumable uploads, tus 1.0 (https://tus.io/protocols/resumable-upload): creation, termination, checksum, expiration.
+
+The PATCH that brings the last byte answers with the capture's ``Location``, or with a 422 that names every fault.
+"""
+
+import base64
+import binascii
+from collections.abc import AsyncIterator
+from email.utils import formatdate
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Request, Response
+
+from rig.errors import InputError
+from server.errors import DiskFull, NotFound, Refused, Unavailable
+from server.http.auth import ServiceOf, require
+from server.http.tus import append
+from server.services.captures import About
+from server.services.keys import Caller
+from server.services.service import Service
+from server.wire.problems import Problem, documented
+
+router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
+Taker = Annotated[Caller, Depends(require("capture"))]
+VERSION = "1.0.0"
+FIELDS = ("session", "label", "expression")
+Resumable = Annotated[str | None, Header(alias="Tus-Resumable", description=VERSION)]
+COMMON = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
+
+
+@router.options("", status_code=204, responses=documented())
+def tus_options(service: ServiceOf) -> Response:
+    headers = {
+        "Tus-Version": VERSION,
+        "Tus-Extension": "creation,termination,checksum,expiration",
+        "Tus-Max-Size": str(service.settings.body_bytes),
+        "Tus-Checksum-Algorithm": "sha256,sha1,md5",
+    }
+    return Response(status_code=204, headers=COMMON | headers)
+
+
+@router.post("", status_code=201, responses=documented(400, 404, 412, 413, 507))
+def tus_create(
+    service: ServiceOf,
+    caller: Taker,
+    tus_resumable: Resumable = None,
+    upload_length: Annotated[str | None, Header(alias="Upload-Length", description="bytes of the archive")] = None,
+    upload_metadata: Annotated[str | None, Header(alias="Upload-Metadata", max_length=8000)] = None,
+) -> Response:
+    """Announces an archive of ``Upload-Length`` bytes. ``Upload-Metadata`` may hold session, label and expression."""
+    _check_version(tus_resumable)
+    if not upload_length or not (upload_length.isascii() and upload_length.isdigit()) or len(upload_length) > 18:
+        raise Problem(400, "upload-length", "Upload-Length must say how many bytes the archive has.")
+    fields = _metadata(upload_metadata)
+    about = About.of(fields)
+    if about.session is not None:
+        service.store.session(about.session)
+    record = service.uploads.create(int(upload_length), fields, caller.key)
+    return Response(status_code=201, headers=COMMON | {"Location": f"/v1/uploads/{record['id']}"} | _expires(record))
+
+
+@router.head("/{upload_id}", responses=documented(404, 412))
+def tus_head(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
+    """How many bytes are here; with the capture's ``Location`` once it was made."""
+    _check_version(tus_resumable)
+    record = _own(service, caller, upload_id)
+    headers = {"Upload-Offset": str(service.uploads.offset(record)), "Upload-Length": str(record["length"])}
+    return Response(status_code=200, headers=COMMON | headers | _expires(record) | _location(record))
+
+
+@router.patch(
+    "/{upload_id}",
+    status_code=204,
+    responses=documented(400, 404, 409, 412, 413, 415, 507) | {460: {"description": "Checksum Mismatch"}},
+    openapi_extra={
+        "requestBody": {
+            "content": {"application/offset+octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+        }
+    },
+)
+async def tus_patch(
+    service: ServiceOf,
+    caller: Taker,
+    request: Request,
+    upload_id: str,
+    tus_resumable: Resumable = None,
+    upload_offset: Annotated[str | None, Header(alias="Upload-Offset")] = None,
+    upload_checksum: Annotated[str | None, Header(alias="Upload-Checksum", max_length=200)] = None,
+) -> Response:
+    """Appends bytes at ``Upload-Offset``."""
+    _check_version(tus_resumable)
+    if request.headers.get("content-type") != "application/offset+octet-stream":
+        raise Problem(415, "unsupported-media-type", "Send application/offset+octet-stream.")
+    record = await service.threads.disk(_own, service, caller, upload_id)
+    with service.uploads.lock(record):
+        return await _append(service, record, upload_offset, request.stream(), upload_checksum)
+
+
+async def _append(
+    service: Service, record: dict[str, Any], offset: str | None, stream: AsyncIterator[bytes], checksum: str | None
+) -> Response:
+    here = await service.threads.disk(service.uploads.offset, record)
+    if offset != str(here):
+        raise Problem(409, "wrong-offset", f"The upload stands at byte {here}; ask with HEAD and go on from there.")
+    if record["capture"] is None:
+        here = await append(service.uploads, record, stream, checksum, service.threads)
+    if here == record["length"] and record["capture"] is None:
+        record = await service.threads.check(_finish, service, record)
+    headers = {"Upload-Offset": str(here)}
+    return Response(status_code=204, headers=COMMON | headers | _expires(record) | _location(record))
+
+
+@router.delete("/{upload_id}", status_code=204, responses=documented(404, 412))
+def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
+    """Gives an upload up; a capture that was made from it stays."""
+    _check_version(tus_resumable)
+    _own(service, caller, upload_id)
+    service.uploads.remove(upload_id)
+    return Response(status_code=204, headers=COMMON)
+
+
+def _finish(service: Service, record: dict[str, Any]) -> dict[str, Any]:
+    """Makes the capture; an archive that cannot be used is let go with its upload."""
+    try:
+        with service.store.incoming() as folder:
+            data = service.uploads.data(record)
+            capture = service.captures.accept(data, folder, About.of(record["fields"]))
+    except (Unavailable, DiskFull):  # these may go well another time
+        raise
+    except (InputError, Refused):
+        service.uploads.remove(record["id"])
+        raise
+    record = record | {"capture": capture["id"]}
+    service.uploads.save(record)
+    service.uploads.data(record).unlink(missing_ok=True)
+    return record
+
+
+def _own(service: Service, caller: Caller, upload_id: str) -> dict[str, Any]:
+    record = service.uploads.get(upload_id)
+    if record["key"] != caller.key and not caller.may("admin"):
+        raise NotFound("upload", upload_id)
+    return record
+
+
+def _check_version(version: str | None) -> None:
+    if version != VERSION:
+        raise Problem(412, "tus-version", f"Send 'Tus-Resumable: {VERSION}'.", headers={"Tus-Version": VERSION})
+
+
+def _metadata(text: str | None) -> dict[str, str]:
+    """``key base64, key base64``; raises a 400 problem for anything else."""
+    fields: dict[str, str] = {}
+    for part in (text or "").split(","):
+        key, _, value = part.strip().partition(" ")
+        if not key:
+            continue
+        try:
+            decoded = base64.b64decode(value, validate=True).decode()
+        except (binascii.Error, ValueError) as error:
+            raise Problem(400, "upload-metadata", f"Upload-Metadata {key!r:.80} is not base64 of UTF-8.") from error
+        if key in FIELDS:
+            fields[key] = decoded
+    return fields
+
+
+def _expires(record: dict[str, Any]) -> dict[str, str]:
+    return {"Upload-Expires": formatdate(record["expires"], usegmt=True)}
+
+
+def _location(record: dict[str, Any]) -> dict[str, str]:
+    return {} if record["capture"] is None else {"Location": f"/v1/captures/{record['capture']}"}

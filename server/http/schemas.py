@@ -1,0 +1,266 @@
+"""Documents on the wire."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from server.services.service import Check
+
+Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
+Text = Annotated[str, Field(max_length=500)]
+State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
+
+class Received(BaseModel):
+    """A request body: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class NewSession(Received):
+    label: Text = ""
+    consent: Text = Field("", description="note on the subject's consent")
+
+
+class NewCapture(Received):
+    session: Id | None = None
+    label: Text = ""
+    expression: Text = ""
+    seed: int | None = Field(None, ge=0, lt=2**31, description="subject and noise of the simulated studio")
+    board: bool = Field(False, description="of the calibration board: needs no calibration, cannot be reconstructed")
+
+
+class SessionEdit(Received):
+    """What is not given stays as it is."""
+
+    label: Text | None = None
+    consent: Text | None = None
+
+
+class CaptureEdit(Received):
+    """What is not given stays as it is; ``"session": null`` takes the capture out of its session."""
+
+    session: Id | None = None
+    label: Text | None = None
+    expression: Text | None = None
+
+
+class NewFeatures(Received):
+    format: Literal["eigenhead-features/1"] = "eigenhead-features/1"
+    points: dict[str, dict[str, list[float]]]
+
+
+class NewJob(Received):
+    capture_id: Id
+    model: str | None = Field(None, max_length=200)
+    settings: dict[str, Any] | None = Field(None, description="see pipeline.settings; unknown keys are refused")
+    queue: str | None = Field(None, max_length=32)
+    priority: int = Field(100, ge=1, le=1000, description="lower goes first")
+
+
+class NewSessionJobs(Received):
+    model: str | None = Field(None, max_length=200)
+    settings: dict[str, Any] | None = None
+    priority: int = Field(100, ge=1, le=1000)
+
+
+class Restart(Received):
+    """What is not given is as in the old job."""
+
+    model: str | None = Field(None, max_length=200)
+    settings: dict[str, Any] | None = None
+
+
+class NewWebhook(Received):
+    url: str = Field(pattern="^https?://", max_length=2000)
+
+
+class NewKey(Received):
+    name: str = Field(min_length=1, max_length=200)
+    scopes: list[Literal["read", "capture", "submit", "admin"]] = Field(min_length=1, max_length=4)
+
+
+class Size(BaseModel):
+    name: str
+    width: int
+    height: int
+
+
+class CaptureOut(BaseModel):
+    id: str
+    created: str
+    source: Literal["upload", "rig"]
+    session: str | None
+    label: str
+    expression: str
+    cameras: list[Size]
+    front: str
+    features: bool
+    board: bool = Field(False, description="pictures of the calibration board, which cannot be reconstructed")
+    bytes: int
+    inputs: dict[str, str] = Field(description="sha256 of every file, by name")
+    shot: dict[str, Any] | None = Field(None, description="the rig's sync certificate")
+
+
+class CaptureList(BaseModel):
+    captures: list[CaptureOut]
+
+
+class SessionOut(BaseModel):
+    id: str
+    created: str
+    label: str
+    consent: str
+    captures: list[str]
+
+
+class SessionList(BaseModel):
+    sessions: list[SessionOut]
+
+
+class JobError(BaseModel):
+    type: str
+    detail: str
+    errors: list[str]
+
+
+class FileOut(BaseModel):
+    bytes: int
+    sha256: str
+
+
+class ResultFile(FileOut):
+    name: str = Field(description="below the result folder, such as overlays/cam00.png")
+    url: str
+    media_type: str
+
+
+class ResultList(BaseModel):
+    job_id: str
+    files: list[ResultFile]
+
+
+class JobOut(BaseModel):
+    id: str
+    state: State
+    stage: str
+    progress: float = Field(ge=0, le=1)
+    eta_s: float | None
+    error: JobError | None
+    notice: str | None = Field(None, description="why a queued job cannot begin, and what to do")
+    capture_id: str | None
+    session: str | None
+    model: str | None
+    settings: dict[str, Any]
+    restart_of: str | None
+    queue: str | None
+    priority: int
+    created: str | None
+    started: str | None
+    finished: str | None
+    files: dict[str, FileOut]
+
+
+class JobList(BaseModel):
+    jobs: list[JobOut]
+
+
+class ModelOut(BaseModel):
+    id: str
+    name: str
+    bytes: int
+    default: bool
+
+
+class ModelList(BaseModel):
+    models: list[ModelOut]
+
+
+class WebhookOut(BaseModel):
+    id: str
+    url: str
+
+
+class NewWebhookOut(WebhookOut):
+    secret: str = Field(description="shown this once; signs the messages (standardwebhooks.com)")
+
+
+class WebhookList(BaseModel):
+    webhooks: list[WebhookOut]
+
+
+class KeyOut(BaseModel):
+    id: str
+    name: str
+    scopes: list[str]
+
+
+class KeyList(BaseModel):
+    keys: list[KeyOut]
+
+
+class NewKeyOut(BaseModel):
+    id: str
+    key: str = Field(description="shown this once")
+
+
+class Health(BaseModel):
+    status: Literal["ok"]
+    version: str
+
+
+class Ready(BaseModel):
+    ready: bool
+    checks: dict[str, Check]
+
+
+class NewCalibration(Received):
+    """Shots that the rig took of the board."""
+
+    board: dict[str, Any] = Field(description="as board.toml: kind, columns, rows, square_mm, ...")
+    captures: list[Id] = Field(min_length=1, max_length=500)
+    label: Text = ""
+
+
+class UseCalibration(Received):
+    calibration_id: Id
+
+
+class CalibrationOut(BaseModel):
+    id: str
+    created: str
+    source: Literal["upload", "rig"]
+    label: str
+    pictures: dict[str, int] = Field(description="number of pictures by camera")
+    state: State
+    error: JobError | None
+    figures: dict[str, Any]
+    checks: list[dict[str, Any]]
+    warnings: list[str]
+    front: str | None
+    in_use: bool
+
+
+class CalibrationList(BaseModel):
+    calibrations: list[CalibrationOut]
+
+
+class CameraOut(BaseModel):
+    name: str
+    driver: str
+    state: Literal["ready", "open", "closed", "missing"]
+
+
+class RigOut(BaseModel):
+    id: str
+    kind: Literal["simulated", "real"]
+    ready: bool
+    cameras: list[CameraOut]
+    faults: list[str]
+    calibration: str | None
+
+
+class BackgroundOut(BaseModel):
+    cameras: list[str]
+    plates: int
+    note: str

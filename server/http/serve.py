@@ -1,0 +1,113 @@
+"""``eigenhead serve``: the service and, unless told otherwise, a worker process beside it."""
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import structlog
+
+from rig.formats.rig_toml import read_rig_config
+from server.address import listen
+from server.processes import python_command, python_environment
+from server.services.keys import Keys, check_address
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+
+if TYPE_CHECKING:
+    import uvicorn
+
+WORKER_PAUSE_S = 1.0  # before a worker that died is started again; doubled up to a minute
+
+log = structlog.get_logger()
+
+
+class WorkerProcess:
+    """A worker that lives as long as this process: it is started again when it dies, and ends when our end of its
+    standard input does, also if we are killed."""
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self._environment = python_environment() | settings.environment()
+        self._stop = threading.Event()
+        self._process = self._start()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        process = self._process
+        if process.stdin is not None:
+            process.stdin.close()
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        self._thread.join()
+
+    def _start(self) -> "subprocess.Popen[bytes]":
+        command = python_command("cli", "worker", "--until-eof")
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=sys.__stderr__, env=self._environment)
+
+    def _watch(self) -> None:
+        pause = WORKER_PAUSE_S
+        while not self._stop.is_set():
+            began = time.monotonic()
+            code = self._process.wait()
+            if self._stop.is_set():
+                return
+            pause = WORKER_PAUSE_S if time.monotonic() - began > 60 else min(60.0, pause * 2)
+            log.error("worker died, starting another", status=code, pause_s=pause)
+            if self._stop.wait(pause if pause > WORKER_PAUSE_S * 2 else 0.1):
+                return
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+            self._process = self._start()
+
+
+def run_service(settings: ServiceSettings, *, worker: bool = True, ready: Callable[[str], None] | None = None) -> None:
+    """Serves until a signal. ``ready`` is told the address once requests are answered.
+
+    What is wrong with the rig's file, the address or the database is found before the rest is loaded. Raises
+    InputError, AddressTaken, DatabaseUnavailable, KeylessAddress.
+    """
+    if settings.rig is not None:
+        read_rig_config(settings.rig)
+    sock = listen(settings.host, settings.port)
+    engine = open_database(settings)
+    check_address(settings, Keys(engine))
+    engine.dispose()
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    url = f"http://{host}:{sock.getsockname()[1]}"
+    _serve(settings, sock, worker, lambda: ready and ready(url))
+
+
+def _serve(settings: ServiceSettings, sock: socket.socket, worker: bool, ready: Callable[[], object]) -> None:
+    import uvicorn
+
+    from server.http.app import create_app
+
+    mount = None
+    if settings.console:
+        from server.console.mount import mount_console as mount  # NiceGUI takes longer to import than all the rest
+    config = uvicorn.Config(
+        create_app(settings, mount), log_config=None, lifespan="on", timeout_graceful_shutdown=3, access_log=False
+    )
+    server = uvicorn.Server(config)
+    beside = WorkerProcess(settings) if worker else None
+    try:
+        threading.Thread(target=_tell, args=(server, ready), daemon=True).start()
+        server.run(sockets=[sock])
+    finally:
+        if beside is not None:
+            beside.close()
+
+
+def _tell(server: "uvicorn.Server", ready: Callable[[], object]) -> None:
+    while not server.started and not server.should_exit:
+        time.sleep(0.02)
+    if server.started:
+        ready()

@@ -1,0 +1,71 @@
+"""The bytes of a resumable upload: https://tus.io/protocols/resumable-upload, with its checksum extension."""
+
+import base64
+import hashlib
+import os
+from collections.abc import AsyncIterator
+from typing import Any
+
+import anyio
+
+from server.services.threads import Threads
+from server.services.uploads import ResumableUploads
+from server.wire.multipart import BLOCK_BYTES
+from server.wire.problems import Problem
+
+
+async def append(
+    uploads: ResumableUploads,
+    record: dict[str, Any],
+    stream: AsyncIterator[bytes],
+    checksum: str | None,
+    threads: Threads,
+) -> int:
+    """Appends a PATCH's body and returns the new offset. A wrong checksum takes the bytes back (460)."""
+    path, before = uploads.data(record), uploads.offset(record)
+    digest = _digest(checksum)
+    target = await threads.disk(path.open, "ab")
+    size, pending, complete = before, bytearray(), False
+    try:
+        async for chunk in stream:
+            size += len(chunk)
+            if size > record["length"]:
+                raise Problem(413, "upload-too-large", f"More bytes than the announced {record['length']:,}.")
+            pending += chunk
+            if len(pending) >= BLOCK_BYTES:
+                await threads.disk(_write, target, bytes(pending), digest)
+                pending = bytearray()
+        complete = True
+    finally:  # a connection that breaks leaves what arrived, so that the client may go on from there
+        with anyio.CancelScope(shield=True):
+            await threads.disk(_finish, target, bytes(pending), digest)
+            if checksum is not None and not (complete and _matches(digest, checksum)):
+                await threads.disk(os.truncate, path, before)
+    if checksum is not None and not _matches(digest, checksum):
+        raise Problem(460, "checksum-mismatch", "The bytes do not have the announced checksum; send them again.")
+    return size
+
+
+def _digest(checksum: str | None) -> Any:
+    algorithm = "sha256" if checksum is None else checksum.partition(" ")[0]
+    if algorithm not in ("sha1", "sha256", "md5"):
+        raise Problem(400, "unknown-checksum", f"Checksum algorithm {algorithm!r:.40}; sha1, sha256 and md5 are known.")
+    return hashlib.new(algorithm, usedforsecurity=False)
+
+
+def _matches(digest: Any, checksum: str) -> bool:
+    return base64.b64encode(digest.digest()).decode() == checksum.partition(" ")[2].strip()
+
+
+def _write(target: Any, data: bytes, digest: Any) -> None:
+    target.write(data)
+    digest.update(data)
+
+
+def _finish(target: Any, data: bytes, digest: Any) -> None:
+    try:
+        _write(target, data, digest)
+        target.flush()
+        os.fsync(target.fileno())
+    finally:
+        target.close()

@@ -1,0 +1,28 @@
+"""Python processes of this package's own code: the worker beside the service, and the children that do heavy work.
+
+They must run this installation's code and no other: a folder named like one of the packages may lie in the working
+directory or on PYTHONPATH.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+SERVER = __package__ or "server"  # "eigenhead.server" in the wheel
+
+
+def python_command(module: str, *arguments: str) -> list[str]:
+    """The command that runs ``module`` (relative to this package: "cli") with the working directory off the path."""
+    return [sys.executable, "-P", "-m", f"{SERVER}.{module}", *arguments]
+
+
+def python_environment() -> dict[str, str]:
+    """This process's variables, with the checkout before everything else that PYTHONPATH names.
+
+    The wheel's packages lie under a name of their own, which needs no such care.
+    """
+    if "." in SERVER:
+        return dict(os.environ)
+    checkout = str(Path(__file__).resolve().parents[1])
+    others = [folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder not in ("", checkout)]
+    return os.environ | {"PYTHONPATH": os.pathsep.join([checkout, *others])}

@@ -1,0 +1,167 @@
+"""Captures: taken with the rig or made of an archive, found, given feature points, changed, removed."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rig.errors import InputError
+from rig.formats.archive import ArchiveLimits
+from server.errors import Conflict, NotFound
+from server.services.jobs import Jobs, refuse_board
+from server.services.rigs import SHOT_BYTES, RigBackend
+from server.settings import ServiceSettings
+from server.storage.store import Store, StoredFile, new_id
+from server.tasks.child import Children
+from server.tasks.ingest import check_features, ingest_archive, ingest_board, ingest_folder
+
+TEXT_MOST = 500  # characters of a label and the like
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What people say of a capture."""
+
+    session: str | None = None
+    label: str = ""
+    expression: str = ""
+
+    @classmethod
+    def of(cls, fields: Mapping[str, str | None]) -> "About":
+        """From a form. Raises InputError."""
+        names = ("session", "label", "expression")
+        faults = [
+            f"{name}: longer than {TEXT_MOST} characters" for name in names if len(fields.get(name) or "") > TEXT_MOST
+        ]
+        if faults:
+            raise InputError("form", faults)
+        return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "")
+
+
+class Captures:
+    """The captures of a service. Methods block; records are as ``record.json`` holds them."""
+
+    def __init__(
+        self, store: Store, jobs: Jobs, rig: RigBackend, children: Children, settings: ServiceSettings
+    ) -> None:
+        self._store, self._jobs, self._rig, self._children = store, jobs, rig, children
+        self._settings = settings
+
+    def take(self, about: About, *, seed: int | None = None, board: bool = False) -> dict[str, Any]:
+        """Triggers the rig now. ``board``: pictures of the calibration board. Raises Unavailable, and DiskFull."""
+        self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
+        if about.session is not None:
+            self._store.session(about.session)
+        with self._store.incoming() as folder:
+            capture = folder / "capture"
+            shot = self._rig.capture(capture, seed=seed, board=board)
+            with self._children.one() as child:
+                ingest = child.remote(ingest_board if board else ingest_folder)
+                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels)
+            return self._add(capture, "rig", content, about, shot)
+
+    def accept(self, archive: Path, folder: Path, about: About) -> dict[str, Any]:
+        """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
+        fault."""
+        limits = self.archive_limits(archive)
+        (folder / "capture").mkdir()
+        with self._children.one() as child:
+            content = child.remote(ingest_archive)(
+                archive=str(archive),
+                folder=str(folder / "capture" / "files"),
+                limits=limits,
+                image_pixels=self._settings.image_pixels,
+            )
+        return self._add(folder / "capture", "upload", content, about)
+
+    def archive_limits(self, archive: Path) -> ArchiveLimits:
+        """What an archive may unpack to. Raises DiskFull where there is no room for it."""
+        self._store.reserve(archive.stat().st_size, self._settings.free_bytes)
+        s = self._settings
+        return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
+
+    def find(self, *, session: str | None = None, limit: int = 100, before: str | None = None) -> list[dict[str, Any]]:
+        """Newest first; ``before``: only those older than this id."""
+        found = []
+        for record in self._store.captures():
+            if (before is None or record["id"] < before) and (session is None or record["session"] == session):
+                found.append(record)
+            if len(found) == limit:
+                break
+        return found
+
+    def edit(self, identity: str, given: Mapping[str, str | None]) -> dict[str, Any]:
+        """Another label, expression or session; what is not given stays. Raises NotFound."""
+        changed: dict[str, str | None] = dict(given)
+        if changed.get("session") is not None:
+            self._store.session(str(changed["session"]))
+        changed |= {name: changed[name] or "" for name in ("label", "expression") if name in changed}
+        return self._store.change_capture(identity, lambda record: record.update(changed))
+
+    def image(self, identity: str, kind: str, camera: str) -> StoredFile:
+        """A camera's file of a kind (images, background), found in the record, never by putting a request's text into a
+        path. Raises NotFound."""
+        record = self._store.capture(identity)
+        for name, digest in record["inputs"].items():
+            path = Path(name)
+            single = path.parent.name == kind and path.stem == camera
+            if single or (kind == "background" and path.parent.name == camera and path.parent.parent.name == kind):
+                return StoredFile(self._store.folder("captures", identity) / "files" / name, digest)
+        raise NotFound("such file of a camera", camera, "the capture's 'inputs' list what there is")
+
+    def features(self, identity: str) -> dict[str, dict[str, list[float]]]:
+        """The stored feature points, by point and camera."""
+        if not self._store.capture(identity)["features"]:
+            return {}
+        path = self._store.folder("captures", identity) / "files" / "features.json"
+        return json.loads(path.read_text())["points"]
+
+    def put_features(self, identity: str, document: Mapping[str, Any]) -> dict[str, Any]:
+        """Stores feature points. Raises InputError naming every point that the capture cannot have."""
+        refuse_board(self._store.capture(identity))
+        folder = self._store.folder("captures", identity) / "files"
+        with self._children.one() as child:
+            digest = child.remote(check_features)(folder=str(folder), document=dict(document))
+
+        def change(record: dict[str, Any]) -> None:
+            record["inputs"] = dict(sorted({**record["inputs"], "features.json": digest}.items()))
+            record["features"] = True
+
+        return self._store.change_capture(identity, change)
+
+    def check_unused(self, identity: str) -> dict[str, Any]:
+        """The record of a capture that no job needs. Raises Conflict."""
+        record = self._store.capture(identity)
+        if active := self._jobs.active(capture=identity):
+            detail = "Jobs that are queued or running need this capture; cancel them first."
+            raise Conflict("capture-in-use", detail, [f"job {job}" for job in active])
+        return record
+
+    def remove(self, identity: str) -> None:
+        """Removes a capture with its images; its jobs and their results stay. Raises Conflict while a job needs it."""
+        self.check_unused(identity)
+        self._store.remove_capture(identity)
+
+    def _add(
+        self,
+        folder: Path,
+        source: str,
+        content: dict[str, Any],
+        about: About,
+        shot: dict[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        if about.session is not None:
+            self._store.session(about.session)
+        record = {
+            "id": new_id(),
+            "created": datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            "source": source,
+            **asdict(about),
+            **content,
+            "features": "features.json" in content["inputs"],
+            "shot": shot,
+        }
+        self._store.add_capture(folder, record)
+        return record

@@ -1,0 +1,81 @@
+"""Whether the service, or this machine, can do its work, and what to do where it cannot."""
+
+import sqlalchemy as sa
+from sqlalchemy.exc import SQLAlchemyError
+
+from server.services.jobs import STATES, WORKFLOW
+from server.services.service import Check, Service
+from server.storage.database import alive_workers
+from server.tasks.child import WorkFailed
+from server.tasks.egl import try_egl
+
+
+def readiness(service: Service) -> dict[str, Check]:
+    """EGL, disk, database, workers, rig."""
+    return {
+        "database": _database(service),
+        "disk": _disk(service),
+        "worker": _workers(service),
+        "egl": _egl(service),
+        "rig": _rig(service),
+        "records": _records(service),
+    }
+
+
+def _database(service: Service) -> Check:
+    try:
+        with service.engine.connect() as connection:
+            connection.execute(sa.select(1))
+    except SQLAlchemyError as error:
+        return Check(ok=False, detail=f"does not answer: {str(error)[:200]}")
+    return Check(ok=True, detail=service.engine.dialect.name)
+
+
+def _disk(service: Service) -> Check:
+    free, spare = service.store.free_bytes(), service.settings.free_bytes
+    detail = f"{free / 1e9:.1f} GB free; uploads and jobs leave {spare / 1e9:.1f} GB"
+    return Check(ok=free > spare, detail=detail if free > spare else detail + ": delete captures or jobs")
+
+
+def _workers(service: Service) -> Check:
+    try:
+        with service.engine.connect() as connection:
+            alive = alive_workers(connection, service.settings.silent_s)
+            count = connection.scalar(sa.select(sa.func.count()).where(alive)) or 0
+    except SQLAlchemyError:
+        return Check(ok=False, detail="unknown: the database does not answer")
+    return Check(ok=count > 0, detail=f"{count} alive" if count else "none alive: start one with `eigenhead worker`")
+
+
+def check_egl(service: Service) -> None:
+    """Asked once a process, when it starts: it takes a second or more, and what is there stays. Blocks."""
+    try:
+        with service.children.one() as child:
+            service.known["egl"] = Check(ok=True, detail=child.remote(try_egl)())
+    except WorkFailed as error:
+        service.known["egl"] = Check(ok=False, detail=error.message)
+
+
+def _egl(service: Service) -> Check:
+    return service.known.get("egl") or Check(ok=False, detail="being started; ask again in a few seconds")
+
+
+def _rig(service: Service) -> Check:
+    state = service.rig.describe()
+    faults = "; ".join(state["faults"])
+    return Check(ok=state["ready"], detail=faults or f"{state['kind']}, {len(state['cameras'])} cameras")
+
+
+def _records(service: Service) -> Check:
+    names = service.store.set_aside()
+    detail = f"{len(names)} damaged records lie in set-aside: {', '.join(names[:5])}" if names else "none damaged"
+    return Check(ok=True, detail=detail)
+
+
+def exposition(service: Service) -> bytes:
+    """The metrics of this moment, in Prometheus' text format."""
+    jobs = dict.fromkeys(set(STATES.values()), 0)
+    for row in service.jobs.client.list_workflows(name=WORKFLOW, load_input=False, load_output=False):
+        jobs[STATES[row.status]] += 1
+    captures, damaged = len(service.store.ids("captures")), len(service.store.set_aside())
+    return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)

@@ -1,0 +1,354 @@
+"""Jobs as everybody but the worker sees them: submit, look, cancel, restart, delete.
+
+The job engine's workflow row is the one truth about a job: its id is the workflow's id, its request the workflow's
+input, its state the workflow's status. Progress comes from the event log, files from the store.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import sqlalchemy as sa
+import structlog
+from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions, WorkflowStatus
+from sqlalchemy.exc import IntegrityError
+
+from pipeline.settings import settings_from_document
+from rig.errors import EigenheadError, InputError
+from server.errors import URN, Conflict, NotFound, TooMany
+from server.settings import ServiceSettings
+from server.storage.database import alive_workers, job_index, workers
+from server.storage.events import EventLog
+from server.storage.store import Store, StoredFile, is_id, new_id
+
+APPLICATION = "eigenhead"
+APPLICATION_VERSION = "eigenhead-jobs-1"  # pinned: a job outlives an upgrade; changes only with the steps themselves
+WORKFLOW = "reconstruct"
+DELIVERY = "deliver"
+STATES = {
+    "DELAYED": "queued",
+    "ENQUEUED": "queued",
+    "PENDING": "running",
+    "SUCCESS": "succeeded",
+    "ERROR": "failed",
+    "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "failed",
+    "CANCELLED": "cancelled",
+}
+STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
+FINISHED = ("succeeded", "failed", "cancelled")
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None."""
+
+    model: str | None = None
+    settings: dict[str, Any] | None = None
+
+    def check(self) -> None:
+        """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""
+        from pipeline.eigenheads.model import list_models
+
+        known, settings_fault = list_models(), None
+        try:
+            settings_from_document(self.settings or {})
+        except InputError as error:
+            settings_fault = error
+        if self.model is not None and self.model != "default" and self.model not in known:
+            fault = f"{self.model!r:.80} is not at hand; there are: {', '.join(['default', *known])}"
+            if settings_fault is None:
+                raise InputError("model", [fault])
+            raise InputError("request", [f"model: {fault}", *(f"settings: {f}" for f in settings_fault.faults)])
+        if settings_fault is not None:
+            raise settings_fault
+
+
+class JobFailed(EigenheadError):
+    """A job that cannot succeed; what the engine stores as the workflow's error."""
+
+    def __init__(self, kind: str, detail: str, errors: tuple[str, ...] = ()) -> None:
+        super().__init__(kind, detail, errors)  # the three arguments are what pickle restores
+        self.kind, self.detail, self.errors = kind, detail, errors
+
+    def __str__(self) -> str:
+        return self.detail
+
+
+def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
+    return {
+        "name": APPLICATION,
+        "system_database_url": settings.url,
+        "application_version": APPLICATION_VERSION,
+        "executor_id": executor_id,
+        "enable_otlp": False,
+        "log_level": "WARNING",
+        "notification_listener_polling_interval_sec": 1.0,
+    }
+
+
+def migrate(settings: ServiceSettings) -> None:
+    """Makes the job engine's tables, which its client does not."""
+    DBOS.migrate(system_database_url=settings.url)
+
+
+class Jobs:
+    """The jobs of one service. Every method blocks on the database: call it from a thread."""
+
+    def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine) -> None:
+        self._settings, self._store, self._engine = settings, store, engine
+        self.events = EventLog(engine)
+        self.client = DBOSClient(
+            system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
+        )
+
+    def close(self) -> None:
+        self.client.destroy()
+
+    def submit(
+        self,
+        capture_id: str,
+        wanted: Work,
+        *,
+        key: str = "local",
+        idempotency_key: str | None = None,
+        queue: str | None = None,
+        priority: int = 100,
+    ) -> dict[str, Any]:
+        """Queues a reconstruction of a capture and returns the job. A known idempotency key returns the first job.
+
+        Raises InputError for work that cannot be done, NotFound, DiskFull, Conflict where the key's first request was
+        another one, TooMany.
+        """
+        wanted.check()
+        capture = self._store.capture(capture_id)
+        refuse_board(capture)
+        if queue is not None and queue not in self._settings.queues:
+            raise InputError("queue", [f"{queue!r:.40} is no queue; there are: {', '.join(self._settings.queues)}"])
+        self._store.reserve(0, self._settings.free_bytes)
+        request = {"capture_id": capture_id, "model": wanted.model, "settings": wanted.settings or {}}
+        session = capture["session"]
+        return self._enqueue(request, session, key, queue, priority, idempotency_key)
+
+    def submit_session(self, session: str, wanted: Work, *, key: str, priority: int) -> list[dict[str, Any]]:
+        """Queues a reconstruction of every capture of a session. Raises as ``submit`` does."""
+        self._store.session(session)
+        heads = [c["id"] for c in self._store.captures() if c["session"] == session and not c.get("board")]
+        return [self.submit(capture, wanted, key=key, priority=priority) for capture in heads]
+
+    def _enqueue(
+        self,
+        request: dict[str, Any],
+        session: str | None,
+        key: str,
+        queue: str | None,
+        priority: int,
+        idempotency_key: str | None = None,
+    ) -> dict[str, Any]:
+        job_id = new_id() if idempotency_key is None else _id_of(key, idempotency_key)
+        first = None if idempotency_key is None else self._status(job_id)
+        if first is None:
+            self._check_count(key)
+            options: EnqueueOptions = {
+                "workflow_name": WORKFLOW,
+                "queue_name": queue or self._settings.queue,
+                "workflow_id": job_id,
+                "app_version": APPLICATION_VERSION,
+                "priority": priority,
+                "attributes": {"capture": request["capture_id"], "session": session, "key": key},
+            }
+            self._index(job_id, request["capture_id"], session)
+            self.client.enqueue(options, request)
+            first = self._status(job_id)
+            assert first is not None
+        if _request(first) != json.loads(json.dumps(request)):
+            detail = "This Idempotency-Key was used for another request; use a new key for a new job."
+            raise Conflict("idempotency-conflict", detail)
+        return self._document(first)
+
+    def get(self, job_id: str) -> dict[str, Any]:
+        """Raises NotFound."""
+        return self._document(self._known(job_id))
+
+    def state(self, job_id: str) -> str:
+        return STATES[self._known(job_id, load=False).status]
+
+    def find(
+        self,
+        *,
+        state: str | None = None,
+        capture: str | None = None,
+        session: str | None = None,
+        limit: int = 100,
+        offset: int = 0,
+    ) -> list[dict[str, Any]]:
+        """Newest first."""
+        ids = self._indexed(capture, session)
+        if ids == []:
+            return []
+        status = STATUSES[state] if state else None
+        rows = self.client.list_workflows(
+            name=WORKFLOW, workflow_ids=ids, status=status, limit=limit, offset=offset, sort_desc=True
+        )
+        latest = self.events.latest([row.workflow_id for row in rows])
+        return [self._document(row, latest.get(row.workflow_id)) for row in rows]
+
+    def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
+        """Ids of queued and running jobs."""
+        wanted = {k: v for k, v in {"capture": capture, "session": session, "key": key}.items() if v is not None}
+        rows = self.client.list_workflows(
+            name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False
+        )
+        return [row.workflow_id for row in rows if wanted.items() <= (row.attributes or {}).items()]
+
+    def cancel(self, job_id: str) -> tuple[dict[str, Any], bool]:
+        """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether it was cancelled
+        now. Raises NotFound."""
+        before = self.state(job_id)
+        if before not in FINISHED:
+            self.client.cancel_workflow(job_id)
+            self.events.append(job_id, {"state": self.state(job_id)})
+        job = self.get(job_id)
+        return job, before not in FINISHED and job["state"] == "cancelled"
+
+    def files(self, job_id: str) -> dict[str, dict[str, Any]]:
+        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict where there is no result."""
+        job = self.get(job_id)
+        if job["state"] != "succeeded":
+            raise Conflict("no-result", f"The job is {job['state']}; it has no result.")
+        return job["files"]
+
+    def result_file(self, job_id: str, name: str) -> StoredFile:
+        """A file of a result, found in the job's record. Raises NotFound, Conflict."""
+        file = self.files(job_id).get(name)
+        if file is None:
+            raise NotFound("file", name, f"GET /v1/jobs/{job_id}/result lists what there is")
+        return StoredFile(self._store.folder("jobs", job_id) / "result" / name, file["sha256"])
+
+    def restart(self, job_id: str, wanted: Work, *, key: str = "local") -> dict[str, Any]:
+        """A new job for the same capture, which names the old one. What is None is as in that. Raises InputError,
+        NotFound, TooMany."""
+        wanted.check()
+        row = self._known(job_id)
+        request = _request(row) | {"restart_of": job_id}
+        if wanted.settings is not None:
+            request["settings"] = wanted.settings
+        if wanted.model is not None:
+            request["model"] = wanted.model
+        self._store.capture(request["capture_id"])
+        return self._enqueue(request, (row.attributes or {}).get("session"), key, row.queue_name, row.priority or 0)
+
+    def delete(self, job_id: str) -> None:
+        """Removes a finished job with its files: the files first, which needs no room in the database."""
+        if self.state(job_id) not in FINISHED:
+            raise Conflict("job-active", "The job is queued or running; cancel it first.")
+        self._store.remove(self._store.folder("jobs", job_id))
+        self.events.remove([job_id])
+        self.client.delete_workflow(job_id)
+        with self._engine.begin() as connection:
+            connection.execute(sa.delete(job_index).where(job_index.c.job_id == job_id))
+
+    def _index(self, job_id: str, capture: str, session: str | None) -> None:
+        row = {"job_id": job_id, "capture_id": capture, "session": session}
+        with suppress(IntegrityError), self._engine.begin() as connection:
+            connection.execute(sa.insert(job_index).values(**row))
+
+    def _indexed(self, capture: str | None, session: str | None) -> list[str] | None:
+        """Ids of the jobs of a capture or session; None where nothing narrows the list."""
+        wanted = [(job_index.c.capture_id, capture), (job_index.c.session, session)]
+        clauses = [column == value for column, value in wanted if value is not None]
+        if not clauses:
+            return None
+        with self._engine.connect() as connection:
+            return [*connection.scalars(sa.select(job_index.c.job_id).where(*clauses))]
+
+    def _check_count(self, key: str) -> None:
+        active = len(self.active(key=key))
+        if active >= self._settings.jobs_per_key:
+            detail = f"{active} jobs are queued or running for this key, which is the most; wait for one to end."
+            raise TooMany("too-many-jobs", detail, retry_after_s=10)
+
+    def _notice(self, queue: str | None) -> str | None:
+        """What keeps a queued job from beginning."""
+        with self._engine.connect() as connection:
+            alive = alive_workers(connection, self._settings.silent_s)
+            if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
+                return None
+        return f"No worker serves the queue {queue!r}: start one with `eigenhead worker --queue {queue}`."
+
+    def _status(self, job_id: str, load: bool = True) -> WorkflowStatus | None:
+        rows = self.client.list_workflows(workflow_ids=[job_id], name=WORKFLOW, load_input=load, load_output=load)
+        return rows[0] if rows else None
+
+    def _known(self, job_id: str, load: bool = True) -> WorkflowStatus:
+        row = self._status(job_id, load) if is_id(job_id) else None
+        if row is None:
+            raise NotFound("job", job_id)
+        return row
+
+    def _document(self, row: WorkflowStatus, event: Any = None) -> dict[str, Any]:
+        event = event or self.events.latest([row.workflow_id]).get(row.workflow_id)
+        state = STATES[row.status]
+        progress = event.document if event is not None and state == "running" else {}
+        request = _request(row)
+        attributes = row.attributes or {}
+        return {
+            "id": row.workflow_id,
+            "state": state,
+            "stage": progress.get("stage") or ("done" if state == "succeeded" else state),
+            "progress": 1.0 if state == "succeeded" else progress.get("progress", 0.0),
+            "eta_s": progress.get("eta_s"),
+            "error": failure(row) if state == "failed" else None,
+            "notice": self._notice(row.queue_name) if state == "queued" else None,
+            "capture_id": request.get("capture_id"),
+            "session": attributes.get("session"),
+            "model": request.get("model"),
+            "settings": request.get("settings") or {},
+            "restart_of": request.get("restart_of"),
+            "queue": row.queue_name,
+            "priority": row.priority or 0,
+            "created": _moment(row.created_at),
+            "started": _moment(row.dequeued_at),
+            "finished": _moment(row.completed_at) if state in FINISHED else None,
+            "files": dict(row.output or {}) if state == "succeeded" else {},
+        }
+
+
+def _request(row: WorkflowStatus) -> dict[str, Any]:
+    return dict(row.input["args"][0]) if row.input else {}
+
+
+def failure(row: WorkflowStatus) -> dict[str, Any]:
+    error = row.error
+    if isinstance(error, JobFailed):
+        return {"type": URN + error.kind, "detail": error.detail, "errors": list(error.errors)}
+    if row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
+        detail = "The job took its worker down with it again and again; the worker's log says why."
+        return {"type": URN + "worker-died", "detail": detail, "errors": []}
+    log.error("job failed in an unforeseen way", job=row.workflow_id, error=str(error))
+    return {
+        "type": URN + "internal-error",
+        "detail": "The job failed in a way that nobody foresaw; the log says more.",
+        "errors": [],
+    }
+
+
+def refuse_board(record: Mapping[str, Any]) -> None:
+    """Raises Conflict for pictures of the calibration board, which show no head."""
+    if record.get("board"):
+        raise Conflict("board-shot", "The capture is of the calibration board; it can only be calibrated from.")
+
+
+def _id_of(key: str, idempotency_key: str) -> str:
+    return hashlib.sha256(f"{key}\0{idempotency_key}".encode()).hexdigest()[:28]
+
+
+def _moment(milliseconds: int | None) -> str | None:
+    if milliseconds is None:
+        return None
+    return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,0 +1,103 @@
+"""API keys with scopes: who may do what.
+
+A key is ``eh_<id>_<secret>``; the database holds the SHA-256 of the secret, which is 256 random bits, so that a slow
+hash would add nothing. Without keys the service answers only to its own machine and refuses to listen elsewhere.
+"""
+
+import hashlib
+import hmac
+import secrets
+from dataclasses import dataclass
+
+import sqlalchemy as sa
+
+from rig.errors import EigenheadError
+from server.errors import NotFound
+from server.settings import ServiceSettings
+from server.storage.database import api_keys, now_sql
+
+SCOPES = ("read", "capture", "submit", "admin")  # admin holds all the others
+LOCAL = "local"
+
+
+class KeylessAddress(EigenheadError):
+    """Listening to the network without a key."""
+
+    def __init__(self, where: str) -> None:
+        super().__init__(
+            f"refusing to listen on {where} without an API key: anybody there could fetch faces. "
+            "Make one with `eigenhead keys add NAME`, or listen on 127.0.0.1 without a public URL"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who asks. ``key`` is the API key's id, or "local"."""
+
+    key: str
+    scopes: frozenset[str]
+
+    def may(self, scope: str) -> bool:
+        return scope in self.scopes or "admin" in self.scopes
+
+
+@dataclass(frozen=True, slots=True)
+class ApiKey:
+    """A key without its secret. ``created`` is in seconds since 1970."""
+
+    id: str
+    name: str
+    scopes: tuple[str, ...]
+    created: float
+
+
+class Keys:
+    """The API keys in the database."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+
+    def add(self, name: str, scopes: tuple[str, ...]) -> str:
+        """Makes a key and returns it; it cannot be shown again."""
+        identity, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
+        row = {"id": identity, "name": name, "digest": _digest(secret), "scopes": " ".join(scopes)}
+        with self._engine.begin() as connection:
+            connection.execute(sa.insert(api_keys).values(**row, created=now_sql(connection)))
+        return f"eh_{identity}_{secret}"
+
+    def all(self) -> list[ApiKey]:
+        """Oldest first."""
+        with self._engine.connect() as connection:
+            rows = connection.execute(sa.select(api_keys).order_by(api_keys.c.created))
+            return [ApiKey(r.id, r.name, tuple(r.scopes.split()), r.created) for r in rows]
+
+    def remove(self, identity: str) -> None:
+        """Raises NotFound."""
+        with self._engine.begin() as connection:
+            if not connection.execute(sa.delete(api_keys).where(api_keys.c.id == identity)).rowcount:
+                raise NotFound("key", identity)
+
+    def any(self) -> bool:
+        with self._engine.connect() as connection:
+            return connection.scalar(sa.select(sa.exists(sa.select(api_keys.c.id)))) or False
+
+    def caller(self, token: str) -> Caller | None:
+        """Whose key ``token`` is; None if nobody's."""
+        parts = token.split("_", 2)
+        if len(parts) != 3 or parts[0] != "eh":
+            return None
+        with self._engine.connect() as connection:
+            row = connection.execute(sa.select(api_keys).where(api_keys.c.id == parts[1][:32])).one_or_none()
+        if row is None or not hmac.compare_digest(row.digest, _digest(parts[2])):
+            return None
+        return Caller(row.id, frozenset(row.scopes.split()))
+
+
+def check_address(settings: ServiceSettings, keys: Keys) -> None:
+    """Raises KeylessAddress before the service listens where it must not."""
+    if not settings.is_private and not keys.any():
+        raise KeylessAddress(settings.public_url or settings.host)
+
+
+def _digest(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()

@@ -1,0 +1,127 @@
+"""What is let go, and when: by age, by count, by space. What a queued or running job needs is never touched, nor is
+anything that the service did not make itself."""
+
+import time
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from rig.errors import EigenheadError
+from server.errors import NotFound
+from server.services.jobs import DELIVERY, FINISHED
+from server.services.service import Service
+from server.storage.store import folder_bytes, newest
+
+LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
+DAY_S = 86400.0
+
+log = structlog.get_logger()
+
+
+def sweep(service: Service) -> dict[str, int]:
+    """One sweep; returns how many of each kind went."""
+    gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
+    gone["jobs"] = _jobs(service)
+    gone["captures"] = _captures(service)
+    gone["caches"] = _caches(service)
+    gone["orphans"] = _orphans(service)
+    gone["deliveries"] = _deliveries(service)
+    if any(gone.values()):
+        log.info("swept", **gone)
+    return gone
+
+
+def _jobs(service: Service) -> int:
+    s, removed = service.settings, 0
+    if s.keep_results_days is None and s.keep_jobs is None and not s.make_room:
+        return 0
+    finished = [job for state in FINISHED for job in service.jobs.find(state=state, limit=100_000)]
+    finished.sort(key=lambda job: job["created"] or "", reverse=True)
+    for place in range(len(finished) - 1, -1, -1):  # oldest first
+        job = finished[place]
+        old = (
+            s.keep_results_days is not None and _age_s(job["finished"] or job["created"]) > s.keep_results_days * DAY_S
+        )
+        many = s.keep_jobs is not None and place >= s.keep_jobs
+        full = s.make_room and service.store.free_bytes() < s.free_bytes
+        if not (old or many or full):
+            break
+        with suppress(EigenheadError):
+            service.jobs.delete(job["id"])
+            removed += 1
+    return removed
+
+
+def _captures(service: Service) -> int:
+    days, removed = service.settings.keep_captures_days, 0
+    if days is None:
+        return 0
+    for record in list(service.store.captures()):
+        if _age_s(record["created"]) > days * DAY_S and not service.jobs.active(capture=record["id"]):
+            service.store.remove_capture(record["id"])
+            removed += 1
+    return removed
+
+
+def _caches(service: Service) -> int:
+    """Caches without a capture, and those used longest ago where all together are too large or the disk is full."""
+    store, s = service.store, service.settings
+    known, removed = set(store.ids("captures")), 0
+    kept: list[tuple[float, int, Path]] = []
+    for identity in store.ids("cache/captures"):
+        folder = store.cache_of(identity)
+        if identity not in known:
+            store.remove(folder)
+            removed += 1
+            continue
+        with suppress(FileNotFoundError):  # it is being erased
+            kept.append((newest(folder), folder_bytes(folder), folder))
+    total = sum(size for _, size, _ in kept)
+    for _, size, folder in sorted(kept):
+        if total <= s.cache_bytes and store.free_bytes() >= s.free_bytes:
+            break
+        store.remove(folder)
+        total -= size
+        removed += 1
+    return removed
+
+
+def _orphans(service: Service) -> int:
+    """Attempts that a killed worker left in a job that ended, and folders of jobs that are not known any more."""
+    removed = 0
+    for job_id in service.store.ids("jobs"):
+        folder = service.store.folder("jobs", job_id)
+        attempts = list(folder.glob("attempt-*"))
+        if not attempts or time.time() - max(path.stat().st_mtime for path in attempts) < LEFTOVER_S:
+            continue
+        if _ended(service, job_id):
+            for path in attempts:
+                service.store.remove(path)
+                removed += 1
+            with suppress(OSError):  # it has a result
+                folder.rmdir()
+    return removed
+
+
+def _ended(service: Service, job_id: str) -> bool:
+    try:
+        return service.jobs.state(job_id) in FINISHED
+    except NotFound:  # erased while its worker still wrote
+        return True
+
+
+def _deliveries(service: Service) -> int:
+    """Messages to webhooks that were delivered, or given up, a day ago."""
+    before = datetime.fromtimestamp(time.time() - DAY_S, UTC).isoformat()
+    client = service.jobs.client
+    rows = client.list_workflows(name=DELIVERY, completed_before=before, load_input=False, load_output=False)
+    if rows:
+        client.delete_workflows([row.workflow_id for row in rows])
+    return len(rows)
+
+
+def _age_s(moment: Any) -> float:
+    return time.time() - datetime.fromisoformat(moment).timestamp() if moment else 0.0

@@ -1,0 +1,285 @@
+"""The rig behind ``POST /v1/captures``: the simulated studio, or real cameras named by a rig.toml.
+
+A calibration that was put to use lies in ``<data>/rig/cameras.json`` and goes into every capture from then on; until
+then the rig's own one does (the studio's layout, or what rig.toml names).
+"""
+
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.acquisition.commands import board_shot
+from rig.acquisition.plates import link_plates
+from rig.acquisition.session import RigSession
+from rig.acquisition.shot import ShotFailed
+from rig.capture import Capture
+from rig.errors import EigenheadError, InputError
+from rig.formats.cameras_json import read_rig, write_rig
+from rig.formats.capture_folder import write_capture
+from rig.formats.images import write_image
+from rig.formats.rig_toml import RigConfig, read_rig_config
+from rig.rig import Rig
+from server.errors import Conflict, NotFound, Unavailable
+from server.settings import ServiceSettings
+from server.tasks.child import Child, WorkFailed
+from server.tasks.simulate import look, simulated
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+PREVIEW_WIDTH = 640
+PREVIEW_QUALITY = 80
+SHOT_BYTES = 64 << 20
+
+
+class RigBackend(Protocol):
+    """What the service asks of a rig. Blocks; call it from a thread."""
+
+    def describe(self) -> dict[str, Any]:
+        """id, kind, ready, cameras, faults, calibration."""
+        ...
+
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+        """Takes a shot into ``folder/files``; returns its certificate. Raises Unavailable naming what is missing.
+
+        ``board``: of the calibration board, for which a rig needs no calibration and not every camera."""
+        ...
+
+    def look(self) -> Mapping[str, ImageRgb]:
+        """What all cameras see now; one that shows nothing is absent. Raises Unavailable."""
+        ...
+
+    def preview(self, camera: str) -> bytes:
+        """A JPEG of what the camera sees now. Raises NotFound or Unavailable."""
+        ...
+
+    def take_background(self) -> dict[str, Any]:
+        """New clean plates of the empty studio. Raises Unavailable."""
+        ...
+
+    def use(self, calibration: Path) -> None:
+        """Uses a cameras.json from now on. Raises Conflict where it is another rig's."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class SimulatedRig:
+    """The embedded studio, drawn in a child process with its own GL context. The truth of a shot is kept beside it."""
+
+    def __init__(self, calibration: Path) -> None:
+        self._calibration = calibration
+        self._child = Child(niceness=3)
+        self._one_at_a_time = threading.Lock()
+
+    def describe(self) -> dict[str, Any]:
+        rig = self._rig()
+        cameras = [{"name": name, "driver": "simulated", "state": "ready"} for name in rig.names]
+        calibrated = "own" if self._calibration.is_file() else "studio"
+        return _state("simulated", "simulated", cameras, [], calibrated)
+
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+        """The studio has no board to show: its pictures are of a person all the same."""
+        with self._one_at_a_time:
+            try:
+                shot = self._child.remote(simulated)(folder=str(folder), seed=seed)
+            except WorkFailed as error:
+                raise Unavailable("shot-failed", error.message, [error.message]) from error
+        if self._calibration.is_file():
+            write_rig(read_rig(self._calibration), folder / "files" / "cameras.json")
+        return shot
+
+    def look(self) -> Mapping[str, ImageRgb]:
+        with self._one_at_a_time:
+            return self._child.remote(look)(cameras=list(self._rig().names))
+
+    def preview(self, camera: str) -> bytes:
+        if camera not in self._rig():
+            raise NotFound("camera of the rig", camera, "GET /v1/rig lists them")
+        with self._one_at_a_time:
+            return jpeg(self._child.remote(look)(cameras=[camera])[camera])
+
+    def take_background(self) -> dict[str, Any]:
+        """The studio takes clean plates with every shot; there is nothing to keep."""
+        return {
+            "cameras": list(self._rig().names),
+            "plates": 2,
+            "note": "the simulated studio takes them with each shot",
+        }
+
+    def use(self, calibration: Path) -> None:
+        _check_names(read_rig(calibration), self._rig().names)
+        self._calibration.parent.mkdir(exist_ok=True)
+        write_rig(read_rig(calibration), self._calibration)
+
+    def close(self) -> None:
+        self._child.close()
+
+    @staticmethod
+    def _rig() -> Rig:
+        from rig.studio.scene.layout import default_layout
+
+        return default_layout()
+
+
+class RealRig:
+    """Cameras of a rig.toml: opened at the first need and kept open; a rig that cannot be opened is tried again."""
+
+    def __init__(self, path: Path, calibration: Path) -> None:
+        self._config: RigConfig = read_rig_config(path)
+        self._path, self._calibration = path, calibration
+        self._session: RigSession | None = None
+        self._lock = threading.RLock()
+
+    def describe(self) -> dict[str, Any]:
+        with self._lock:
+            states = {} if self._session is None else self._session.states()
+            error = None if self._session is None else self._session.trigger_error()
+        cameras, faults = [], [] if error is None else [f"trigger: {error}"]
+        for camera in self._config.cameras:
+            state = states.get(camera.name)
+            known = "closed" if state is None else "open" if state.opened else "missing"
+            cameras.append({"name": camera.name, "driver": camera.driver, "state": known})
+            if state is not None and state.error:
+                faults.append(f"{camera.name}: {state.error}")
+        rig = self._calibrated()
+        if rig is None:
+            faults.append("no calibration: calibrate the rig and put the calibration to use")
+        return _state(self._config.name, "real", cameras, faults, None if rig is None else "own")
+
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+        if seed is not None:
+            raise InputError("request", ["seed: only the simulated studio takes one"])
+        if board:
+            return self._board_shot(folder)
+        rig = self._calibrated()
+        if rig is None:
+            detail = "The rig has no calibration: take shots of the board, calibrate from them and use the result."
+            raise Unavailable("not-calibrated", detail)
+        with self._lock:
+            session = self._opened()
+            shot = session.shoot()
+            if not shot.complete:
+                faults = [str(fault) for fault in shot.faults if fault.is_error]
+                raise Unavailable("shot-failed", "The shot is no capture: " + "; ".join(faults), faults)
+            images = {name: image for name, image in shot.images.items() if name in rig}
+            write_capture(folder / "files", Capture(images), rig)
+            link_plates(session.plates, folder / "files" / "background")
+        return shot.document()
+
+    def _board_shot(self, folder: Path) -> dict[str, Any]:
+        with self._lock:
+            try:
+                shot = board_shot(self._opened())
+            except ShotFailed as error:
+                faults = [str(fault) for fault in error.faults]
+                raise Unavailable("shot-failed", f"No picture of the board: {'; '.join(faults)}", faults) from error
+        for name, image in shot.images.items():
+            write_image(folder / "files" / "images" / f"{name}.png", image)
+        return shot.document()
+
+    def look(self) -> Mapping[str, ImageRgb]:
+        with self._lock:
+            return self._opened().look()
+
+    def preview(self, camera: str) -> bytes:
+        if camera not in self._config.names:
+            raise NotFound("camera of the rig", camera, "GET /v1/rig lists them")
+        with self._lock:
+            image = self._opened().look([camera]).get(camera)
+        if image is None:
+            raise Unavailable("camera-missing", f"{camera} delivers no picture; GET /v1/rig says why.", [camera])
+        return jpeg(image)
+
+    def take_background(self) -> dict[str, Any]:
+        with self._lock:
+            try:
+                plates = self._opened().take_plates()
+            except ShotFailed as error:
+                faults = [str(fault) for fault in error.faults]
+                raise Unavailable("plates-failed", str(error), faults) from error
+        return {"cameras": sorted(plates.files), "plates": self._config.shot.plates, "note": ""}
+
+    def use(self, calibration: Path) -> None:
+        rig = read_rig(calibration)
+        _check_names(rig, self._config.names)
+        self._calibration.parent.mkdir(exist_ok=True)
+        write_rig(rig, self._calibration)
+        with self._lock:
+            if self._session is not None:
+                self._session.rig = rig
+
+    def close(self) -> None:
+        with self._lock:
+            if self._session is not None:
+                self._session.close()
+                self._session = None
+
+    def _opened(self) -> RigSession:
+        if self._session is None:
+            session = RigSession(self._config)
+            try:
+                session.open()
+                session.warm_up()
+            except EigenheadError as error:
+                session.close()
+                raise Unavailable("rig-unavailable", str(error), [str(error)]) from error
+            if self._calibration.is_file():
+                session.rig = read_rig(self._calibration)
+            self._session = session
+        return self._session
+
+    def _calibrated(self) -> Rig | None:
+        if self._calibration.is_file():
+            return read_rig(self._calibration)
+        with suppress(InputError):
+            if self._config.calibration_file is not None:
+                return read_rig(self._config.calibration_file)
+        return None
+
+
+def open_rig(settings: ServiceSettings) -> RigBackend:
+    """Raises InputError naming every fault of rig.toml."""
+    calibration = settings.data / "rig" / "cameras.json"
+    return SimulatedRig(calibration) if settings.rig is None else RealRig(settings.rig, calibration)
+
+
+def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
+    """RGB pixels as a JPEG of at most ``width``."""
+    small = reduced(image, width)
+    done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
+    assert done
+    return data.tobytes()
+
+
+def reduced(image: ImageRgb, width: int) -> ImageRgb:
+    """The image, made smaller where it is wider than ``width``."""
+    if image.shape[1] <= width:
+        return image
+    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+
+def _check_names(rig: Rig, names: tuple[str, ...]) -> None:
+    if set(rig.names) != set(names):
+        differing = sorted(set(rig.names) ^ set(names))
+        detail = "The calibration is of other cameras than the rig has."
+        raise Conflict("other-rig", detail, [f"{name}: only in one of the two" for name in differing])
+
+
+def _state(
+    identity: str, kind: str, cameras: list[dict[str, Any]], faults: list[str], calibration: str | None
+) -> dict[str, Any]:
+    ready = not faults and all(camera["state"] != "missing" for camera in cameras)
+    return {
+        "id": identity,
+        "kind": kind,
+        "ready": ready,
+        "cameras": cameras,
+        "faults": faults,
+        "calibration": calibration,
+    }

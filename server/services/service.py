@@ -1,0 +1,105 @@
+"""The parts of one service process, made once and passed to whoever serves: HTTP's routes, the operator's pages."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from server.metrics import Metrics
+from server.services.calibrations import Calibrations
+from server.services.captures import Captures
+from server.services.jobs import Jobs, migrate
+from server.services.keys import Keys
+from server.services.rigs import RigBackend, open_rig
+from server.services.sessions import Sessions
+from server.services.threads import Threads
+from server.services.uploads import ResumableUploads
+from server.services.webhooks import Webhooks
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+from server.storage.store import Store
+from server.tasks.calibrate import ingest_board_pictures
+from server.tasks.child import Children
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One finding about the service: whether it is well, and what to do where it is not."""
+
+    ok: bool
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """The parts of one service process."""
+
+    settings: ServiceSettings
+    store: Store
+    engine: sa.Engine
+    jobs: Jobs
+    keys: Keys
+    webhooks: Webhooks
+    uploads: ResumableUploads
+    threads: Threads
+    children: Children
+    rig: RigBackend
+    captures: Captures
+    sessions: Sessions
+    calibrations: Calibrations
+    metrics: Metrics
+    known: dict[str, Check]  # findings that are made once
+
+    def close(self) -> None:
+        self.rig.close()
+        self.children.close()
+        self.jobs.close()
+        self.engine.dispose()
+
+    def accept_board_pictures(self, archive: Path, folder: Path, label: str) -> dict[str, Any]:
+        """Queues a calibration from an archive of IMAGES/ and board.toml. Raises InputError naming every fault."""
+        limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
+        target.mkdir(parents=True)
+        with self.children.one() as child:
+            child.remote(ingest_board_pictures)(archive=str(archive), folder=str(target), limits=limits)
+        return self.calibrations.add(target, "upload", label)
+
+    def use_calibration(self, identity: str) -> dict[str, Any]:
+        """Every capture from now on gets this calibration; returns the rig's state. Raises NotFound, Conflict."""
+        self.rig.use(self.calibrations.cameras_json(identity))
+        self.calibrations.mark_in_use(identity)
+        return self.rig.describe()
+
+    def cancel(self, job_id: str) -> dict[str, Any]:
+        """Cancels a job and tells the webhooks; a finished one stays as it is."""
+        job, did = self.jobs.cancel(job_id)
+        if did:
+            self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue)
+        return job
+
+
+def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
+    """Opens the data folder, the database and the rig's description. Raises InputError, DatabaseUnavailable."""
+    store = Store(settings.data)
+    engine = open_database(settings)
+    migrate(settings)
+    jobs, rig = Jobs(settings, store, engine), open_rig(settings)
+    children = Children(settings.checks_at_once, niceness=3)
+    return Service(
+        settings=settings,
+        store=store,
+        engine=engine,
+        jobs=jobs,
+        captures=Captures(store, jobs, rig, children, settings),
+        sessions=Sessions(store, jobs),
+        calibrations=Calibrations(store, jobs.client, settings.queue),
+        keys=Keys(engine),
+        webhooks=Webhooks(engine),
+        uploads=ResumableUploads(store, settings),
+        threads=Threads(checks=settings.checks_at_once),
+        children=children,
+        rig=rig,
+        metrics=metrics,
+        known={},
+    )

@@ -1,0 +1,99 @@
+"""Resumable uploads (tus 1.0) on disk: ``uploads/<id>/upload.json`` and ``uploads/<id>/data``."""
+
+import fcntl
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from rig.atomic_write import write_atomically
+from server.errors import Conflict, NotFound, Refused, TooLarge
+from server.settings import ServiceSettings
+from server.storage.store import Store, is_id, new_id
+
+UPLOAD_FORMAT = "eigenhead-upload/1"
+
+
+def too_large(settings: ServiceSettings) -> TooLarge:
+    return TooLarge("upload-too-large", f"An upload may have {settings.body_bytes:,} bytes.")
+
+
+class ResumableUploads:
+    """The length of ``data`` is the offset: what a killed service had written is what the client continues from."""
+
+    def __init__(self, store: Store, settings: ServiceSettings) -> None:
+        self._store, self._settings = store, settings
+
+    def create(self, length: int, fields: dict[str, str], key: str) -> dict[str, Any]:
+        if length > self._settings.body_bytes:
+            raise too_large(self._settings)
+        self._store.reserve(2 * length + self._promised(), self._settings.free_bytes)
+        identity = new_id()
+        folder = self._store.folder("uploads", identity)
+        folder.mkdir(parents=True)
+        (folder / "data").touch()
+        expires = time.time() + self._settings.upload_hours * 3600
+        record = {"format": UPLOAD_FORMAT, "id": identity, "length": length, "fields": fields, "key": key}
+        record |= {"expires": expires, "capture": None}
+        self.save(record)
+        return record
+
+    def get(self, identity: str) -> dict[str, Any]:
+        """Raises NotFound, also for what expired."""
+        if not is_id(identity):
+            raise NotFound("upload", identity)
+        with suppress(OSError, ValueError):
+            record = json.loads((self._store.folder("uploads", identity) / "upload.json").read_bytes())
+            if record["expires"] > time.time():
+                return record
+        raise NotFound("upload", identity)
+
+    def offset(self, record: dict[str, Any]) -> int:
+        """Bytes that are here; all of them once the capture was made and the data let go."""
+        if record["capture"] is not None:
+            return record["length"]
+        return self.data(record).stat().st_size
+
+    def data(self, record: dict[str, Any]) -> Path:
+        return self._store.folder("uploads", record["id"]) / "data"
+
+    def save(self, record: dict[str, Any]) -> None:
+        path = self._store.folder("uploads", record["id"]) / "upload.json"
+        write_atomically(path, json.dumps(record).encode())
+
+    @contextmanager
+    def lock(self, record: dict[str, Any]) -> Iterator[None]:
+        """One writer at a time, in this process or another. Raises Conflict."""
+        with (self.data(record).parent / "upload.json").open("rb") as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                detail = "Another request is writing to this upload; ask with HEAD and go on from there."
+                raise Conflict("upload-busy", detail) from error
+            yield
+
+    def remove(self, identity: str) -> None:
+        self._store.remove(self._store.folder("uploads", identity))
+
+    def sweep(self) -> int:
+        """Removes what expired."""
+        removed = 0
+        for identity in self._store.ids("uploads"):
+            try:
+                self.get(identity)
+            except NotFound:
+                if (self._store.folder("uploads", identity) / "upload.json").is_file():
+                    self.remove(identity)
+                    removed += 1
+        return removed
+
+    def _promised(self) -> int:
+        """Bytes that unfinished uploads may still bring."""
+        total = 0
+        for identity in self._store.ids("uploads"):
+            with suppress(Refused, OSError):
+                record = self.get(identity)
+                total += 0 if record["capture"] else record["length"] - self.offset(record)
+        return total

@@ -1,0 +1,87 @@
+"""Telling other programs how a job ended: signed, retried, durable.
+
+The message and its signature follow https://www.standardwebhooks.com: ``webhook-id``, ``webhook-timestamp`` and
+``webhook-signature: v1,<base64 HMAC-SHA256 of "id.timestamp.body">``. A delivery is a workflow of the job engine, so
+that it survives what a job survives; nine attempts over about eight minutes.
+"""
+
+import base64
+import hashlib
+import hmac
+import json
+import secrets
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import sqlalchemy as sa
+from dbos import EnqueueOptions
+
+from server.errors import NotFound
+from server.services.jobs import APPLICATION_VERSION, DELIVERY
+from server.storage.database import now_sql, webhooks
+
+WEBHOOKS_QUEUE = "webhooks"
+TIMEOUT_S = 10.0
+
+
+class Webhooks:
+    """The addresses that are told, and the telling."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+
+    def add(self, url: str) -> dict[str, Any]:
+        """The new webhook with its secret, which is shown this once."""
+        row = {
+            "id": secrets.token_hex(14),
+            "url": url,
+            "secret": "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode(),
+        }
+        with self._engine.begin() as connection:
+            connection.execute(sa.insert(webhooks).values(**row, created=now_sql(connection)))
+        return row
+
+    def all(self) -> list[dict[str, Any]]:
+        with self._engine.connect() as connection:
+            rows = connection.execute(sa.select(webhooks.c.id, webhooks.c.url).order_by(webhooks.c.created))
+            return [{"id": row.id, "url": row.url} for row in rows]
+
+    def remove(self, identity: str) -> None:
+        """Raises NotFound."""
+        with self._engine.begin() as connection:
+            if not connection.execute(sa.delete(webhooks).where(webhooks.c.id == identity)).rowcount:
+                raise NotFound("webhook", identity)
+
+    def announce(self, job_id: str, state: str, enqueue: Callable[..., Any]) -> None:
+        """Queues one delivery a webhook; doing it again for the same job and state changes nothing."""
+        for hook in self.all():
+            message = {"webhook": hook["id"], "type": f"job.{state}", "job_id": job_id}
+            identity = f"hook-{hook['id']}-{job_id}-{state}"
+            options: EnqueueOptions = {
+                "workflow_name": DELIVERY,
+                "queue_name": WEBHOOKS_QUEUE,
+                "workflow_id": identity,
+                "app_version": APPLICATION_VERSION,
+            }
+            enqueue(options, message | {"id": identity})
+
+    def post(self, message: dict[str, Any]) -> int:
+        """One attempt. Raises httpx.HTTPError where the other side does not take it; a removed webhook is done."""
+        with self._engine.connect() as connection:
+            hook = connection.execute(sa.select(webhooks).where(webhooks.c.id == message["webhook"])).one_or_none()
+        if hook is None:
+            return 0
+        body = json.dumps({"type": message["type"], "data": {"job_id": message["job_id"]}}).encode()
+        headers = signed_headers(message["id"], int(time.time()), body, hook.secret) | {
+            "content-type": "application/json"
+        }
+        return httpx.post(hook.url, content=body, headers=headers, timeout=TIMEOUT_S).raise_for_status().status_code
+
+
+def signed_headers(identity: str, timestamp: int, body: bytes, secret: str) -> dict[str, str]:
+    key = base64.b64decode(secret.removeprefix("whsec_"))
+    digest = hmac.new(key, f"{identity}.{timestamp}.".encode() + body, hashlib.sha256).digest()
+    signature = "v1," + base64.b64encode(digest).decode()
+    return {"webhook-id": identity, "webhook-timestamp": str(timestamp), "webhook-signature": signature}

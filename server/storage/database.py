@@ -1,0 +1,116 @@
+"""The service's own tables, beside the job engine's in the same database (SQLite file or PostgreSQL).
+
+Times are seconds since 1970 on the *database's* clock, so that two hosts whose clocks differ agree on who is silent.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy import event
+from sqlalchemy.exc import SQLAlchemyError
+
+from rig.errors import EigenheadError
+from server.settings import ServiceSettings
+
+CONNECT_S = 10  # a database that does not even refuse
+
+metadata = sa.MetaData()
+
+
+class DatabaseUnavailable(EigenheadError):
+    """The database does not answer, or is damaged."""
+
+    def __init__(self, place: str, error: SQLAlchemyError) -> None:
+        why = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
+        super().__init__(
+            f"the job database at {place} cannot be used ({why}): start it, or mend EIGENHEAD_DATABASE_URL"
+        )
+
+
+events = sa.Table(
+    "eigenhead_events",
+    metadata,
+    sa.Column("job_id", sa.String(64), primary_key=True),
+    sa.Column("seq", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("at", sa.Float, nullable=False),
+    sa.Column("document", sa.Text, nullable=False),
+)
+
+job_index = sa.Table(  # what jobs are looked up by; the job itself is the engine's row
+    "eigenhead_job_index",
+    metadata,
+    sa.Column("job_id", sa.String(64), primary_key=True),
+    sa.Column("capture_id", sa.String(64), nullable=False, index=True),
+    sa.Column("session", sa.String(64), nullable=True, index=True),
+)
+
+workers = sa.Table(
+    "eigenhead_workers",
+    metadata,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("machine", sa.String(200), nullable=False),  # boot and process namespace: where the pid means something
+    sa.Column("host", sa.String(200), nullable=False),
+    sa.Column("pid", sa.Integer, nullable=False),
+    sa.Column("pid_started", sa.BigInteger, nullable=False),  # a pid is used again; with its start time it is unique
+    sa.Column("queue", sa.String(64), nullable=False),
+    sa.Column("concurrency", sa.Integer, nullable=False),
+    sa.Column("version", sa.String(64), nullable=False),
+    sa.Column("started", sa.Float, nullable=False),
+    sa.Column("seen", sa.Float, nullable=False),
+    sa.Column("stopped", sa.Float, nullable=True),
+)
+
+api_keys = sa.Table(
+    "eigenhead_api_keys",
+    metadata,
+    sa.Column("id", sa.String(32), primary_key=True),
+    sa.Column("name", sa.String(200), nullable=False),
+    sa.Column("digest", sa.String(64), nullable=False),
+    sa.Column("scopes", sa.String(200), nullable=False),
+    sa.Column("created", sa.Float, nullable=False),
+)
+
+webhooks = sa.Table(
+    "eigenhead_webhooks",
+    metadata,
+    sa.Column("id", sa.String(32), primary_key=True),
+    sa.Column("url", sa.Text, nullable=False),
+    sa.Column("secret", sa.String(200), nullable=False),
+    sa.Column("created", sa.Float, nullable=False),
+)
+
+
+def open_database(settings: ServiceSettings) -> sa.Engine:
+    """An engine on the service's database, with its tables made. Raises DatabaseUnavailable."""
+    url = sa.make_url(settings.url)
+    if url.get_backend_name() == "sqlite":
+        Path(str(url.database)).parent.mkdir(parents=True, exist_ok=True)
+        engine = sa.create_engine(url, connect_args={"timeout": 30}, pool_size=10, max_overflow=10)
+
+        @event.listens_for(engine, "connect")
+        def prepare(connection: Any, record: Any) -> None:
+            connection.isolation_level = "IMMEDIATE"  # a writer that starts as a reader could not wait for its turn
+            connection.execute("PRAGMA busy_timeout=30000")
+            connection.execute("PRAGMA journal_mode=WAL")  # kept in the file: the job engine's connections read it too
+            connection.execute("PRAGMA synchronous=FULL")  # WAL's default loses the last commits with the power
+    else:
+        patience = {"connect_timeout": CONNECT_S}
+        engine = sa.create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10, connect_args=patience)
+    try:
+        metadata.create_all(engine)
+    except SQLAlchemyError as error:
+        raise DatabaseUnavailable(settings.place, error) from error
+    return engine
+
+
+def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElement[bool]:
+    """Of a worker that has not stopped and was heard of in the last ``silent_s``."""
+    return sa.and_(workers.c.stopped.is_(None), workers.c.seen > now_sql(connection) - silent_s)
+
+
+def now_sql(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:
+    """Seconds since 1970 on the database's clock."""
+    if engine.dialect.name == "sqlite":
+        return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float)
+    return sa.literal_column("extract(epoch from clock_timestamp())", sa.Float)

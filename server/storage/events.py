@@ -1,0 +1,59 @@
+"""What happened to a job, in order: the log behind progress, server-sent events and the remaining time."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
+
+from server.storage.database import events, now_sql
+
+
+@dataclass(frozen=True, slots=True)
+class JobEvent:
+    """``document`` holds ``stage`` and ``progress`` (0 to 1), perhaps ``eta_s``, or a ``state``."""
+
+    seq: int
+    at: float
+    document: dict[str, Any]
+
+
+class EventLog:
+    """The events table. Numbers count up from 1 within a job, also across workers that take it over."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+
+    def append(self, job_id: str, document: dict[str, Any]) -> None:
+        for _ in range(20):  # a taken-over job has two writers for a moment
+            try:
+                with self._engine.begin() as connection:
+                    last = connection.scalar(sa.select(sa.func.max(events.c.seq)).where(events.c.job_id == job_id)) or 0
+                    row = {"job_id": job_id, "seq": last + 1, "document": json.dumps(document)}
+                    connection.execute(sa.insert(events).values(**row, at=now_sql(connection)))
+                return
+            except IntegrityError:
+                continue
+
+    def since(self, job_id: str, seq: int, limit: int = 1000) -> list[JobEvent]:
+        query = (
+            sa.select(events).where(events.c.job_id == job_id, events.c.seq > seq).order_by(events.c.seq).limit(limit)
+        )
+        with self._engine.connect() as connection:
+            return [JobEvent(row.seq, row.at, json.loads(row.document)) for row in connection.execute(query)]
+
+    def latest(self, job_ids: list[str]) -> dict[str, JobEvent]:
+        """The newest progress event of each job that has one."""
+        newest = sa.select(events.c.job_id, sa.func.max(events.c.seq).label("seq")).where(events.c.job_id.in_(job_ids))
+        newest = newest.group_by(events.c.job_id).subquery()
+        query = sa.select(events).join(
+            newest, sa.and_(events.c.job_id == newest.c.job_id, events.c.seq == newest.c.seq)
+        )
+        with self._engine.connect() as connection:
+            rows = connection.execute(query)
+            return {row.job_id: JobEvent(row.seq, row.at, json.loads(row.document)) for row in rows}
+
+    def remove(self, job_ids: list[str]) -> None:
+        with self._engine.begin() as connection:
+            connection.execute(sa.delete(events).where(events.c.job_id.in_(job_ids)))

@@ -1,0 +1,48 @@
+"""A result folder that somebody named: written beside it under another name, and moved in when it is complete, file by
+file, report.json last: the folder itself may be a mount, or where a shell stands.
+
+Nothing of an earlier result stays (a head.obj that was asked for once, overlays of other cameras); what is there and no
+result's file stays as it is.
+"""
+
+import re
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+RESULT_FILE = re.compile(
+    r"^((head|bust|neutral|posed|turntable|contact_sheet)[\w-]*\.\w+|report\.json|overlays|texture)$"
+)
+
+
+@contextmanager
+def fresh_folder(out: Path) -> Iterator[Path]:
+    """An empty folder that takes the place of ``out`` when the block ends well, and is gone when it does not.
+
+    Raises OSError at once where ``out`` cannot be written."""
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(20, "Not a directory", str(out))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    made = out.resolve().parent / f".{out.resolve().name or 'result'}.{secrets.token_hex(6)}"
+    made.mkdir()
+    try:
+        yield made
+        _swap(made, out)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _swap(made: Path, out: Path) -> None:
+    if not out.exists():
+        made.rename(out)
+        return
+    for old in list(out.iterdir()):
+        if RESULT_FILE.match(old.name):
+            shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+    for new in sorted(made.iterdir(), key=lambda path: path.name == "report.json"):
+        target = out / new.name
+        if target.is_dir() and not target.is_symlink():
+            shutil.rmtree(target)
+        new.replace(target)

@@ -1,0 +1,227 @@
+"""Artefacts on disk: captures, sessions, results.
+
+    <data>/captures/<id>/record.json  files/...          one folder a capture, as the contract lays it out
+    <data>/sessions/<id>.json
+    <data>/jobs/<id>/result/...                          and attempt-*/ while a worker writes
+    <data>/cache/captures/<id>/...                       what is worth keeping of a capture, and can be made anew
+    <data>/calibrations/<id>/...  rig/...                 see server.services.calibrations, server.services.rigs
+    <data>/incoming/<id>/                                what is being received; swept after a crash
+    <data>/trash/                                        what is being deleted
+    <data>/set-aside/                                    damaged records, moved here and reported
+
+A folder appears under its final name in one rename, after everything in it reached the disk. What is in the data folder
+and is not named above was put there by somebody else: it is never read and never deleted.
+"""
+
+import json
+import os
+import re
+import secrets
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from rig.atomic_write import write_atomically
+from server.errors import DiskFull, NotFound
+
+CAPTURE_FORMAT, SESSION_FORMAT = "eigenhead-capture/1", "eigenhead-session/1"
+ID = re.compile(r"^[0-9a-f]{28}$")
+FOLDERS = ("captures", "sessions", "jobs", "incoming", "uploads", "trash", "set-aside", "calibrations", "cache", "rig")
+
+log = structlog.get_logger()
+
+
+def new_id() -> str:
+    """28 hex digits that sort by time: 12 of milliseconds, 16 at random."""
+    return f"{time.time_ns() // 1_000_000:012x}{secrets.token_hex(8)}"
+
+
+def is_id(text: str) -> bool:
+    return ID.match(text) is not None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredFile:
+    """A file and the sha256 of what is in it."""
+
+    path: Path
+    sha256: str
+
+
+class Store:
+    """The data folder. Every id that comes from a request passes ``is_id`` before it becomes part of a path."""
+
+    def __init__(self, data: Path) -> None:
+        self.data = data
+        self._changing = threading.Lock()  # two changes of one record must not lose one of them
+        for name in FOLDERS:
+            (data / name).mkdir(parents=True, exist_ok=True)
+        data.chmod(0o700)  # faces are biometric data
+
+    def folder(self, kind: str, identity: str) -> Path:
+        """Where a capture, job, ... lies or would lie. Raises NotFound for what is no id."""
+        if not is_id(identity):
+            raise NotFound(kind.removesuffix("s"), identity)
+        return self.data / kind / identity
+
+    def ids(self, kind: str) -> list[str]:
+        """Newest first."""
+        with suppress(FileNotFoundError):
+            names = (entry.name.removesuffix(".json") for entry in os.scandir(self.data / kind))
+            return sorted((name for name in names if is_id(name)), reverse=True)
+        return []
+
+    @contextmanager
+    def incoming(self) -> Iterator[Path]:
+        """A folder to receive things in; it is gone afterwards, with everything that was not moved out of it."""
+        folder = self.data / "incoming" / new_id()
+        folder.mkdir(parents=True)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def free_bytes(self) -> int:
+        return shutil.disk_usage(self.data).free
+
+    def reserve(self, wanted: int, spare: int) -> None:
+        """Raises DiskFull if ``wanted`` bytes would leave less than ``spare`` free."""
+        if self.free_bytes() - wanted < spare:
+            raise DiskFull
+
+    def add_capture(self, folder: Path, record: dict[str, Any]) -> None:
+        """Moves ``folder`` (with ``files/`` in it) to its place, with its record."""
+        write_atomically(folder / "record.json", _encoded({"format": CAPTURE_FORMAT, **record}))
+        move_durably(folder, self.folder("captures", record["id"]))
+
+    def capture(self, identity: str) -> dict[str, Any]:
+        """The record of a capture. Raises NotFound."""
+        path = self.folder("captures", identity) / "record.json"
+        record = self._read(path, CAPTURE_FORMAT, path.parent)
+        if record is None:
+            raise NotFound("capture", identity)
+        return record
+
+    def captures(self) -> Iterator[dict[str, Any]]:
+        """The records of all captures, newest first."""
+        for identity in self.ids("captures"):
+            folder = self.data / "captures" / identity
+            record = self._read(folder / "record.json", CAPTURE_FORMAT, folder)
+            if record is not None:
+                yield record
+
+    def change_capture(self, identity: str, change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+        """Applies ``change`` to the record of a capture and returns it. Raises NotFound."""
+        with self._changing:
+            record = self.capture(identity)
+            change(record)
+            write_atomically(self.folder("captures", identity) / "record.json", _encoded(record))
+        return record
+
+    def remove_capture(self, identity: str) -> None:
+        """Removes a capture with what was kept of it: that shows a face too."""
+        self.remove(self.folder("captures", identity))
+        self.remove(self.cache_of(identity))
+
+    def cache_of(self, identity: str) -> Path:
+        """Where silhouettes, thumbnails and the like of a capture are kept."""
+        return self.folder("cache/captures", identity)
+
+    def save_session(self, record: dict[str, Any]) -> None:
+        path = self.folder("sessions", record["id"]).with_suffix(".json")
+        write_atomically(path, _encoded({"format": SESSION_FORMAT, **record}))
+        _sync_folder(path.parent)
+
+    def session(self, identity: str) -> dict[str, Any]:
+        """The record of a session. Raises NotFound."""
+        path = self.folder("sessions", identity).with_suffix(".json")
+        record = self._read(path, SESSION_FORMAT, path)
+        if record is None:
+            raise NotFound("session", identity)
+        return record
+
+    def sessions(self) -> Iterator[dict[str, Any]]:
+        for identity in self.ids("sessions"):
+            with suppress(NotFound):
+                yield self.session(identity)
+
+    def remove(self, path: Path) -> None:
+        """Deletes a file or folder; it is out of sight at once even if the deletion is cut short."""
+        target = self.data / "trash" / f"{new_id()}"
+        try:
+            path.rename(target)
+        except FileNotFoundError:
+            return
+        except OSError:  # a full file system may have no room for the new name
+            target = path
+        shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(missing_ok=True)
+
+    def sweep(self, older_s: float) -> int:
+        """Deletes what a crash left in ``incoming`` and ``trash``, if nobody touched it for ``older_s``."""
+        removed = 0
+        for kind in ("incoming", "trash"):
+            for identity in self.ids(kind):
+                folder = self.data / kind / identity
+                with suppress(FileNotFoundError):
+                    if time.time() - newest(folder) > older_s:
+                        shutil.rmtree(folder, ignore_errors=True) if folder.is_dir() else folder.unlink()
+                        removed += 1
+        return removed
+
+    def set_aside(self) -> list[str]:
+        """Names of the damaged records that were moved out of the way."""
+        return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
+
+    def _read(self, path: Path, wanted: str, whole: Path) -> dict[str, Any] | None:
+        try:
+            data = path.read_bytes()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        with suppress(ValueError, RecursionError):
+            record = json.loads(data)
+            if isinstance(record, dict) and record.get("format") == wanted and record.get("id") == whole.stem:
+                return record
+        name = f"{whole.parent.name}-{whole.name}-{int(time.time())}"
+        log.error("damaged record set aside", record=str(path), to=name)
+        with suppress(OSError):
+            whole.rename(self.data / "set-aside" / name)
+        return None
+
+
+def move_durably(folder: Path, target: Path) -> None:
+    """Renames a folder whose files were synced, and syncs the names. Raises OSError if ``target`` has content."""
+    for path in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
+        _sync_folder(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    folder.rename(target)
+    _sync_folder(target.parent)
+
+
+def folder_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def newest(path: Path) -> float:
+    times = [path.stat().st_mtime]
+    if path.is_dir():
+        times += [entry.stat().st_mtime for entry in path.rglob("*")]
+    return max(times)
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _encoded(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, indent=1, ensure_ascii=False).encode()

@@ -1,0 +1,248 @@
+"""A warm child process that does one piece of heavy work after another.
+
+Heavy work (reconstruction, checking images, rendering the simulated studio) runs outside the process that answers
+requests or keeps a worker's heartbeat: a GL context and the interpreter lock stay out of its way, a crash in native
+code costs one job and not the process, and what does not listen to a cancellation can be killed.
+
+The child is this module run with a socket. It ends when the socket does, so that it never outlives its parent.
+"""
+
+import errno
+import importlib
+import os
+import pickle
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from rig.errors import Cancelled, EigenheadError, InputError
+from server.processes import SERVER, python_command, python_environment
+
+PATIENCE_S = 0.5  # between asking a piece of work to stop and killing it: a cancellation takes effect within a second
+REPORT_EVERY_S = 0.05
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+Report = Callable[[str, float], None]
+P = ParamSpec("P")
+T = TypeVar("T")
+STOP = b""
+
+
+class WorkFailed(EigenheadError):
+    """The work raised. ``kind`` tells a known failure (an error of this project, a full disk, no memory) from a bug,
+    whose ``trace`` is for the log."""
+
+    def __init__(self, kind: str, message: str, faults: tuple[str, ...] = (), trace: str = "") -> None:
+        super().__init__(message)
+        self.kind, self.message, self.faults, self.trace = kind, message, faults, trace
+
+
+class Bench:
+    """What outlives one piece of work in the child: expensive things by name, made once, closed at the end."""
+
+    def __init__(self) -> None:
+        self._stack = ExitStack()
+        self._things: dict[str, Any] = {}
+
+    def keep(self, name: str, make: Callable[[], Any]) -> Any:
+        """The thing called ``name``; ``make`` may return a context manager, which is entered."""
+        if name not in self._things:
+            thing = make()
+            self._things[name] = self._stack.enter_context(thing) if hasattr(thing, "__exit__") else thing
+        return self._things[name]
+
+
+class Child:
+    """One child process; a call starts it when there is none. Not for two threads at once."""
+
+    def __init__(self, niceness: int = 0) -> None:
+        self._niceness = niceness
+        self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Connection | None = None
+
+    def remote(
+        self,
+        work: Callable[Concatenate[Bench, Report, P], T],
+        *,
+        report: Report = lambda stage, fraction: None,
+        cancelled: Callable[[], bool] = lambda: False,
+    ) -> Callable[P, T]:
+        """``work``, a function of a module, as it runs in the child: ``child.remote(work)(name=value)`` calls
+        ``work(bench, report, name=value)`` there. What travels is the function's module and name.
+
+        The call raises Cancelled within ``PATIENCE_S`` and one poll after ``cancelled()`` becomes true, InputError and
+        WorkFailed as the function did, and WorkFailed("crash") when the child died.
+        """
+
+        def call(*arguments: P.args, **named: P.kwargs) -> T:
+            return self._run(pickle.dumps((work, arguments, named)), report, cancelled)
+
+        return call
+
+    def _run(self, request: bytes, report: Report, cancelled: Callable[[], bool]) -> Any:
+        connection = self._started()
+        try:
+            connection.send_bytes(request)
+            return self._await(connection, report, cancelled)
+        except (EOFError, OSError) as error:
+            code = self._kill()
+            how = f"signal {-code}" if code < 0 else f"status {code}"
+            raise WorkFailed("crash", f"The process that did the work died ({how}).") from error
+        except BaseException:
+            if self._connection is not None and not self._idle:
+                self._kill()
+            raise
+
+    def close(self) -> None:
+        self._kill()
+
+    def start(self) -> None:
+        """Starts the process ahead of the first piece of work."""
+        self._started()
+
+    def _started(self) -> Connection:
+        self._idle = False
+        if self._connection is not None and self._process is not None and self._process.poll() is None:
+            return self._connection
+        self._kill()
+        ours, theirs = socket.socketpair()
+        command = python_command("tasks.child", str(theirs.fileno()), str(self._niceness))
+        with theirs:
+            self._process = subprocess.Popen(
+                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=2, env=python_environment()
+            )
+        self._connection = Connection(ours.detach())
+        return self._connection
+
+    def _await(self, connection: Connection, report: Report, cancelled: Callable[[], bool]) -> Any:
+        deadline: float | None = None
+        while True:
+            if connection.poll(0.05):
+                kind, *rest = connection.recv()
+                if kind == "report":
+                    report(*rest)
+                    continue
+                self._idle = True
+                if kind == "done":
+                    return rest[0]
+                raise _error(*rest)
+            if deadline is None and cancelled():
+                connection.send_bytes(STOP)
+                deadline = time.monotonic() + PATIENCE_S
+            if deadline is not None and time.monotonic() > deadline:
+                self._kill()
+                raise Cancelled
+
+    def _kill(self) -> int:
+        process, self._process = self._process, None
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        if process is None:
+            return 0
+        process.kill() if process.poll() is None else None
+        return process.wait()
+
+
+class Children:
+    """A few children for many threads: each takes one for its work and gives it back."""
+
+    def __init__(self, count: int, niceness: int = 0) -> None:
+        self._all = [Child(niceness) for _ in range(count)]
+        self._free: queue.LifoQueue[Child] = queue.LifoQueue()
+        for child in self._all:
+            self._free.put(child)
+
+    @contextmanager
+    def one(self) -> Iterator[Child]:
+        child = self._free.get()
+        try:
+            yield child
+        finally:
+            self._free.put(child)
+
+    def close(self) -> None:
+        for child in self._all:
+            child.close()
+
+
+def _error(kind: str, message: str, subject: str, faults: tuple[str, ...], trace: str) -> EigenheadError:
+    if kind == "Cancelled":
+        return Cancelled()
+    return InputError(subject, faults) if kind == "InputError" else WorkFailed(kind, message, faults, trace)
+
+
+def _described(error: BaseException) -> tuple[str, str, str, str, tuple[str, ...], str]:
+    if isinstance(error, InputError):
+        return "failed", "InputError", str(error), error.subject, error.faults, ""
+    if isinstance(error, EigenheadError):
+        return "failed", type(error).__name__, str(error), "", tuple(getattr(error, "faults", ())), ""
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        return "failed", "disk-full", "The disk is full. Delete captures or jobs, then restart the job.", "", (), ""
+    if isinstance(error, MemoryError):
+        return "failed", "out-of-memory", "The work needed more memory than there is.", "", (), ""
+    trace = "".join(traceback.format_exception(error))
+    return "failed", "bug", f"{type(error).__name__}: {error}"[:500], "", (), trace
+
+
+def serve(connection: Connection) -> None:
+    """The child's main loop: the first thread works (a GL context wants that), a second one listens."""
+    requests: queue.Queue[bytes] = queue.Queue()
+    stop = threading.Event()
+
+    def listen() -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                message = connection.recv_bytes()
+                if message == STOP:
+                    stop.set()
+                else:
+                    requests.put(message)
+        os._exit(0)  # the parent is gone: nobody waits for the result
+
+    threading.Thread(target=listen, daemon=True).start()
+    bench = Bench()
+    while True:
+        request = requests.get()
+        stop.clear()
+        try:
+            work, arguments, named = pickle.loads(request)
+            answer = ("done", work(bench, _reporter(connection, stop), *arguments, **named))
+        except BaseException as error:
+            answer = _described(error)
+        connection.send(answer)
+
+
+def _reporter(connection: Connection, stop: threading.Event) -> Report:
+    last: tuple[str, float] = ("", 0.0)
+
+    def report(stage: str, fraction: float) -> None:
+        nonlocal last
+        if stop.is_set():
+            raise Cancelled
+        now = time.monotonic()
+        if stage != last[0] or now - last[1] > REPORT_EVERY_S:
+            last = (stage, now)
+            connection.send(("report", stage, float(fraction)))
+
+    return report
+
+
+def function_at(address: str) -> Callable[..., Any]:
+    """The function that "module:name" names. A module that begins with a dot lies in the package ``server``, whatever
+    that is called where the code runs."""
+    module, _, name = address.partition(":")
+    return getattr(importlib.import_module(module, SERVER), name)
+
+
+if __name__ == "__main__":
+    os.nice(int(sys.argv[2]))
+    serve(Connection(int(sys.argv[1])))

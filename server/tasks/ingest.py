@@ -1,0 +1,170 @@
+"""What happens to an uploaded archive or a capture folder before it is accepted; runs in a child process.
+
+Camera by camera, so that a rig of 64 large cameras is checked in the memory of one.
+"""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
+from rig.capture import Capture
+from rig.errors import InputError
+from rig.formats.archive import ArchiveLimits, extract_archive
+from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.formats.capture_folder import IMAGE_SUFFIXES, capture_root, read_shot, size_fault, stray_faults
+from rig.formats.features_json import features_from_bytes
+from rig.formats.images import IMAGE_FORMATS
+from rig.plausibility import rig_faults
+from server.tasks.child import Bench, Report
+
+
+def ingest_archive(
+    bench: Bench, report: Report, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
+) -> dict[str, Any]:
+    """Unpacks ``archive``, checks the capture in it, and leaves ``folder`` with exactly its files.
+
+    Returns what the capture's record says of the content. Raises InputError naming every fault.
+    """
+    target = Path(folder)
+    unpacked = target.with_name(target.name + ".unpacked")
+    extract_archive(Path(archive), unpacked, limits)
+    root = capture_root(unpacked)
+    described = check_capture(root, image_pixels, report)
+    for name in described["inputs"]:
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).rename(target / name)
+    shutil.rmtree(unpacked)
+    return described
+
+
+def ingest_folder(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> dict[str, Any]:
+    """The same for a folder of our own making (a shot of the rig)."""
+    return check_capture(Path(folder), image_pixels, report)
+
+
+def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> dict[str, Any]:
+    """A shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
+    root = Path(folder)
+    for entry in root.iterdir():
+        if entry.name != "images":
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    files = sorted((root / "images").iterdir())
+    sizes = {}
+    for path in files:
+        with Image.open(path, formats=IMAGE_FORMATS) as header:
+            sizes[path.stem] = header.size
+    huge = [f"{name} is {w} x {h} pixels" for name, (w, h) in sizes.items() if w * h > image_pixels]
+    if huge:
+        raise InputError("capture", [f"{fault}; at most {image_pixels:,} are accepted" for fault in huge])
+    return {
+        "board": True,
+        "cameras": [{"name": name, "width": width, "height": height} for name, (width, height) in sizes.items()],
+        "front": files[0].stem,
+        "inputs": {path.relative_to(root).as_posix(): _sha256(path) for path in files},
+        "bytes": sum(path.stat().st_size for path in files),
+    }
+
+
+def check_capture(root: Path, image_pixels: int, report: Report) -> dict[str, Any]:
+    rig_file = find_rig_file(root)
+    if rig_file is None:
+        raise InputError("capture", ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+    try:
+        rig = read_rig_file(rig_file)
+    except InputError as error:
+        raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+    faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)] + stray_faults(root, rig)
+    digests: dict[str, str] = {}
+    empty: list[str] = []
+    for number, camera in enumerate(rig):
+        report("check", number / len(rig))
+        of_camera = _size_faults(root, camera, image_pixels)
+        if not of_camera:
+            shot = read_shot(root, rig.subset([camera.name]), of_camera)
+            digests |= shot.digests
+            empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
+        faults += [fault for fault in of_camera if not fault.startswith("features.json")]  # judged below, for all
+    if (root / "features.json").is_file():
+        features = features_from_bytes((root / "features.json").read_bytes(), rig, faults)
+        faults += feature_faults(features, rig)
+    if len(empty) == len(rig):
+        faults.append("every picture is its own clean plate: nobody was there, or the plates were copied; shoot again")
+    if faults:
+        raise InputError("capture", faults)
+    for path in _rig_files(rig_file):
+        digests[path.relative_to(root).as_posix()] = _sha256(path)
+    return {
+        "cameras": [{"name": c.name, "width": c.intrinsics.width, "height": c.intrinsics.height} for c in rig],
+        "front": rig.front_camera(),
+        "inputs": dict(sorted(digests.items())),
+        "bytes": sum((root / name).stat().st_size for name in digests),
+    }
+
+
+def _shows_its_plate(shot: Capture, name: str) -> bool:
+    """Whether a picture is, pixel for pixel, one of its camera's clean plates: noise never repeats."""
+    image = shot.images.get(name)
+    plates = shot.backgrounds.get(name, ())
+    return image is not None and any(np.array_equal(image, plate) for plate in plates)
+
+
+def check_features(bench: Bench, report: Report, *, folder: str, document: dict[str, Any]) -> str:
+    """Judges feature points for the capture in ``folder`` and stores them; returns the file's sha256."""
+    rig_file = find_rig_file(Path(folder))
+    assert rig_file is not None  # it was accepted with one
+    faults: list[str] = []
+    data = json.dumps(document, indent=1).encode()
+    # Points come one after the other: whether they suffice is asked when the job starts.
+    faults += unknown_landmarks(features_from_bytes(data, read_rig_file(rig_file), faults))
+    if faults:
+        raise InputError("features.json", faults)
+    write_atomically(Path(folder) / "features.json", data)
+    return _sha256(Path(folder) / "features.json")
+
+
+def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
+    """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
+    faults = []
+    wanted = (camera.intrinsics.width, camera.intrinsics.height)
+    for path in _images_of(root, camera.name):
+        name = path.relative_to(root).as_posix()
+        try:
+            with Image.open(path, formats=IMAGE_FORMATS) as header:
+                width, height = header.size
+        except Image.DecompressionBombError:
+            faults.append(f"{name} claims to be huge; at most {image_pixels:,} pixels are accepted")
+            continue
+        except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
+            faults.append(f"{name} is damaged or no PNG, JPEG, TIFF or WebP image")
+            continue
+        if width * height > image_pixels:
+            faults.append(f"{name} is {width} x {height} pixels; at most {image_pixels:,} pixels are accepted")
+        elif (width, height) != wanted:
+            faults.append(size_fault(name, (width, height), wanted))
+    return faults
+
+
+def _images_of(root: Path, camera: str) -> list[Path]:
+    folders = [root / "images", root / "masks", root / "background", root / "background" / camera]
+    files = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
+    files = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    return [path for path in files if path.stem == camera or path.parent == folders[3]]
+
+
+def _rig_files(rig_file: Path) -> list[Path]:
+    """A COLMAP model is several files of one suffix; the other formats are one file."""
+    if rig_file.suffix in (".bin", ".txt"):
+        return sorted(p for p in rig_file.parent.iterdir() if p.is_file() and p.suffix == rig_file.suffix)
+    return [rig_file]
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,36 @@
+"""What a job runs in a worker's child process: files in, ``reconstruct()``, files out."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from server.tasks.child import Bench, Report
+
+
+def reconstruct_capture(
+    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Reconstructs the capture folder ``capture`` into the result folder ``result``; returns figures for the job.
+    ``cache`` is where silhouettes of this capture are kept.
+
+    Raises InputError for an input that cannot be used, any EigenheadError that the pipeline raises, OSError for a full
+    disk, Cancelled out of ``report``.
+    """
+    from pipeline.eigenheads.model import load_model
+    from pipeline.reconstruct import reconstruct
+    from pipeline.results.write import write_result
+    from pipeline.settings import settings_from_document
+    from rig.formats.capture_folder import read_capture
+    from rig.render.renderer import Renderer
+    from server.storage.silhouette_cache import segment_once
+
+    report("read", 0.0)
+    name = model or "default"
+    head_model = bench.keep(f"model {name}", lambda: load_model(name))
+    renderer = bench.keep("renderer", Renderer.create)
+    shot, rig = read_capture(Path(capture))
+    chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
+    done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=report, segment=once)
+    report("write", 0.0)
+    write_result(Path(result), done, shot)
+    return {"seconds": sum(done.seconds.values()), "warnings": [w.code for w in done.warnings]}

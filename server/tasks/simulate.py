@@ -1,0 +1,62 @@
+"""Taking a shot with the simulated studio; runs in a child process, which keeps the renderer and the model."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from server.tasks.child import Bench, Report
+
+if TYPE_CHECKING:
+    from rig.studio.scene.simulate import SimulatedCapture
+
+
+def simulated(bench: Bench, report: Report, *, folder: str, seed: int | None) -> dict[str, Any]:
+    """A capture in ``folder/files``, its truth in ``folder/truth``; returns the shot's certificate.
+
+    Without a seed the subject is another one each time. The operator's clicks are left out: they are made later.
+    """
+    from pipeline.eigenheads.model import load_model
+    from rig.formats.capture_folder import write_capture
+    from rig.render.renderer import Renderer
+    from rig.studio.devices.folder import write_truth
+    from rig.studio.scene.layout import default_layout
+    from rig.studio.scene.simulate import simulate
+    from rig.studio.sensor.preset import PRESET
+    from server.tasks.subjects import drawn_subject
+
+    model = bench.keep("model", load_model)
+    renderer = bench.keep("renderer", Renderer.create)
+    rng = np.random.default_rng(seed)
+    taken = simulate(drawn_subject(model, rng), default_layout(), PRESET, rng, renderer=renderer)
+    write_capture(Path(folder) / "files", replace(taken.capture, features={}), taken.rig)
+    write_truth(Path(folder) / "truth", taken, seed=seed)
+    return describe(taken)
+
+
+def describe(taken: "SimulatedCapture") -> dict[str, Any]:
+    """The certificate of a simulated shot: every picture is of one moment."""
+    cameras = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
+    faults = [f.kind if f.camera is None else f"{f.kind} in {f.camera}" for f in taken.faults]
+    return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
+
+
+def look(bench: Bench, report: Report, *, cameras: list[str]) -> dict[str, np.ndarray]:
+    """What cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
+    from pipeline.eigenheads.model import load_model
+    from rig.render.renderer import Renderer
+    from rig.studio.scene.layout import default_layout
+    from rig.studio.scene.simulate import build_scene, view_light
+    from rig.studio.sensor.preset import PRESET
+    from rig.studio.sensor.sensor import expose
+    from server.tasks.subjects import drawn_subject
+
+    def scene() -> Any:
+        rng = np.random.default_rng(1)
+        model = bench.keep("model", load_model)
+        renderer = bench.keep("renderer", Renderer.create)
+        return build_scene(drawn_subject(model, rng), default_layout(), PRESET, rng, renderer=renderer)
+
+    views, noise = bench.keep("scene", scene).views, np.random.default_rng()
+    return {name: expose(view_light(views[name]), views[name].sensor, noise) for name in cameras}

@@ -1,0 +1,165 @@
+"""Receiving multipart bodies straight to the data folder.
+
+The body is parsed here, not by the framework, so that a key and free space are looked at before the first byte, no
+file is held in memory or in a temporary folder elsewhere, and every write happens in a thread.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from server.services.captures import About
+from server.services.service import Service
+from server.services.threads import Threads
+from server.services.uploads import too_large
+from server.settings import ServiceSettings
+from server.storage.store import Store
+from server.wire.problems import Problem
+
+BLOCK_BYTES = 1 << 20
+FIELD_BYTES = 1 << 16  # of a form field that is no file
+ARCHIVE = ".zip, .tar or .tar.gz"
+
+
+def described_form(file: str, fields: Iterable[str], **described: str) -> dict[str, Any]:
+    """OpenAPI's word for a multipart body of one file, text ``fields``, and further ones with a description."""
+    texts: dict[str, dict[str, str]] = {name: {"type": "string"} for name in fields}
+    texts |= {name: {"type": "string", "description": text} for name, text in described.items()}
+    properties = {"file": {"type": "string", "format": "binary", "description": file}} | texts
+    schema = {"type": "object", "required": ["file"], "properties": properties}
+    return {"requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}}
+
+
+def check_length(request: Request, store: Store, settings: ServiceSettings) -> None:
+    """Judges the announced length: 413 if it is too much, 507 if the disk has no room for it twice (packed,
+    unpacked)."""
+    text = request.headers.get("content-length")
+    length = int(text) if text and text.isascii() and text.isdigit() else 0
+    if length > settings.body_bytes:
+        raise too_large(settings)
+    store.reserve(2 * length, settings.free_bytes)
+
+
+async def receive_multipart(
+    request: Request, folder: Path, settings: ServiceSettings, threads: Threads
+) -> tuple[Path, dict[str, str]]:
+    """Writes the part ``file`` into ``folder``; returns its path and the other fields.
+
+    Raises problems: 415 for another content type, 400 for a body that breaks off, 422 without a ``file``, 413.
+    """
+    kind, options = parse_options_header(request.headers.get("content-type"))
+    boundary = options.get(b"boundary")
+    if kind != b"multipart/form-data" or not boundary:
+        raise Problem(415, "unsupported-media-type", "Send multipart/form-data with the archive as the part 'file'.")
+    form = _Form()
+    try:
+        parser = MultipartParser(boundary, form.callbacks())
+    except FormParserError as error:
+        raise Problem(400, "malformed-body", f"The multipart boundary is no good ({error}).") from error
+    path = folder / "upload"
+    received = 0
+    target = await threads.disk(path.open, "xb")
+    try:
+        async for chunk in request.stream():
+            received += len(chunk)
+            if received > settings.body_bytes:
+                raise too_large(settings)
+            try:
+                parser.write(chunk)
+            except FormParserError as error:
+                raise Problem(400, "malformed-body", f"The body is no multipart/form-data ({error}).") from error
+            if len(form.pending) >= BLOCK_BYTES:
+                await threads.disk(target.write, form.take())
+        await threads.disk(target.write, form.take())
+    finally:
+        await threads.disk(target.close)
+    if not form.ended:
+        raise Problem(400, "malformed-body", "The multipart body breaks off before its end; send it again.")
+    if not form.files:
+        raise Problem(422, "file-missing", "The form has no part 'file' that holds the archive.", ["file: missing"])
+    return path, form.fields
+
+
+class _Form:
+    """What the parser's callbacks collect: the bytes of ``file`` that are not on the disk yet, and the fields."""
+
+    def __init__(self) -> None:
+        self.pending = bytearray()
+        self.fields: dict[str, str] = {}
+        self.files = 0
+        self.ended = False
+        self._header, self._value = b"", b""
+        self._name, self._data = "", bytearray()
+
+    def callbacks(self) -> Any:
+        return {
+            "on_part_begin": self._part_begin,
+            "on_header_field": lambda data, start, end: self._add_header(data[start:end]),
+            "on_header_value": lambda data, start, end: self._add_value(data[start:end]),
+            "on_header_end": self._header_end,
+            "on_part_data": self._part_data,
+            "on_part_end": self._part_end,
+            "on_end": self._end,
+        }
+
+    def take(self) -> bytes:
+        data, self.pending = bytes(self.pending), bytearray()
+        return data
+
+    def _part_begin(self) -> None:
+        self._name, self._data = "", bytearray()
+
+    def _add_header(self, data: bytes) -> None:
+        self._header += data
+
+    def _add_value(self, data: bytes) -> None:
+        self._value += data
+
+    def _header_end(self) -> None:
+        if self._header.lower() == b"content-disposition":
+            self._name = parse_options_header(self._value)[1].get(b"name", b"").decode("utf-8", "replace")
+            self.files += self._name == "file"
+        self._header, self._value = b"", b""
+
+    def _part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._name == "file" and self.files == 1:
+            self.pending += data[start:end]
+        elif self._name == "file":
+            raise Problem(
+                422, "file-repeated", "The form has several parts 'file'; send one archive.", ["file: repeated"]
+            )
+        elif len(self._data) + end - start > FIELD_BYTES:
+            raise Problem(
+                413, "field-too-large", f"The form field {self._name!r:.80} is longer than {FIELD_BYTES:,} bytes."
+            )
+        else:
+            self._data += data[start:end]
+
+    def _part_end(self) -> None:
+        if self._name != "file":
+            self.fields[self._name] = self._data.decode("utf-8", "replace")
+
+    def _end(self) -> None:
+        self.ended = True
+
+
+async def receive_capture(service: Service, request: Request) -> tuple[dict[str, Any], dict[str, str]]:
+    """Receives a multipart archive and makes a capture of it; returns its record and the form's fields."""
+    await service.threads.disk(check_length, request, service.store, service.settings)
+    with service.store.incoming() as folder:
+        archive, fields = await receive_multipart(request, folder, service.settings, service.threads)
+        record = await service.threads.check(service.captures.accept, archive, folder, About.of(fields))
+    return record, fields
+
+
+async def receive_board_pictures(service: Service, request: Request) -> dict[str, Any]:
+    """Receives a multipart archive of IMAGES/ and board.toml and queues a calibration; returns its document."""
+    await service.threads.disk(check_length, request, service.store, service.settings)
+    with service.store.incoming() as folder:
+        archive, fields = await receive_multipart(request, folder, service.settings, service.threads)
+        label = (fields.get("label") or "")[:500]
+        return await service.threads.check(service.accept_board_pictures, archive, folder, label)

@@ -1,0 +1,145 @@
+"""Errors on the wire: RFC 9457 ``application/problem+json`` with a stable ``type`` and every fault in ``errors``."""
+
+import errno
+from collections.abc import Iterable, Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from fastapi.routing import APIRoute
+from sqlalchemy.exc import DBAPIError
+from starlette.exceptions import HTTPException
+
+from rig.errors import EigenheadError, InputError
+from server.errors import (
+    URN,
+    Conflict,
+    DiskFull,
+    Forbidden,
+    Gone,
+    NotFound,
+    Refused,
+    TooLarge,
+    TooMany,
+    Unavailable,
+    Unknown,
+    Unusable,
+    unusable_input,
+)
+
+MEDIA_TYPE = "application/problem+json"
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
+log = structlog.get_logger()
+
+PROBLEM_SCHEMA = {
+    "type": "object",
+    "required": ["type", "title", "status", "detail", "errors"],
+    "properties": {
+        "type": {"type": "string", "description": f"stable name, {URN}<kind>"},
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "detail": {"type": "string", "description": "what is wrong and what to do"},
+        "errors": {"type": "array", "items": {"type": "string"}, "description": "every fault found"},
+    },
+}
+
+
+STATUS_OF: dict[type[Refused], int] = {
+    Unknown: 401,
+    Forbidden: 403,
+    NotFound: 404,
+    Conflict: 409,
+    Gone: 410,
+    TooLarge: 413,
+    Unusable: 422,
+    TooMany: 429,
+    Unavailable: 503,
+    DiskFull: 507,
+}
+
+
+class Problem(EigenheadError):
+    """What HTTP itself refuses, or a refusal of the service with its status."""
+
+    def __init__(
+        self,
+        status: int,
+        kind: str,
+        detail: str,
+        errors: Iterable[str] = (),
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(detail)
+        self.status, self.kind, self.detail = status, kind, detail
+        self.errors, self.headers = list(errors), dict(headers or {})
+
+    def document(self) -> dict[str, Any]:
+        title = self.kind.replace("-", " ").capitalize()
+        return {
+            "type": URN + self.kind,
+            "title": title,
+            "status": self.status,
+            "detail": self.detail,
+            "errors": self.errors,
+        }
+
+    def response(self) -> JSONResponse:
+        return JSONResponse(self.document(), self.status, headers=self.headers, media_type=MEDIA_TYPE)
+
+
+def problem_from(error: Exception) -> Problem:
+    """The problem that an error is; what nobody foresaw is a 500 that says so without its inside."""
+    if isinstance(error, Problem):
+        return error
+    if isinstance(error, InputError):
+        error = unusable_input(error)
+    if isinstance(error, Refused):
+        again = {} if error.retry_after_s is None else {"Retry-After": str(error.retry_after_s)}
+        return Problem(STATUS_OF[type(error)], error.kind, error.detail, error.errors, again)
+    if isinstance(error, RequestValidationError):
+        faults = [f"{'.'.join(str(part) for part in e['loc'])}: {e['msg']}" for e in error.errors()]
+        return Problem(
+            422, "invalid-request", "The request does not fit the call; see 'errors' and /openapi.json.", faults
+        )
+    if isinstance(error, HTTPException):
+        phrase = HTTPStatus(error.status_code).phrase
+        kind = "".join(c if c.isalnum() else "-" for c in phrase.lower())
+        detail = error.detail if error.detail != phrase else f"{phrase}; /openapi.json lists what there is."
+        return Problem(error.status_code, kind, str(detail), headers=error.headers)
+    if (isinstance(error, OSError) and error.errno in DISK_FULL) or "database or disk is full" in str(error):
+        return problem_from(DiskFull())
+    if isinstance(error, DBAPIError):
+        log.error("database failed", error=str(error)[:500])
+        return Problem(503, "database-unavailable", "The job database does not answer; try again in a moment.")
+    log.error("unforeseen error", exc_info=error)
+    return Problem(500, "internal-error", "The service failed in a way that nobody foresaw; its log says more.")
+
+
+def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
+    """Makes every error of ``app`` a problem document; ``routes`` are all that it has."""
+
+    async def answer(request: Request, error: Exception) -> JSONResponse:
+        problem = problem_from(error)
+        if problem.status == 405:
+            problem.headers["Allow"] = ", ".join(_methods_of(routes, request.url.path))
+        return problem.response()
+
+    for kind in (Exception, EigenheadError, HTTPException, RequestValidationError, OSError, DBAPIError):
+        app.add_exception_handler(kind, answer)
+
+
+def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
+    """Every method of the path; the router itself names those of the first route that fits."""
+    fitting = [route for route in routes if route.path_regex.match(path)]
+    return sorted({method for route in fitting if route.path == fitting[0].path for method in route.methods or ()})
+
+
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The ``responses`` of a route that may refuse with these statuses."""
+    body = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    every = {401, 403, 422, 429, 500, 503, *statuses}
+    return {status: {"description": HTTPStatus(status).phrase, "content": body} for status in sorted(every)}

@@ -1,0 +1,102 @@
+"""Sending a file of known content: ETag, If-None-Match, one byte range."""
+
+import hashlib
+import io
+import mimetypes
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.responses import FileResponse, StreamingResponse
+
+from server.storage.store import StoredFile
+from server.wire.problems import Problem
+
+TYPES = {
+    ".ply": "application/octet-stream",
+    ".glb": "model/gltf-binary",
+    ".obj": "model/obj",
+    ".mtl": "model/mtl",
+    ".stl": "model/stl",
+    ".usdz": "model/vnd.usdz+zip",
+}
+BLOCK_BYTES = 1 << 20
+RANGE = re.compile(r"^bytes=(\d{1,18})?-(\d{1,18})?$")
+
+
+def send_file(request: Request, file: StoredFile) -> Response:
+    """200, 206, 304 or a 416 problem. What is no single byte range is ignored, as RFC 9110 allows."""
+    path, etag = file.path, f'"{file.sha256}"'
+    if not path.is_file():
+        raise Problem(404, "not-found", "The file is not there any more.")
+    headers = {"ETag": etag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
+    if (
+        etag in re.split(r"\s*,\s*", request.headers.get("if-none-match", ""))
+        or request.headers.get("if-none-match") == "*"
+    ):
+        return Response(status_code=304, headers=headers)
+    _check_range(request, path.stat().st_size)
+    return FileResponse(path, headers=headers, media_type=media_type(path.name))
+
+
+def send_archive(request: Request, folder: Path, files: Mapping[str, Mapping[str, Any]]) -> Response:
+    """The named files below ``folder`` as a .zip, stored and without times: the same files are the same bytes."""
+    digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
+    headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
+    headers["Content-Disposition"] = 'attachment; filename="result.zip"'
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    if request.method == "HEAD":
+        return Response(headers=headers, media_type="application/zip")
+    return StreamingResponse(_zipped(folder, list(files)), headers=headers, media_type="application/zip")
+
+
+def _zipped(folder: Path, names: list[str]) -> Iterator[bytes]:
+    sent = _Sent()
+    with zipfile.ZipFile(sent, "w", zipfile.ZIP_STORED) as archive:
+        for name in names:
+            with (folder / name).open("rb") as source, archive.open(zipfile.ZipInfo(name), "w") as target:
+                while block := source.read(BLOCK_BYTES):
+                    target.write(block)
+                    yield sent.take()
+    yield sent.take()
+
+
+class _Sent(io.RawIOBase):
+    """What was written and not taken yet; a stream that cannot seek."""
+
+    def __init__(self) -> None:
+        self._pending = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any, /) -> int:
+        self._pending += data
+        return len(data)
+
+    def take(self) -> bytes:
+        data, self._pending = bytes(self._pending), bytearray()
+        return data
+
+
+def media_type(name: str) -> str:
+    suffix = Path(name).suffix
+    return TYPES.get(suffix) or mimetypes.guess_type(name)[0] or "application/octet-stream"
+
+
+def _check_range(request: Request, size: int) -> None:
+    text = request.headers.get("range")
+    if text is None:
+        return
+    match = RANGE.match(text)
+    first, last = match.groups() if match else (None, None)
+    if (first is None and last is None) or (first and last and int(first) > int(last)):
+        request.scope["headers"] = [(name, value) for name, value in request.scope["headers"] if name != b"range"]
+    elif (first is not None and int(first) >= size) or (first is None and int(last or 0) == 0):
+        raise Problem(
+            416, "range-not-satisfiable", f"The file has {size} bytes.", headers={"Content-Range": f"bytes */{size}"}
+        )

@@ -1,0 +1,351 @@
+"""The worker: takes jobs from a queue, runs each in a child process, and takes over the jobs of workers that died.
+
+A job is three durable steps around one ``reconstruct()``: *ingest* (the capture is there, the disk has room), *fit*
+(the child writes a complete result folder under a name of this attempt), *publish* (rename). A worker that is killed in
+any of them leaves a job that another one starts again at the step that was cut off; the bytes of a result do not
+depend on who made it, so that it does not matter if two did.
+
+Every worker writes a heartbeat row. Whoever finds one that is stopped, whose process is gone (same machine), or that is
+silent for ``silent_s``, puts its jobs back into their queue; the engine changes only rows that still belong to the dead
+worker, so that two that try do no harm.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import secrets
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+import structlog
+from dbos import DBOS
+from dbos import error as dbos_error
+from sqlalchemy.exc import SQLAlchemyError
+
+from rig.errors import Cancelled, InputError
+from server.errors import Refused, unusable_input
+from server.services import calibrations
+from server.services.jobs import DELIVERY, WORKFLOW, JobFailed, engine_config
+from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
+from server.settings import ServiceSettings
+from server.storage.database import now_sql, open_database, workers
+from server.storage.events import EventLog
+from server.storage.store import Store, move_durably
+from server.tasks.calibrate import calibrate_folder
+from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
+from server.tasks.progress import Course, Expectation, ProgressMeter
+from server.worker.heartbeat import dead_workers, process_identity
+
+FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
+
+log = structlog.get_logger()
+
+
+class Worker:
+    """One worker of one process (the job engine is a singleton)."""
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self.settings = settings
+        self.store = Store(settings.data)
+        self.engine = open_database(settings)
+        self.events = EventLog(self.engine)
+        self.id = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"[:64]
+        self._children = Children(settings.concurrency, niceness=5)  # a busy machine still answers requests
+        self._work = function_at(settings.work)
+        self._stop = threading.Event()
+        self._webhooks = Webhooks(self.engine)
+        self._expectation = Expectation()
+        self._states = _StateWatch(settings.poll_s)
+
+    def start(self) -> None:
+        DBOS(config=engine_config(self.settings, self.id))
+        self._register()
+        DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE])
+        self._beat()  # before the first job: a worker without a heartbeat row would have nobody to notice its death
+        DBOS.launch()
+        limit = self.settings.concurrency
+        DBOS.register_queue(
+            self.settings.queue,
+            worker_concurrency=limit,
+            polling_interval_sec=self.settings.poll_s,
+            on_conflict="always_update",
+        )
+        DBOS.register_queue(WEBHOOKS_QUEUE, worker_concurrency=8, on_conflict="always_update")
+        threading.Thread(target=self._keep_alive, name="heartbeat", daemon=True).start()
+        log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
+
+    def run_until_stopped(self) -> None:
+        """Blocks until ``stop`` or a signal; a running job is left for the next worker."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: self._stop.set())
+        while not self._stop.wait(0.5):
+            pass
+        with suppress(SQLAlchemyError), self.engine.begin() as connection:
+            connection.execute(sa.update(workers).where(workers.c.id == self.id).values(stopped=now_sql(connection)))
+        log.info("worker stopped", worker=self.id)
+        os._exit(0)  # an orderly end of the engine would record a job that is cut off here as failed
+
+    def stop(self) -> None:
+        self._stop.set()
+
+    def _register(self) -> None:
+        worker = self
+
+        @DBOS.step(name="ingest")
+        def ingest(job_id: str, request: dict[str, Any]) -> None:
+            worker.ingest(job_id, request)
+
+        @DBOS.step(name="fit")
+        def fit(job_id: str, request: dict[str, Any]) -> str:
+            return worker.fit(job_id, request)
+
+        @DBOS.step(name="publish")
+        def publish(job_id: str, attempt: str) -> dict[str, Any]:
+            return worker.publish(job_id, attempt)
+
+        @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=self.settings.attempts)
+        def reconstruct_job(request: dict[str, Any]) -> dict[str, Any]:
+            job_id = DBOS.workflow_id
+            assert job_id is not None
+            with structlog.contextvars.bound_contextvars(job=job_id):
+                try:
+                    ingest(job_id, request)
+                    files = publish(job_id, fit(job_id, request))
+                except JobFailed as error:
+                    log.warning("job failed", kind=error.kind, detail=error.detail)
+                    worker.settle(job_id, "failed")
+                    raise
+                except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
+                    shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
+                    log.info("job cancelled")
+                    raise
+                worker.settle(job_id, "succeeded")
+                return files
+
+        @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
+        def post(message: dict[str, Any]) -> int:
+            return worker._webhooks.post(message)
+
+        @DBOS.workflow(name=DELIVERY)
+        def deliver(message: dict[str, Any]) -> int:
+            return post(message)
+
+        @DBOS.step(name="calibrate")
+        def calibrate(identity: str) -> dict[str, Any]:
+            return worker.calibrate(identity)
+
+        @DBOS.workflow(name=calibrations.WORKFLOW, max_recovery_attempts=self.settings.attempts)
+        def calibrate_rig(identity: str) -> dict[str, Any]:
+            return calibrate(identity)
+
+        del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
+
+    def ingest(self, job_id: str, request: dict[str, Any]) -> None:
+        """Fails early and clearly on what would make the fit fail late."""
+        self.events.append(job_id, {"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None})
+        log.info("job started", capture=request["capture_id"])
+        try:
+            record = self.store.capture(request["capture_id"])
+            self.store.reserve(record["bytes"], self.settings.free_bytes)
+        except Refused as error:
+            raise JobFailed(error.kind, error.detail) from error
+
+    def fit(self, job_id: str, request: dict[str, Any]) -> str:
+        """Runs the work in a child and returns the name of the attempt's folder."""
+        name = f"attempt-{secrets.token_hex(6)}"
+        folder = self.store.folder("jobs", job_id) / name
+        arguments = {
+            "capture": str(self.store.folder("captures", request["capture_id"]) / "files"),
+            "result": str(folder),
+            "cache": str(self.store.cache_of(request["capture_id"])),
+            "model": request.get("model"),
+            "settings": request.get("settings") or {},
+        }
+        try:
+            folder.mkdir(parents=True)
+            method = arguments["settings"].get("method", "contour")
+            course = Course(self._expectation.of(method))
+            meter = ProgressMeter(self.events, job_id, course)
+            with self._children.one() as child:
+                cancelled = lambda: not self._states.runs(job_id)  # noqa: E731
+                child.remote(self._work, report=meter.report, cancelled=cancelled)(**arguments)
+            self._expectation.learn(method, course.finish())
+        except BaseException as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise self._failure(error) from error
+        return name
+
+    def calibrate(self, identity: str) -> dict[str, Any]:
+        """One calibration, written under a temporary name and renamed."""
+        folder = self.store.folder("calibrations", identity)
+        in_use = self.settings.data / "rig" / "cameras.json"
+        attempt = folder / f"attempt-{secrets.token_hex(6)}"
+        arguments = {
+            "folder": str(folder),
+            "result": str(attempt),
+            "previous": str(in_use) if in_use.is_file() else None,
+            "cache": str(self.settings.data / "cache" / "boards"),
+            "front": None,
+        }
+        try:
+            with self._children.one() as child:
+                result = child.remote(calibrate_folder)(**arguments)
+            shutil.rmtree(folder / "result", ignore_errors=True)
+            move_durably(attempt, folder / "result")
+        except BaseException as error:
+            shutil.rmtree(attempt, ignore_errors=True)
+            raise self._failure(error) from error
+        return result
+
+    def publish(self, job_id: str, attempt: str) -> dict[str, Any]:
+        """Gives the result its name; returns size and sha256 of every file. Another worker may have done so already,
+        with the same bytes."""
+        folder = self.store.folder("jobs", job_id)
+        target = folder / "result"
+        if not target.is_dir():
+            try:
+                move_durably(folder / attempt, target)
+            except OSError as error:
+                if not target.is_dir():
+                    raise self._failure(error) from error
+        for old in folder.glob("attempt-*"):
+            shutil.rmtree(old, ignore_errors=True)
+        files = described(target)
+        log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
+        return files
+
+    def settle(self, job_id: str, state: str) -> None:
+        """Tells the world how the job ended: the last event of its stream, with what the operator must see to, and the
+        webhooks."""
+        moved = moved_cameras(self.store.folder("jobs", job_id) / "result" / "report.json")
+        if moved:
+            log.warning("camera moved", details=moved)
+        with suppress(SQLAlchemyError):
+            self.events.append(job_id, {"state": state} | ({"camera_moved": moved} if moved else {}))
+        self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options)
+
+    def _failure(self, error: BaseException) -> BaseException:
+        if isinstance(error, Cancelled):
+            return error
+        if isinstance(error, InputError):
+            problem = unusable_input(error)
+            return JobFailed(problem.kind, problem.detail, error.faults)
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
+            return JobFailed("disk-full", "The disk is full. Delete captures or jobs, then restart the job.")
+        if isinstance(error, WorkFailed):
+            if error.trace:
+                log.error("work raised", trace=error.trace)
+            kind = "".join(f"-{c.lower()}" if c.isupper() else c for c in error.kind).lstrip("-")
+            return JobFailed(
+                {"bug": "internal-error", "crash": "work-crashed"}.get(kind, kind), error.message, error.faults
+            )
+        return error
+
+    def _keep_alive(self) -> None:
+        """Heartbeat and reaper; its own thread, so that no job can hold it up."""
+        while not self._stop.wait(self.settings.heartbeat_s):
+            try:
+                self._beat()
+                self._reap()
+            except Exception as error:  # the database may be away for a while; the worker outlasts it
+                log.error("heartbeat failed", error=str(error)[:300])
+
+    def _beat(self) -> None:
+        machine, host, pid, started = process_identity()
+        with self.engine.begin() as connection:
+            seen = {"seen": now_sql(connection)}
+            changed = connection.execute(sa.update(workers).where(workers.c.id == self.id).values(**seen, stopped=None))
+            if not changed.rowcount:
+                row = {"id": self.id, "machine": machine, "host": host, "pid": pid, "pid_started": started}
+                row |= {"queue": self.settings.queue, "concurrency": self.settings.concurrency}
+                row |= {"version": version("eigenhead"), "started": now_sql(connection)}
+                connection.execute(sa.insert(workers).values(**row, **seen))
+
+    def _reap(self) -> None:
+        """Puts the jobs of dead workers back. Idempotent, and safe for any number of reapers at once."""
+        dead = dead_workers(self.engine, self.settings.silent_s, own=self.id)
+        running = self._running()
+        known = self._known_workers()  # asked second: a worker that begins in between is no stray
+        strays = {row.executor_id for row in running if row.executor_id not in known}
+        gone = [*dead, *sorted(strays)]
+        if gone:
+            # Not the public resume_workflow: that takes a job from whoever has it by now, revives a cancelled one, and
+            # forgets how many workers the job took down with it.
+            handles = DBOS._recover_pending_workflows(gone)
+            for handle in handles:
+                log.warning("job taken over", job=handle.get_workflow_id())
+        with self.engine.begin() as connection:
+            old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
+            connection.execute(sa.delete(workers).where(old))
+
+    def _known_workers(self) -> set[str]:
+        with self.engine.connect() as connection:
+            return set(connection.scalars(sa.select(workers.c.id)))
+
+    def _running(self) -> list[Any]:
+        names = [WORKFLOW, DELIVERY, calibrations.WORKFLOW]
+        return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
+
+
+def moved_cameras(report: Path) -> list[str]:
+    """What a result's report.json says of cameras that have moved since their calibration."""
+    try:
+        warnings = json.loads(report.read_bytes())["warnings"]
+    except (OSError, ValueError, KeyError):  # no result, or another kind of work
+        return []
+    return [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
+
+
+class _StateWatch:
+    """Whether a job is still to run, asked of the database a few times a second."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s = every_s
+        self._asked: dict[str, float] = {}
+
+    def runs(self, job_id: str) -> bool:
+        now = time.monotonic()
+        if now - self._asked.get(job_id, 0.0) < self._every_s:
+            return True
+        self._asked = {job_id: now} | {k: t for k, t in self._asked.items() if now - t < 60.0 and k != job_id}
+        try:
+            row = DBOS.get_workflow_status(job_id)
+        except Exception as error:  # the database is away: that is no reason to stop a fit
+            log.warning("state of the job unknown", error=str(error)[:200])
+            return True
+        return row is not None and row.status in ("PENDING", "ENQUEUED")
+
+
+def described(folder: Path) -> dict[str, Any]:
+    """Size and sha256 of every file below ``folder``, by relative name."""
+    files = {}
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": digest}
+    return files
+
+
+def run_worker(settings: ServiceSettings, *, until_eof: bool = False) -> None:
+    """The worker process. With ``until_eof`` it stops when its standard input ends: when its parent does."""
+    worker = Worker(settings)
+    worker.start()
+    if until_eof:
+        threading.Thread(target=_stop_at_eof, args=(worker.stop,), daemon=True).start()
+    worker.run_until_stopped()
+
+
+def _stop_at_eof(stop: Callable[[], None]) -> None:
+    while sys.stdin.buffer.read(4096):
+        pass
+    stop()

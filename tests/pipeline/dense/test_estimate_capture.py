@@ -1,0 +1,50 @@
+"""The dense stage's depth on a capture rendered by another program, against the points that two cameras see."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from pipeline.dense.depth_map import DepthMap, points_world
+from pipeline.dense.estimate import estimate_depth
+from pipeline.imaging.silhouette import silhouette_from_mask
+from pipeline.settings import DenseSettings
+from rig.formats.capture_folder import read_capture
+from tests.support.shared_data import shared
+
+HEAD, HAIR = 0, 1
+
+
+@pytest.mark.slow
+def test_depth_of_a_scan_is_precise_and_states_its_deviation() -> None:
+    """From true masks and without a fitted head: the search is bounded by the silhouettes alone."""
+    folder, truth = shared("data/captures/scan-a"), shared("data/captures/scan-a.truth")
+    capture, rig = read_capture(folder)
+    masks = {name: cv2.imread(str(truth / "silhouettes" / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in rig.names}
+    silhouettes = {name: silhouette_from_mask(mask > 127) for name, mask in masks.items() if mask is not None}
+    maps = estimate_depth(capture.images, silhouettes, rig, None, DenseSettings(), report=lambda stage, share: None)
+    visible = np.load(truth / "visible.npz")
+    distance, deviations, part = errors(maps, visible)
+    for which, precise, within_two in ((HEAD, 0.98, 0.9), (HAIR, 0.95, 0.8)):
+        kind = part == which
+        assert np.mean(distance[kind] < 2.0) > precise
+        assert np.median(distance[kind]) < 0.25
+        assert np.mean(deviations[kind] < 2.0) > within_two
+
+
+def errors(
+    maps: tuple[DepthMap, ...], visible: dict[str, np.ndarray], count: int = 40_000
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance to the true surface (mm), the same along the ray by the stated deviation, and the part, of ``count`` of
+    the known pixels."""
+    points = np.concatenate([points_world(each) for each in maps])
+    stated = np.concatenate([each.deviation_mm[each.known] for each in maps])
+    eyes = np.concatenate([np.tile(each.camera.centre_world, (int(each.known.sum()), 1)) for each in maps])
+    chosen = np.random.default_rng(0).choice(len(points), count, replace=False)
+    away, near = KDTree(visible["points"]).query(points[chosen])
+    normal = visible["normals"][near]
+    off = np.abs(((points[chosen] - visible["points"][near]) * normal).sum(axis=1))
+    distance = np.where(away**2 - off**2 < 4.0, off, away)  # truth is 1.5 mm apart: beside a point its plane goes on
+    ray = points[chosen] - eyes[chosen]
+    upright = np.abs((ray * normal).sum(axis=1)) / np.linalg.norm(ray, axis=1)
+    return distance, distance / np.maximum(upright, 0.15) / stated[chosen], visible["part"][near]

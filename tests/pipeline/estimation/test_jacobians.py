@@ -1,0 +1,240 @@
+"""Every term of every problem against central differences of its own residuals.
+
+Whoever adds a term adds a line to ``CASES``: a term at a planted value, where its unknowns move it, and steps whose
+third order is below the tolerance.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.adjustment.corner_term import CornerTerm
+from calibration.adjustment.lens_prior import AspectTerm
+from calibration.adjustment.state import (
+    PER_CAMERA as PER_BUNDLE_CAMERA,
+)
+from calibration.adjustment.state import (
+    PER_SHOT,
+    BundleState,
+    Observations,
+    moved_state,
+    observations,
+    values_of,
+)
+from calibration.silhouette_refinement.tangency_term import PackedTangencies, TangencyTerm
+from pipeline.estimation.terms import Residuals
+from pipeline.fitting.feature_term import FeatureTerm
+from pipeline.fitting.head_problem import apply_step
+from pipeline.fitting.problem import (
+    PER_CAMERA,
+    POSE,
+    ContourProblem,
+    Stage,
+    State,
+    SurfaceObservations,
+    first_evidence,
+    make_problem,
+    moved_views,
+)
+from pipeline.fitting.rim import project_with_slopes
+from pipeline.fitting.rim_term import observed_rim, rim_rows
+from pipeline.fitting.surface_term import SurfaceTerm, surface_rows
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.camera_drift import ShiftTerm
+from pipeline.multiview.triangulation import ReprojectionTerm
+from pipeline.settings import FittingSettings
+from rig.geometry import Similarity, rotation_from_vector
+from tests.support.board_sessions import session
+from tests.support.photo_scene import ellipsoid_model
+from tests.support.scenes import fan
+
+
+@dataclass(frozen=True)
+class Case:
+    """``residuals(step)``: the residuals after a step of all unknowns; ``jacobian``: theirs, at no step."""
+
+    residuals: Callable[[np.ndarray], np.ndarray]
+    jacobian: np.ndarray
+    steps: np.ndarray
+    tolerance: float = 1e-6  # of the largest entry of a column
+
+
+def case(term: Any, value: Any, moved: Callable[[Any, np.ndarray], Any], steps: np.ndarray) -> Case:
+    here: Residuals = term.at(value)
+    jacobian = here.jacobian().reshape(here.residual.size, -1)
+    return Case(lambda step: term.at(moved(value, step)).residual.ravel(), jacobian, steps)
+
+
+def reprojection() -> Case:
+    rig, point = fan(640, 480), np.array([20.0, -30.0, 40.0])
+    pixels = {camera.name: camera.project(point[None])[0] + 3.0 for camera in rig}
+    return case(ReprojectionTerm(pixels, rig, 1.5), point, np.add, np.full(3, 1e-2))
+
+
+def image_shift() -> Case:
+    rng = np.random.default_rng(1)
+    term = ShiftTerm(rng.normal(size=(8, 2)), rng.normal(size=8), 0.5)
+    return case(term, np.array([3.0, -1.0]), np.add, np.full(2, 1e-2))
+
+
+def tangency(focal: bool) -> Case:
+    """Both cameras' pixels of the same points: where the residual is zero, its gain is constant to first order."""
+    rig, points = fan(640, 480), np.random.default_rng(2).normal(0.0, 60.0, (12, 3))
+    cameras = np.array([[k % 7, (k + 1 + k % 3) % 7] for k in range(12)])
+    pixels = np.array(
+        [[rig.cameras[k].project(p[None])[0] for k in pair] for p, pair in zip(points, cameras, strict=True)]
+    )
+    term = TangencyTerm(PackedTangencies(cameras, pixels, np.full(12, 1e-3)), rig, focal, 0.2)
+    steps = np.tile([1e-5, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2, *([1e-5] if focal else [])], 7)
+    return case(term, np.zeros(len(steps)), np.add, steps)
+
+
+def small_bundle() -> tuple[BundleState, Observations]:
+    """Three cameras, five shots, the board in motion, some corners off."""
+    source, rng = session(cameras=3, shots=5, seed=1), np.random.default_rng(0)
+    d = source.detections
+    state = BundleState(
+        np.stack([values_of(camera.intrinsics) for camera in source.rig]),
+        np.stack([camera.camera_from_world.rotation for camera in source.rig]),
+        np.stack([camera.camera_from_world.translation for camera in source.rig]),
+        np.stack([source.poses[shot].rotation for shot in d.shots]),
+        np.stack([source.poses[shot].translation for shot in d.shots]),
+        np.zeros(3),
+        rng.normal(size=(5, 6)) * [0.01, 0.01, 0.01, 10, 10, 10],
+    )
+    return state, observations(d.views, source.rig.names, d.shots, d.board)
+
+
+def corners() -> Case:
+    state, seen = small_bundle()
+    term = CornerTerm(seen, np.full(3, 0.2))
+    per_camera = [*[1e-2] * 4, *[1e-4] * 5, *[1e-5] * 3, *[1e-2] * 3]
+    steps = np.array([*per_camera * 3, *[*[1e-5] * 3, *[1e-2] * 3] * 5, *[1e-4] * 3])
+    here = term.at(state)
+    jacobian = here.jacobian(len(steps)).reshape(here.residual.size, -1)
+    return Case(lambda step: term.at(moved_state(state, step)).residual.ravel(), jacobian, steps, 1e-5)
+
+
+def aspects() -> Case:
+    state, _ = small_bundle()
+    here = AspectTerm().at(state)
+    jacobian = np.zeros((3, 3 * PER_BUNDLE_CAMERA + 5 * PER_SHOT + 3))
+    for k, slope in enumerate(here.slopes()):
+        jacobian[k, k * PER_BUNDLE_CAMERA : k * PER_BUNDLE_CAMERA + 2] = slope
+    return Case(
+        lambda step: AspectTerm().at(moved_state(state, step)).residual, jacobian, np.full(jacobian.shape[1], 1e-3)
+    )
+
+
+def head() -> tuple[ContourProblem, Stage, State]:
+    """An ellipsoid, its one mode and the kernel's, cameras a little off, six landmarks picked 2 px off."""
+    model, rig, rng = ellipsoid_model(3), fan(640, 480), np.random.default_rng(5)
+    names = dict(zip(("pronasale", "gnathion", "nasion"), (3, 40, 90), strict=True))
+    model = replace(model, landmarks=names)
+    at = model.vertices(np.zeros(0))
+    features = {
+        name: {camera.name: camera.project(at[[row]])[0] + 2.0 for camera in rig} for name, row in names.items()
+    }
+    flat = np.zeros((480, 640), np.float32)
+    silhouettes = {camera.name: Silhouette(flat < 0, flat) for camera in rig}
+    problem = make_problem(model, Similarity.identity(), silhouettes, rig, FittingSettings(), features)
+    modes = 8
+    stage = Stage("full", modes, True, (1.5,), True, True, 3)
+    pose = Similarity(1.01, rotation_from_vector(np.array([0.05, -0.1, 0.02])), np.array([3.0, -2.0, 5.0]))
+    shift = rng.normal(size=(len(rig), 6)) * [1e-3, 1e-3, 1e-3, 0.5, 0.5, 0.5]
+    return problem, stage, State(0.3 * rng.normal(size=modes), pose, shift)
+
+
+def head_steps(problem: ContourProblem, stage: Stage) -> np.ndarray:
+    camera = [1e-5] * 3 + [1e-2] * 3
+    return np.array([*[1e-2] * stage.modes, *[1e-5] * 3, *[1e-2] * 3, 1e-4, *camera * len(problem.views.names)])
+
+
+def rim_of_a_head() -> Case:
+    """Where the outline lies along its normal, of samples that stay where they are on the mesh; with cameras where the
+    calibration has them, since a correction is a left perturbation of its own camera and no sum of two."""
+    problem, stage, state = head()
+    state = replace(state, camera_shift=np.zeros_like(state.camera_shift))
+    rim = observed_rim(problem, first_evidence(problem.settings), state, stage)
+    rows = rim_rows(problem, state, rim, stage)
+    steps, shared = head_steps(problem, stage), stage.modes + POSE
+    jacobian = np.zeros((len(rows), len(steps)))
+    jacobian[:, :shared] = rows[:, :shared]
+    own = shared + PER_CAMERA * rim.view[:, None] + np.arange(PER_CAMERA)
+    jacobian[np.arange(len(rows))[:, None], own] = rows[:, shared:]
+    share = np.stack([1.0 - rim.blend, rim.blend], axis=1)[:, :, None]
+
+    def on_mesh(at: State) -> np.ndarray:
+        return (share * problem.bases[stage.level].vertices(at.coefficients)[rim.corner]).sum(axis=1)
+
+    lift = state.world_from_head.inverse().apply(rim.point) - on_mesh(state)  # over the chord, along the normal
+
+    def residuals(step: np.ndarray) -> np.ndarray:
+        moved = apply_step(state, step, stage)
+        points = moved.world_from_head.apply(on_mesh(moved) + lift)
+        pixels, _ = project_with_slopes(points, rim.view, moved_views(problem, moved))
+        return (rim.normal * pixels).sum(axis=1)
+
+    return Case(residuals, jacobian, steps, 1e-3)  # the modes are summed in single precision
+
+
+def features_of_a_head() -> Case:
+    """With the deviation in pixels, which the Jacobian takes for constant, held where it is."""
+    problem, stage, state = head()
+    state = replace(state, camera_shift=np.zeros_like(state.camera_shift))
+    picked = problem.features
+    assert picked is not None
+    problem = replace(problem, settings=replace(problem.settings, landmark_noise_mm=0.0))
+    term = FeatureTerm(problem, picked, stage)
+    return replace(
+        case(term, state, lambda s, step: apply_step(s, step, stage), head_steps(problem, stage)), tolerance=1e-4
+    )
+
+
+def surface_of_a_head() -> Case:
+    problem, stage, state = head()
+    rng, rows, cameras = np.random.default_rng(6), np.arange(0, 600, 20), 6 * len(problem.views.names)
+    model = problem.model
+    normal = rng.standard_normal((len(rows), 3))
+    seen = SurfaceObservations(
+        vertex=rows, basis=model.basis("full", stage.modes, rows), mean=model.vertices(np.zeros(0))[rows],
+        normal=normal / np.linalg.norm(normal, axis=1, keepdims=True), seen_at=model.vertices(np.zeros(0))[rows],
+        displacement=rng.standard_normal(len(rows)), information=np.ones(len(rows)),
+        by_camera=rng.standard_normal((len(rows), cameras)), camera_shift=np.zeros_like(state.camera_shift),
+        camera_matrix=np.eye(cameras), camera_gradient=np.zeros(cameras),
+    )  # fmt: skip
+    here = SurfaceTerm(seen, stage).at(state)
+    jacobian = surface_rows(seen, stage.modes, state.world_from_head, here.points, cameras=True).astype(float)
+
+    def residuals(step: np.ndarray) -> np.ndarray:
+        return SurfaceTerm(seen, stage).at(apply_step(state, step, stage)).residual
+
+    return Case(residuals, jacobian, 100.0 * head_steps(problem, stage), 1e-3)  # single precision
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "reprojection of a point": reprojection,
+    "shift of an image": image_shift,
+    "tangency": lambda: tangency(False),
+    "tangency with focal lengths": lambda: tangency(True),
+    "corners of boards": corners,
+    "square pixels": aspects,
+    "rim of a head": rim_of_a_head,
+    "feature points of a head": features_of_a_head,
+    "surface in photographs": surface_of_a_head,
+}
+
+
+@pytest.mark.parametrize("make", CASES.values(), ids=CASES.keys())
+def test_jacobians_are_central_differences(make: Callable[[], Case]) -> None:
+    subject = make()
+    assert subject.jacobian.shape[1] == len(subject.steps)
+    for column, by in enumerate(subject.steps):
+        step = np.zeros(len(subject.steps))
+        step[column] = by
+        slope = (subject.residuals(step) - subject.residuals(-step)) / (2.0 * by)
+        scale = max(np.abs(subject.jacobian[:, column]).max(), 1e-9)
+        np.testing.assert_allclose(subject.jacobian[:, column] / scale, slope / scale, atol=subject.tolerance)

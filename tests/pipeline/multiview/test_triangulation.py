@@ -1,0 +1,120 @@
+"""Triangulation: planted points, with noise as derived; what determines no point is said; contradicting views."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from pipeline.alignment.feature_points import locate_features
+from pipeline.multiview.triangulation import NoPoint, triangulate
+from rig.camera import Camera, Distortion, Intrinsics
+from rig.geometry import look_at
+from rig.rig import Rig
+from tests.support.oracles import project
+
+UP = np.array([0.0, 1.0, 0.0])
+LENS = Distortion(-0.12, 0.05, 1e-3, -8e-4, 0.01)
+
+
+def camera(name: str, centre: list[float], lens: Distortion = LENS) -> Camera:
+    intrinsics = Intrinsics(1024, 768, 1500.0, 1480.0, 520.0, 377.0, lens)
+    return Camera(name, intrinsics, look_at(np.array(centre), np.zeros(3), UP))
+
+
+RIG = Rig(
+    (
+        camera("left", [-500.0, 50.0, 1000.0]),
+        camera("front", [0.0, 0.0, 1100.0]),
+        camera("right", [600.0, -80.0, 950.0]),
+        camera("above", [100.0, 600.0, 900.0]),
+    )
+)
+
+
+def seen(point: np.ndarray, names: tuple[str, ...] = RIG.names) -> dict[str, np.ndarray]:
+    """Pixels by the oracle's own formulas."""
+    pixels = {}
+    for name in names:
+        k, pose = RIG[name].intrinsics, RIG[name].camera_from_world
+        pixel, _ = project(
+            point[None], pose.rotation, pose.translation, k.fx, k.fy, k.cx, k.cy, *k.distortion.opencv().tolist()
+        )
+        pixels[name] = pixel[0]
+    return pixels
+
+
+coordinates = st.floats(-120.0, 120.0)
+
+
+@settings(max_examples=40)
+@given(x=coordinates, y=coordinates, z=coordinates, views=st.sampled_from([2, 3, 4]))
+def test_exact_pixels_give_the_point_back(x: float, y: float, z: float, views: int) -> None:
+    truth = np.array([x, y, z])
+    found = triangulate(seen(truth, RIG.names[:views]), RIG, noise_px=1.0)
+    # 1e-9 of the distance is where the iteration stops
+    np.testing.assert_allclose(found.position_world, truth, atol=1e-5)
+    assert max(np.abs(r).max() for r in found.residuals_px.values()) < 1e-6
+
+
+def test_the_minimum_is_the_one_of_scipy() -> None:
+    rng = np.random.default_rng(3)
+    pixels = {name: pixel + rng.normal(0, 5.0, 2) for name, pixel in seen(np.array([20.0, -60.0, 90.0])).items()}
+
+    def residuals(point: np.ndarray) -> np.ndarray:
+        return np.concatenate([RIG[name].project(point[None])[0] - pixel for name, pixel in pixels.items()])
+
+    oracle = least_squares(residuals, np.zeros(3), method="lm", xtol=1e-14, ftol=1e-14)
+    found = triangulate(pixels, RIG, noise_px=5.0)
+    np.testing.assert_allclose(found.position_world, oracle.x, atol=1e-4)
+    assert found.misfit(1.0) == pytest.approx(2 * oracle.cost, rel=1e-9)
+
+
+def test_the_covariance_is_that_of_many_draws() -> None:
+    rng = np.random.default_rng(0)
+    truth, noise, draws = np.array([-30.0, 40.0, 80.0]), 1.5, 200
+    exact = seen(truth, ("left", "front"))
+    found = [
+        triangulate({k: v + rng.normal(0, noise, 2) for k, v in exact.items()}, RIG, noise_px=noise)
+        for _ in range(draws)
+    ]
+    errors = np.stack([point.position_world - truth for point in found])
+    # If the covariance is right the sum of squared Mahalanobis distances is chi-square with 3 * draws degrees.
+    total = sum(e @ np.linalg.solve(p.covariance, e) for e, p in zip(errors, found, strict=True))
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * draws)
+    assert low < total < high
+
+
+def test_what_determines_no_point_is_said() -> None:
+    pixels = seen(np.zeros(3))
+    with pytest.raises(NoPoint, match="1 view"):
+        triangulate({"left": pixels["left"]}, RIG, noise_px=1.0)
+    twins = Rig((camera("a", [0.0, 0.0, 1000.0]), camera("b", [0.0, 0.0, 1000.0])))
+    with pytest.raises(NoPoint, match="parallel"):
+        triangulate({"a": np.array([500.0, 300.0]), "b": np.array([500.0, 300.0])}, twins, noise_px=1.0)
+
+
+def test_rays_that_meet_behind_the_cameras_are_refused() -> None:
+    eyes = Rig((camera("a", [-100.0, 0.0, 1000.0]), camera("b", [100.0, 0.0, 1000.0])))
+    with pytest.raises(NoPoint, match="behind"):
+        triangulate({"a": np.array([100.0, 384.0]), "b": np.array([940.0, 384.0])}, eyes, noise_px=1.0)
+
+
+def test_a_view_that_contradicts_the_others_is_left_out() -> None:
+    truth = np.array([10.0, 20.0, 90.0])
+    pixels = seen(truth)
+    pixels["right"] = pixels["right"] + (40.0, 25.0)
+    located = locate_features({"pronasale": pixels}, RIG, noise_px=1.5)
+    np.testing.assert_allclose(located.points["pronasale"].position_world, truth, atol=1e-5)
+    assert "right" not in located.points["pronasale"].residuals_px
+    assert len(located.remarks) == 1
+    assert "pronasale in right" in located.remarks[0]
+
+
+def test_two_views_that_contradict_each_other_lose_the_point() -> None:
+    pixels = seen(np.array([10.0, 20.0, 90.0]), ("left", "front"))
+    pixels["front"] = pixels["front"] + (0.0, 60.0)  # off the epipolar line
+    located = locate_features({"pronasale": pixels, "gnathion": {"left": pixels["left"]}}, RIG, noise_px=1.5)
+    assert not located.points
+    assert [remark.split()[1] for remark in located.remarks] == ["pronasale", "gnathion"]

@@ -1,0 +1,126 @@
+"""The coloured whole surface: its colours are the photographs', its files what the contract says."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.fitting.fit import Fit
+from pipeline.results.bust import Bust, make_bust
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.write import write_result
+from pipeline.settings import BustSettings, OutputSettings, Settings, settings_from_document
+from rig.capture import Capture
+from rig.colour_space import srgb_from_linear
+from rig.errors import InputError
+from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import Mesh
+from tests.support.ellipsoid_depths import Ellipsoid, look, pinhole_fan, scene
+from tests.support.scenes import pattern, pixel_grid
+
+BALL = Ellipsoid((0, 0, 0), (60, 60, 60))
+SETTINGS = Settings(bust=BustSettings(spacing_mm=3.0))
+PLACE = Similarity(1.25, rotation_from_vector(np.array([0.1, -0.3, 0.05])), np.array([12.0, -7.0, 30.0]))
+
+
+@pytest.fixture(scope="module")
+def photographed() -> tuple[Bust, Capture, dict]:
+    """A ball whose colours are known at every point, and its bust."""
+    made = scene([BALL], pinhole_fan())
+    images = {}
+    for camera in made.rig:
+        depth, _ = look(camera, [BALL])
+        rays = camera.rays_world(pixel_grid(camera))
+        along = depth.ravel() / (rays @ camera.camera_from_world.rotation[2])
+        points = camera.centre_world + np.where(np.isfinite(along), along, 0)[:, None] * rays
+        light = np.where(np.isfinite(along)[:, None], pattern(points), 0.05)
+        images[camera.name] = np.rint(255 * srgb_from_linear(light)).astype(np.uint8).reshape(*depth.shape, 3)
+    sphere = trimesh.creation.icosphere(4, 60.0)
+    head, capture = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32)), Capture(images)
+    report = {"report": lambda stage, share: None}
+    return (
+        make_bust(made.maps, capture, made.silhouettes, made.rig, head, SETTINGS, **report),
+        capture,
+        made.silhouettes,
+    )
+
+
+@pytest.fixture(scope="module")
+def result(photographed) -> Reconstruction:
+    bust, _, silhouettes = photographed
+    head = bust.mesh_world
+    count = len(head.vertices)
+    return Reconstruction(
+        fit=Fit("contour", np.zeros(2), PLACE, 1, "planted"),
+        model_name="ball",
+        model_sha256="ab" * 32,
+        mesh_world=head,
+        normals=bust.normals,
+        colours=bust.colours,
+        views=bust.views,
+        quality_mm=np.full(count, 0.5),
+        silhouettes=silhouettes,
+        start_masks={},
+        fitted_masks={name: silhouette.mask for name, silhouette in silhouettes.items()},
+        cameras={},
+        landmarks={},
+        measurements={},
+        front="cam03",
+        settings=SETTINGS,
+        digests={},
+        seconds={},
+        bust=bust,
+    )
+
+
+def test_colours_are_those_of_the_photographs(photographed) -> None:
+    """Codes are rounded twice, sampled in a window of 0.45 px and blurred by 0.1 mm of depth: two or three levels."""
+    bust, _, _ = photographed
+    expected = 255 * srgb_from_linear(pattern(bust.mesh_world.vertices))
+    several = bust.views > 1
+    assert several.mean() > 0.5
+    assert np.median(np.abs(bust.colours[several] - expected[several])) < 3.0
+
+
+def test_files_hold_what_the_contract_says(result: Reconstruction, photographed, tmp_path: Path) -> None:
+    bust, capture, _ = photographed
+    write_result(tmp_path, result, capture)
+    data = (tmp_path / "bust.ply").read_bytes()
+    end = data.index(b"end_header\n") + len(b"end_header\n")
+    properties = [line.split()[2] for line in data[:end].decode().splitlines() if line.startswith("property")][:-1]
+    assert properties == ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "quality", "views", "part"]
+    kinds = ["<f4"] * 6 + ["u1"] * 3 + ["<f4", "u1", "u1"]
+    read = np.frombuffer(data, np.dtype(list(zip(properties, kinds, strict=True))), len(bust.views), end)
+    np.testing.assert_allclose(np.stack([read[n] for n in "xyz"], 1), bust.mesh_world.vertices, atol=1e-4)
+    np.testing.assert_array_equal(read["part"], bust.surface.part)
+    np.testing.assert_allclose(read["quality"], bust.surface.deviation_mm, rtol=1e-6)
+    glb = trimesh.load(tmp_path / "bust.glb", force="mesh")
+    assert isinstance(glb, trimesh.Trimesh)
+    expected = (bust.mesh_world.vertices - PLACE.translation) @ PLACE.rotation / 1000
+    np.testing.assert_allclose(np.sort(glb.vertices[:, 1]), np.sort(expected[:, 1]), atol=1e-5)
+    told = json.loads((tmp_path / "report.json").read_text())["bust"]
+    assert told["closed"] is True
+    assert told["spacing_mm"] == 3.0
+    assert told["vertices"] == len(bust.views)
+    assert 0.5 < told["seen_share"] < 0.9
+    assert sum(told["parts"].values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("surface", "files"), [("head", {"head"}), ("bust", {"bust"}), ("both", {"head", "bust"})])
+def test_surface_says_which_are_written(
+    surface, files: set[str], result: Reconstruction, photographed, tmp_path: Path
+) -> None:
+    asked = replace(SETTINGS, outputs=OutputSettings(surface=surface))
+    made = replace(result, settings=asked, bust=None if surface == "head" else result.bust)
+    write_result(tmp_path, made, photographed[1])
+    assert {path.stem for path in tmp_path.glob("*.ply")} == files
+    assert {path.stem for path in tmp_path.glob("*.glb")} == files
+
+
+def test_spacing_has_bounds() -> None:
+    assert settings_from_document({"bust": {"spacing_mm": 0.5}}).bust.spacing_mm == 0.5
+    with pytest.raises(InputError, match=r"bust\.spacing_mm is 0\.4, wanted 0\.5 to 3"):
+        settings_from_document({"bust": {"spacing_mm": 0.4}})

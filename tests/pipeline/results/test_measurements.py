@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+
+from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.fitting.fit import Fit
+from pipeline.results.measurements import DISTANCES, landmarks, measurements
+from rig.geometry import Similarity, rotation_from_vector
+
+COUNT = 8
+SIZE = COUNT + 7  # coefficients, rotation, translation, log scale
+
+
+@pytest.fixture(scope="module")
+def model() -> HeadModel:
+    return load_model()
+
+
+def fit_at(parameters: np.ndarray, covariance: np.ndarray | None = None) -> Fit:
+    """A fit at a deviation ``parameters`` from a pose that is no special one, in the parameters of ``Fit``."""
+    shape, turn, shift, grow = parameters[:COUNT], parameters[COUNT : COUNT + 3], parameters[-4:-1], parameters[-1]
+    rotation = rotation_from_vector(turn) @ rotation_from_vector(np.array([0.2, -0.5, 0.1]))
+    place = Similarity(1.05 * np.exp(grow), rotation, np.array([30.0, -60.0, 900.0]) + shift)
+    start = np.linspace(-1, 1, COUNT)
+    return Fit("contour", start + shape, place, 1, "test", covariance)
+
+
+def covariance(seed: int = 0) -> np.ndarray:
+    root = np.random.default_rng(seed).normal(size=(SIZE, SIZE)) / np.sqrt(SIZE)
+    scale = np.r_[np.full(COUNT, 0.2), np.full(3, 0.003), np.full(3, 0.5), 0.004]
+    return (root @ root.T) * np.outer(scale, scale)
+
+
+def test_landmarks_are_the_models_vertices_in_the_world(model: HeadModel) -> None:
+    fit = fit_at(np.zeros(SIZE))
+    world = fit.world_from_head.apply(model.vertices(fit.coefficients))
+    found = landmarks(model, fit)
+    assert len(found) == 26
+    for name, landmark in found.items():
+        np.testing.assert_allclose(landmark.position_mm, world[model.landmarks[name]], atol=1e-3)
+        assert landmark.std_mm is None
+
+
+def test_standard_deviations_are_those_of_drawn_parameters(model: HeadModel) -> None:
+    # Monte Carlo: with 4,000 draws a standard deviation is known to 1 / sqrt(8,000) = 1.1 %; four times that.
+    spread = covariance()
+    draws = np.random.default_rng(1).multivariate_normal(np.zeros(SIZE), spread, 4000)
+    rows = np.array([model.landmarks[name] for name in ("pronasale", "zygion_left", "zygion_right")])
+    basis = model.basis("full", COUNT, rows).astype(float)
+    mean = model.levels["full"].operator[rows] @ model.mean.astype(float)
+    points = np.empty((len(draws), 3, 3))
+    for i, draw in enumerate(draws):
+        fit = fit_at(draw)
+        points[i] = fit.world_from_head.apply(mean + np.einsum("m,mni->ni", fit.coefficients, basis))
+    fit = fit_at(np.zeros(SIZE), spread)
+    tip = landmarks(model, fit)["pronasale"].std_mm
+    assert tip is not None
+    np.testing.assert_allclose(tip, points[:, 0].std(axis=0), rtol=0.045)
+    breadth = np.linalg.norm(points[:, 1] - points[:, 2], axis=1)
+    found = measurements(model, fit)["bizygomatic_breadth"]
+    assert found.std_mm == pytest.approx(breadth.std(), rel=0.045)
+    assert found.value_mm == pytest.approx(breadth.mean(), rel=0.002)
+
+
+def test_a_rigid_motion_moves_landmarks_but_no_measurement(model: HeadModel) -> None:
+    rigid = covariance()
+    rigid[:COUNT] = rigid[:, :COUNT] = rigid[-1] = rigid[:, -1] = 0.0
+    fit = fit_at(np.zeros(SIZE), rigid)
+    assert all(m.std_mm is not None and m.std_mm < 1e-6 for m in measurements(model, fit).values())
+    assert all(p.std_mm is not None and p.std_mm.min() > 0.01 for p in landmarks(model, fit).values())
+
+
+def test_an_uncertain_scale_is_uncertain_lengths(model: HeadModel) -> None:
+    scale_only = np.zeros((SIZE, SIZE))
+    scale_only[-1, -1] = 0.01**2
+    for measurement in measurements(model, fit_at(np.zeros(SIZE), scale_only)).values():
+        assert measurement.std_mm == pytest.approx(0.01 * measurement.value_mm, rel=1e-6)
+
+
+# Farkas (1994) and the anthropometric survey of Gordon et al. (ANSUR, 1989), adults: mean plus or minus five standard
+# deviations, wide because a landmark of a model is a vertex.
+ADULT_MM = {
+    "head_breadth": (125, 180),
+    "head_length": (160, 225),
+    "bizygomatic_breadth": (110, 165),
+    "nose_length": (38, 65),
+    "nose_breadth": (25, 50),
+    "face_height": (95, 145),
+    "mouth_breadth": (38, 68),
+    "intercanthal_breadth": (24, 43),
+}
+
+
+def test_the_mean_head_has_an_adults_measures(model: HeadModel) -> None:
+    fit = Fit("contour", np.zeros(COUNT), Similarity.identity(), 1, "test")
+    found = measurements(model, fit)
+    assert set(found) == set(DISTANCES)
+    for name, (low, high) in ADULT_MM.items():
+        assert low < found[name].value_mm < high, (name, found[name].value_mm)

@@ -1,0 +1,212 @@
+import importlib.util
+import json
+import struct
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.fitting.fit import Fit
+from pipeline.imaging.cpu_raster import depth_map
+from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
+from pipeline.results.measurements import Landmark, Measurement
+from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, overlay
+from pipeline.results.reconstruction import CameraFigures, Reconstruction
+from pipeline.results.write import write_result
+from pipeline.settings import OutputSettings, Settings
+from rig.capture import Capture
+from rig.formats.images import read_image
+from rig.formats.mesh_file import read_mesh
+from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import Mesh
+from tests.support.scenes import ellipsoid, fan, pattern
+from tests.support.shared_data import shared
+
+CONTRACT_KEYS = {
+    "format", "model", "method", "cameras", "coefficients", "world_from_head", "landmarks", "measurements", "front",
+    "seconds", "evaluations", "stopped_because", "inputs", "warnings", "version",
+}  # fmt: skip
+PLACE = Similarity(1.25, rotation_from_vector(np.array([0.1, -0.3, 0.05])), np.array([12.0, -7.0, 30.0]))
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Reconstruction, Capture]:
+    rig, head = fan(), ellipsoid(4)
+    world = Mesh(PLACE.apply(head.vertices), head.faces)
+    colours = np.round(pattern(head.vertices) * 255).astype(np.uint8)
+    masks = {camera.name: np.isfinite(depth_map(camera, world.vertices, world.faces)[0]) for camera in rig}
+    images = {name: np.where(mask[:, :, None], 180, 60).astype(np.uint8).repeat(3, 2) for name, mask in masks.items()}
+    shifted = {name: np.roll(mask, 6, axis=1) for name, mask in masks.items()}
+    figures = {name: CameraFigures(True, 0.99, 0.4, 12.5, 90.0, 0.02, 300) for name in rig.names}
+    figures["cam03"] = CameraFigures(False, None, None, None)
+    silhouettes = {name: silhouette_from_mask(mask) for name, mask in masks.items()}
+    silhouettes["cam03"] = replace(silhouettes["cam03"], quality=ViewQuality(usable=False, contrast=float("inf")))
+    fit = Fit("contour", np.array([0.5, -1.0]), PLACE, 42, "the cost no longer falls")
+    result = Reconstruction(
+        fit=fit,
+        model_name="ellipsoid",
+        model_sha256="ab" * 32,
+        mesh_world=world,
+        normals=world.normals(),
+        colours=colours,
+        views=np.r_[np.zeros(5, np.uint8), np.full(len(head.vertices) - 5, 3, np.uint8)],
+        quality_mm=np.linspace(0.1, 2.0, len(head.vertices)),
+        silhouettes=silhouettes,
+        start_masks=shifted,
+        fitted_masks=masks,
+        cameras=figures,
+        landmarks={"pronasale": Landmark(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))},
+        measurements={"nose_length": Measurement(52.0, float("nan"))},
+        front="cam03",
+        settings=Settings(outputs=OutputSettings(obj=True)),
+        digests={"images/cam00.png": "cd" * 32},
+        seconds={"segmentation": 0.5, "fitting": 1.5},
+        warnings=(ReportWarning("view_left_out", "cam03 is left out"),),
+    )
+    return result, Capture({name: image[:, :, :3].copy() for name, image in images.items()})
+
+
+@pytest.fixture(scope="module")
+def folder(scene: tuple[Reconstruction, Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("result")
+    write_result(out, *scene)
+    return out
+
+
+def read_vertices(path: Path) -> tuple[list[str], np.ndarray]:
+    """An independent reader of the contract's PLY: header lines, vertex records."""
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + len(b"end_header\n")
+    header = data[:end].decode("ascii").splitlines()
+    count = int(next(line.split()[2] for line in header if line.startswith("element vertex")))
+    record = np.dtype(
+        [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")]
+        + [(n, "u1") for n in "rgb"]
+        + [("q", "<f4"), ("views", "u1")]
+    )
+    return header, np.frombuffer(data, record, count, end)
+
+
+def test_ply_holds_the_world_mesh_with_its_colours_quality_and_views(folder: Path, scene) -> None:
+    result, _ = scene
+    header, vertices = read_vertices(folder / "head.ply")
+    assert header[1] == "format binary_little_endian 1.0"
+    assert [line for line in header if line.startswith("property")] == [
+        *(f"property float {n}" for n in ("x", "y", "z", "nx", "ny", "nz")),
+        *(f"property uchar {n}" for n in ("red", "green", "blue")),
+        "property float quality", "property uchar views", "property list uchar int vertex_indices",
+    ]  # fmt: skip
+    np.testing.assert_allclose(np.stack([vertices[n] for n in "xyz"], 1), result.mesh_world.vertices, atol=1e-4)
+    np.testing.assert_array_equal(np.stack([vertices[n] for n in "rgb"], 1), result.colours)
+    np.testing.assert_allclose(vertices["q"], result.quality_mm, rtol=1e-6)
+    assert (vertices["views"][:6] == [0, 0, 0, 0, 0, 3]).all()
+    comments = " ".join(line for line in header if line.startswith("comment"))
+    for word in ("unit mm", "frame world", "model ellipsoid", "ab" * 32, "inputs", "settings", "version"):
+        assert word in comments
+
+
+def test_the_same_result_is_the_same_bytes(folder: Path, scene, tmp_path: Path) -> None:
+    result, capture = scene
+    write_result(tmp_path, replace(result, seconds={"segmentation": 9.0}), capture)
+    for file in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "report.json"):
+        assert (tmp_path / file.relative_to(folder)).read_bytes() == file.read_bytes(), file.name
+
+
+def test_other_inputs_or_settings_change_the_comments(folder: Path, scene, tmp_path: Path) -> None:
+    result, capture = scene
+    write_result(tmp_path / "a", replace(result, digests={"images/cam00.png": "ef" * 32}), capture)
+    write_result(tmp_path / "b", replace(result, settings=Settings(method="simplex")), capture)
+    headers = [read_vertices(p / "head.ply")[0] for p in (folder, tmp_path / "a", tmp_path / "b")]
+    assert len({tuple(header) for header in headers}) == 3
+
+
+def test_glb_is_the_head_frame_in_metres_with_linear_colours(folder: Path, scene) -> None:
+    result, _ = scene
+    head = ellipsoid(4)
+    loaded = read_mesh(folder / "head.glb")
+    # The pose is undone and the size kept: the head's own shape times the scale.
+    np.testing.assert_allclose(loaded.vertices * 1000, 1.25 * head.vertices, atol=2e-2)
+    data = (folder / "head.glb").read_bytes()
+    magic, glb_version, length = struct.unpack_from("<4sII", data)
+    assert (magic, glb_version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    document = json.loads(data[20 : 20 + size])
+    assert kind == b"JSON"
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    view = document["bufferViews"][document["accessors"][attributes["COLOR_0"]]["bufferView"]]
+    start = 20 + size + 8 + view["byteOffset"]
+    stored = np.frombuffer(data, "<u2", 4 * len(head.vertices), start).reshape(-1, 4)
+    # 2.2 is sRGB's well-known approximation, within 0.01 of the exact curve.
+    np.testing.assert_allclose(stored[:, :3] / 65535, (result.colours / 255.0) ** 2.2, atol=0.01)
+    normal_view = document["bufferViews"][document["accessors"][attributes["NORMAL"]]["bufferView"]]
+    normals = np.frombuffer(data, "<f4", 3 * len(head.vertices), 20 + size + 8 + normal_view["byteOffset"]).reshape(
+        -1, 3
+    )
+    np.testing.assert_allclose(normals, head.normals(), atol=1e-5)
+
+
+def test_report_has_every_key_of_the_contract_and_only_json_numbers(folder: Path) -> None:
+    def refuse(word: str) -> None:
+        raise AssertionError(f"report.json holds {word}")
+
+    report = json.loads((folder / "report.json").read_text(), parse_constant=refuse)
+    assert set(report) >= CONTRACT_KEYS
+    assert report["format"] == "eigenhead-report/1"
+    assert set(report["cameras"]["cam00"]) >= {"iou", "contour_rms_px", "xor_cost", "used", "excluded_share"}
+    assert report["cameras"]["cam03"]["used"] is False
+    assert report["cameras"]["cam03"]["view"]["contrast"] is None
+    assert report["seconds"] == {"total": 2.0, "segmentation": 0.5, "fitting": 1.5}
+    assert report["texture"]["filled"] == 5
+    assert report["warnings"] == [{"code": "view_left_out", "message": "cam03 is left out"}]
+    assert report["landmarks"]["pronasale"] == {"position": [1.0, 2.0, 3.0], "std": [0.1, 0.2, 0.3]}
+    assert report["measurements"]["nose_length"] == {"value": 52.0, "std": None}
+
+
+def test_the_reported_similarity_has_the_papers_form(folder: Path) -> None:
+    place = json.loads((folder / "report.json").read_text())["world_from_head"]
+    points = np.random.default_rng(1).normal(size=(5, 3)) * 100
+    rotation, translation = np.array(place["rotation"]), np.array(place["translation"])
+    np.testing.assert_allclose(place["scale"] * (points @ rotation.T + translation), PLACE.apply(points), atol=1e-9)
+
+
+def test_every_camera_has_an_overlay_of_its_image_with_both_contours(folder: Path, scene) -> None:
+    _, capture = scene
+    for name, image in capture.images.items():
+        drawn = read_image(folder / "overlays" / f"{name}.png")
+        assert drawn.shape == image.shape
+        changed = (drawn != image).any(axis=2)
+        assert 0.002 < changed.mean() < 0.15
+    for picture in ("contact_sheet.png", "turntable.png"):
+        assert read_image(folder / picture).std() > 10
+
+
+def test_contours_are_painted_where_they_are() -> None:
+    image = np.full((240, 320, 3), 128, np.uint8)
+    observed, fitted = np.zeros((2, 240, 320), bool)
+    observed[60:200, 100:200], fitted[60:200, 140:260] = True, True
+    drawn = overlay(image, silhouette_from_mask(observed).distance, fitted).astype(float)
+    row = drawn[150]
+    # The contour runs half a pixel outside the outermost pixel centre: x = 99.5 and 259.5.
+    for x, colour in ((99.5, INPUT_COLOUR), (259.5, FITTED_COLOUR)):
+        window = np.arange(int(x) - 8, int(x) + 9)
+        near = np.abs(row[window] - np.array(colour)).sum(axis=1)
+        assert sorted(window[np.argsort(near)[:2]]) == [int(x), int(x) + 1]
+    assert (row[20] == 128).all()
+    assert (row[170] == 128).all()
+
+
+def test_the_shared_checker_finds_no_breach_of_the_contract(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = shared("tools/score.py")
+    monkeypatch.syspath_prepend(str(path.parent))
+    spec = importlib.util.spec_from_file_location("shared_score", path)
+    assert spec is not None
+    assert spec.loader is not None
+    score = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "shared_score", score)
+    spec.loader.exec_module(score)
+    faults, mesh = score.check_result(str(folder))
+    assert faults == []
+    assert mesh is not None

@@ -1,0 +1,95 @@
+"""Exchanges of files planted in a capture of the studio: cables, pictures alone, plates alone, duplicates."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from pipeline.imaging.silhouette import silhouette_from_mask
+from pipeline.settings import Settings
+from pipeline.silhouettes.own_pictures import ExchangedPictures, misplaced_plates, own_pictures
+from pipeline.silhouettes.segment import segment
+from rig.capture import Capture, refiled
+
+pytestmark = [pytest.mark.gl, pytest.mark.slow]  # the studio takes ten seconds for one capture
+EXCHANGE = {"cam04": "cam06", "cam06": "cam04"}
+
+
+def judged(shot, capture, exchanged: Literal["repair", "refuse"] = "repair"):
+    """``own_pictures`` with the studio's true masks, filed as the pictures are: nothing here depends on their noise."""
+    truth = {id(shot.capture.images[name]): mask for name, mask in shot.masks.items()}
+
+    def segmented(filed: Capture):
+        return {name: silhouette_from_mask(truth[id(image)]) for name, image in filed.images.items()}
+
+    return own_pictures(capture, shot.rig, segmented, exchanged=exchanged)
+
+
+def filed_right(shot, found):
+    names = shot.rig.names
+    return all(
+        found.capture.images[name] is shot.capture.images[name]
+        and found.capture.backgrounds[name] is shot.capture.backgrounds[name]
+        and np.array_equal(found.silhouettes[name].mask, shot.masks[name])
+        for name in names
+    )
+
+
+def test_a_good_capture_is_left_as_it_is(half_size_shot):
+    found = judged(half_size_shot, half_size_shot.capture)
+    assert (found.pictures, found.plates, found.warnings) == ({}, {}, ())
+    assert filed_right(half_size_shot, found)
+
+
+@pytest.mark.parametrize(
+    ("planted", "code"),
+    [
+        ({"pictures": EXCHANGE, "plates": EXCHANGE, "points": EXCHANGE}, "cameras-exchanged"),
+        ({"pictures": EXCHANGE, "plates": EXCHANGE}, "cameras-exchanged"),
+        ({"pictures": EXCHANGE}, "cameras-exchanged"),
+        ({"plates": EXCHANGE}, "plates-exchanged"),
+    ],
+    ids=["cables", "cables, points picked before", "pictures alone", "plates alone"],
+)
+def test_an_exchange_is_named_and_filed_back(half_size_shot, planted, code):
+    found = judged(half_size_shot, refiled(half_size_shot.capture, **planted))
+    assert filed_right(half_size_shot, found)
+    for landmark, views in half_size_shot.capture.features.items():
+        assert found.capture.features[landmark].keys() == views.keys()
+    assert [warning.code for warning in found.warnings] == [code]
+    assert "cam04 and cam06 hold each other's" in found.warnings[0].message
+
+
+def test_an_exchange_is_refused_where_the_settings_say_so(half_size_shot):
+    with pytest.raises(ExchangedPictures, match="cam04 and cam06 hold each other's pictures"):
+        judged(half_size_shot, refiled(half_size_shot.capture, pictures=EXCHANGE, plates=EXCHANGE), "refuse")
+    with pytest.raises(ExchangedPictures, match="clean plates"):
+        judged(half_size_shot, refiled(half_size_shot.capture, plates=EXCHANGE), "refuse")
+
+
+def test_a_duplicated_picture_is_left_to_its_own_camera(half_size_shot):
+    copied = refiled(half_size_shot.capture, pictures={"cam08": "cam07"}, plates={"cam08": "cam07"})
+    found = judged(half_size_shot, copied)
+    (warning,) = found.warnings
+    assert warning.code == "picture-duplicated"
+    assert warning.message.startswith("cam08 holds the same picture as cam07")
+    assert [name for name, s in found.silhouettes.items() if not s.quality.usable] == ["cam08"]
+
+
+def test_plates_of_one_backdrop_are_nobodys(half_size_shot):
+    """Where every camera has the same cloth behind the subject, nothing is said about whose plate is whose."""
+    shot, capture = half_size_shot, half_size_shot.capture
+    same = Capture(capture.images, {name: capture.backgrounds["cam00"] for name in shot.rig.names})
+    assert misplaced_plates(same, shot.rig) == {}
+
+
+def test_segmentation_of_exchanged_cables_ends_where_that_of_good_ones_does(half_size_shot):
+    shot, settings = half_size_shot, Settings().segmentation
+
+    def segmented(capture: Capture):
+        return segment(capture, shot.rig, settings, report=lambda stage, share: None)
+
+    exchanged = refiled(shot.capture, pictures=EXCHANGE, plates=EXCHANGE)
+    found = own_pictures(exchanged, shot.rig, segmented, exchanged="repair")
+    good = segmented(shot.capture)
+    assert all(np.array_equal(found.silhouettes[name].mask, good[name].mask) for name in shot.rig.names)

@@ -1,0 +1,221 @@
+"""Capture folders: what is written is read back; every layout of the contract; every fault named at once."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rig.camera import Camera, Intrinsics
+from rig.capture import Capture
+from rig.errors import InputError
+from rig.formats.capture_folder import capture_root, read_capture, write_capture
+from rig.formats.features_json import features_from_bytes
+from rig.formats.images import read_image, write_image
+from rig.geometry import look_at
+from rig.rig import Rig
+from tests.support.shared_data import shared
+
+RNG = np.random.default_rng(0)
+HEIGHT, WIDTH = 48, 64
+
+
+def small_rig() -> Rig:
+    intrinsics = Intrinsics(WIDTH, HEIGHT, 90.0, 90.0, 31.5, 23.5)
+    places = ([-300.0, 0.0, 900.0], [0.0, 0.0, 1000.0], [300.0, 0.0, 900.0])
+    up = np.array([0.0, 1.0, 0.0])
+    return Rig(
+        tuple(Camera(n, intrinsics, look_at(np.array(p), np.zeros(3), up)) for n, p in zip("abc", places, strict=True))
+    )
+
+
+def picture() -> np.ndarray:
+    return RNG.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def small_capture() -> Capture:
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[10:40, 20:50] = True
+    return Capture(
+        images={name: picture() for name in "abc"},
+        backgrounds={"a": (picture(),), "b": (picture(), picture())},
+        masks={"c": mask},
+        features={"pronasale": {"a": np.array([31.25, 20.5]), "b": np.array([-0.5, 47.5])}},
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_capture(tmp_path / "shot", small_capture(), small_rig())
+    return tmp_path / "shot"
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    capture = small_capture()
+    write_capture(tmp_path, capture, small_rig())
+    again, rig = read_capture(tmp_path)
+    assert rig.names == ("a", "b", "c")
+    for name in "abc":
+        np.testing.assert_array_equal(again.images[name], capture.images[name])
+        assert not again.images[name].flags.writeable
+    assert {name: len(plates) for name, plates in again.backgrounds.items()} == {"a": 1, "b": 2}
+    np.testing.assert_array_equal(again.backgrounds["b"][1], capture.backgrounds["b"][1])
+    np.testing.assert_array_equal(again.masks["c"], capture.masks["c"])
+    np.testing.assert_array_equal(again.features["pronasale"]["b"], [-0.5, 47.5])
+    files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert set(again.digests) == files
+    assert list(again.digests) == sorted(again.digests)
+
+
+def test_images_are_rgb(tmp_path: Path) -> None:
+    red = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    red[..., 0] = 255
+    write_image(tmp_path / "red.png", red)
+    np.testing.assert_array_equal(read_image(tmp_path / "red.png"), red)
+    stored = np.asarray(cv2.imread(str(tmp_path / "red.png")))
+    assert stored[0, 0].tolist() == [0, 0, 255]  # OpenCV's order is the other one
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".tif", ".webp"])
+def test_other_formats_are_read(folder: Path, suffix: str) -> None:
+    grey = np.full((HEIGHT, WIDTH, 3), 117, np.uint8)
+    (folder / "images" / "a.png").unlink()
+    cv2.imwrite(str(folder / "images" / f"a{suffix}"), grey)
+    capture, _ = read_capture(folder)
+    assert np.abs(capture.images["a"].astype(int) - 117).max() <= 2
+
+
+def test_an_exif_turn_is_not_obeyed(folder: Path) -> None:
+    """The calibration holds for the sensor's rows and columns."""
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0112] = 6  # rotate by 90 degrees to look at
+    (folder / "images" / "a.png").unlink()
+    Image.fromarray(picture()).save(folder / "images" / "a.jpg", exif=exif)
+    capture, _ = read_capture(folder)
+    assert capture.images["a"].shape == (HEIGHT, WIDTH, 3)
+
+
+def test_one_enclosing_folder(folder: Path) -> None:
+    (folder.parent / "__MACOSX").mkdir()
+    assert capture_root(folder.parent) == folder
+    assert set(read_capture(folder.parent)[0].images) == set("abc")
+
+
+def test_a_colmap_model_in_place_of_cameras_json(folder: Path) -> None:
+    from rig.formats.colmap import write_colmap
+
+    rig = small_rig()
+    (folder / "cameras.json").unlink()
+    write_colmap(rig, folder / "sparse" / "0")
+    capture, again = read_capture(folder)
+    assert again.names == rig.names
+    # Both files that were read count for the digest, and the points, which were not, do not.
+    assert {path for path in capture.digests if path.startswith("sparse")} == {
+        "sparse/0/cameras.txt",
+        "sparse/0/images.txt",
+    }
+
+
+def damage(path: str, data: bytes) -> Callable[[Path], None]:
+    def harm(folder: Path) -> None:
+        (folder / path).write_bytes(data)
+
+    return harm
+
+
+def remove(path: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / path).unlink()
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def points(document: Any) -> Callable[[Path], None]:
+    return damage("features.json", json.dumps(document).encode())
+
+
+def feature(views: Any) -> Callable[[Path], None]:
+    return points({"format": "eigenhead-features/1", "points": {"pronasale": views}})
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (remove("images/b.png"), "images/b.png is missing"),
+        (remove("background/a.png"), "background/a.png is missing: a clean plate, or masks/a.png, is needed"),
+        (damage("images/b.png", b"no picture"), "images/b.png is damaged or no PNG, JPEG, TIFF or WebP image"),
+        (damage("images/b.png", png(picture())[:-40]), "images/b.png is damaged: its pixels cannot be decoded"),
+        (damage("images/b.png", png(picture()[:20])), "images/b.png is 64 x 20 pixels, but its camera is 64 x 48"),
+        (damage("images/b.jpg", png(picture())), "images/ holds b.jpg and b.png: which one is meant?"),
+        (damage("background/b/001.png", b""), "background/b/001.png is damaged"),
+        (damage("masks/c.png", png(np.zeros((HEIGHT, WIDTH), np.uint8))), "masks/c.png is empty"),
+        (damage("features.json", b"{"), "features.json cannot be read as JSON"),
+        (points([]), "features.json is no object"),
+        (points({"points": {}}), "features.json: format is None"),
+        (feature([1, 2]), "'pronasale' is no object of camera"),
+        (feature({"z": [1, 2]}), "names camera 'z', which the rig does not have"),
+        (feature({"a": [1]}), "is no pair of finite pixels"),
+        (feature({"a": [1, float("nan")]}), "is no pair of finite pixels"),
+        (feature({"a": [1, 10**400]}), "is no pair of finite pixels"),
+        (feature({"a": [True, 2]}), "is no pair of finite pixels"),
+        (feature({"a": [64.0, 2]}), "lies outside the image"),
+    ],
+)
+def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str) -> None:
+    harm(folder)
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    assert len(caught.value.faults) == 1
+    assert words in caught.value.faults[0]
+
+
+def test_all_faults_are_named_at_once(folder: Path) -> None:
+    (folder / "images" / "a.png").unlink()
+    (folder / "images" / "b.png").write_bytes(b"")
+    (folder / "features.json").write_text("[]")
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    assert len(caught.value.faults) == 3
+
+
+def test_a_rig_s_faults_come_with_its_file_s_name(folder: Path) -> None:
+    (folder / "cameras.json").write_text("{}")
+    with pytest.raises(InputError, match=r"capture: cameras\.json: "):
+        read_capture(folder)
+    (folder / "cameras.json").unlink()
+    with pytest.raises(InputError, match=r"holds no cameras\.json"):
+        read_capture(folder)
+    with pytest.raises(InputError, match="is no folder"):
+        read_capture(folder / "absent")
+
+
+def test_a_picture_too_large_is_refused_before_it_is_decoded(folder: Path) -> None:
+    import struct
+    import zlib
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    chunk = b"IHDR" + header
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (folder / "images" / "a.png").write_bytes(bomb)
+    with pytest.raises(InputError, match=r"images/a\.png is (60000 x 60000 pixels|damaged)"):
+        read_capture(folder)
+
+
+def test_too_many_points_are_refused() -> None:
+    faults: list[str] = []
+    document = {"format": "eigenhead-features/1", "points": {f"p{i}": {} for i in range(201)}}
+    assert features_from_bytes(json.dumps(document).encode(), small_rig(), faults) == {}
+    assert "201 points, at most 200" in faults[0]
+
+
+def test_the_shared_capture_is_read() -> None:
+    capture, rig = read_capture(shared("data/captures/scan-a"))
+    assert len(rig) == len(capture.images) == 11
+    assert not any(camera.intrinsics.distortion.is_zero for camera in rig)
+    assert len(capture.features) == 7

@@ -1,0 +1,246 @@
+"""Foreign rig files: what is written is read back the same, by us and by pycolmap; damage always ends in InputError."""
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rig.camera import Camera, Distortion, Intrinsics
+from rig.errors import InputError
+from rig.formats.cameras_file import FORMATS, find_rig_file, read_rig_file, write_rig_file
+from rig.formats.cameras_json import write_rig
+from rig.formats.colmap import write_colmap
+from rig.formats.opencv_toml import write_aniposelib, write_caliscope
+from rig.geometry import look_at
+from rig.rig import Rig
+from tests.support.shared_data import shared
+
+POINTS = np.random.default_rng(4).uniform(-80.0, 80.0, (20, 3))
+
+
+def fan(count: int = 5) -> Rig:
+    cameras = []
+    for i, azimuth in enumerate(np.linspace(-1.2, 1.2, count)):
+        centre = np.array([900 * np.sin(azimuth), 90.0 * i - 150, 900 * np.cos(azimuth)])
+        lens = Distortion(-0.11 + 0.02 * i, 0.05, 1e-3 * i, -7e-4, 0.013)
+        intrinsics = Intrinsics(1024 + i, 768, 1500.0 + i, 1510.0, 511.5 + i, 380.25, lens)
+        cameras.append(Camera(f"cam{i:02d}", intrinsics, look_at(centre, np.zeros(3), np.array([0.0, 1.0, 0.0]))))
+    return Rig(tuple(cameras))
+
+
+def write(kind: str, rig: Rig, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    match kind:
+        case "ours":
+            write_rig(rig, folder / "cameras.json")
+        case "colmap text":
+            write_colmap(rig, folder / "sparse" / "0")
+        case "colmap binary":
+            write_colmap(rig, folder, binary=True)
+        case "caliscope":
+            write_caliscope(rig, folder / "camera_array.toml")
+        case "aniposelib":
+            write_aniposelib(rig, folder / "calibration.toml")
+
+
+KINDS = ("ours", "colmap text", "colmap binary", "caliscope", "aniposelib")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_written_is_read_back(kind: str, tmp_path: Path) -> None:
+    rig = fan()
+    write(kind, rig, tmp_path)
+    (tmp_path / "board.toml").write_text('kind = "checkerboard"\n')  # no rig: must not be taken for one
+    path = find_rig_file(tmp_path)
+    assert path is not None
+    back = read_rig_file(path)
+    assert back.names == rig.names
+    for ours, theirs in zip(rig, back, strict=True):
+        assert theirs.intrinsics.width == ours.intrinsics.width
+        np.testing.assert_allclose(theirs.project(POINTS), ours.project(POINTS), atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_format_is_written_and_found_again(kind: str, tmp_path: Path) -> None:
+    names = {"eigenhead": "cameras.json", "caliscope": "camera_array.toml", "aniposelib": "calibration.toml"}
+    write_rig_file(fan(), tmp_path / names.get(kind, "sparse/0"), kind)
+    file = find_rig_file(tmp_path)
+    assert file is not None
+    assert read_rig_file(file).names == fan().names
+    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
+        write_rig_file(fan(), tmp_path / "x", "ply")
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_pycolmap_loads_what_is_exported(binary: bool, tmp_path: Path) -> None:
+    rig = fan()
+    write_colmap(rig, tmp_path, binary=binary)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert len(model.images) == len(rig)
+    for image in model.images.values():
+        camera = rig[Path(image.name).stem]
+        theirs = np.array([image.project_point(point) for point in POINTS])
+        np.testing.assert_allclose(theirs - 0.5, camera.project(POINTS), atol=1e-8)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_models_written_by_pycolmap_are_read(binary: bool, tmp_path: Path) -> None:
+    rig = fan()
+    write_colmap(rig, tmp_path / "in")
+    model = pycolmap.Reconstruction(str(tmp_path / "in"))
+    out = tmp_path / "capture" / "sparse" / "0"
+    out.mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(str(out))
+    path = find_rig_file(tmp_path / "capture")
+    assert path is not None
+    back = read_rig_file(path)
+    assert sorted(back.names) == sorted(rig.names)
+    for camera in rig:
+        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-8)
+
+
+def test_simple_colmap_models_and_folders_of_images(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text(
+        "# c\n1 SIMPLE_PINHOLE 640 480 700 320 240\n2 RADIAL 640 480 710 320 240 0.1 -0.2\n"
+    )
+    poses = "".join(f"{i} 1 0 0 0 {i} 0 900 {1 + i % 2} cam{i}/shot.jpg\n10.5 11.5 -1\n" for i in range(3))
+    (tmp_path / "images.txt").write_text(poses)
+    rig = read_rig_file(tmp_path / "cameras.txt")
+    assert rig.names == ("cam0", "cam1", "cam2")
+    assert rig["cam0"].intrinsics == Intrinsics(640, 480, 700.0, 700.0, 319.5, 239.5)
+    assert rig["cam1"].intrinsics.distortion == Distortion(0.1, -0.2)
+
+
+def test_the_published_caliscope_file(tmp_path: Path) -> None:
+    rig = read_rig_file(shared("data/multicam-board/camera_array.toml"))
+    assert rig.names == ("cam_0", "cam_1", "cam_2", "cam_3")
+    np.testing.assert_allclose(rig["cam_0"].camera_from_world.translation, [171.2599, -32.3454, 1208.3865], atol=1e-3)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("", 1.0), ("", 1000.0), ('unit = "mm"', 1.0), ('unit = "m"', 1000.0)])
+def test_the_unit_of_an_aniposelib_file(unit: str, scale: float, tmp_path: Path) -> None:
+    rig = fan(3)
+    metres = tuple(
+        replace(c, camera_from_world=replace(c.camera_from_world, translation=c.camera_from_world.translation / scale))
+        for c in rig
+    )
+    path = tmp_path / "calibration.toml"
+    write_aniposelib(Rig(metres), path)
+    path.write_text(path.read_text().replace('unit = "mm"', unit))
+    back = read_rig_file(path)
+    np.testing.assert_allclose(back["cam01"].camera_from_world.translation, rig["cam01"].camera_from_world.translation)
+
+
+def corrupted(kind: str, folder: Path) -> Path:
+    """A rig file with one or more faults, named by the key of the table below."""
+    write("colmap text" if "text" in kind else "colmap binary" if "binary" in kind else "aniposelib", fan(), folder)
+    path = find_rig_file(folder)
+    assert path is not None
+    images = path.with_name(f"images{path.suffix}")
+    match kind:
+        case "binary: truncated cameras":
+            path.write_bytes(path.read_bytes()[:-30])
+        case "binary: truncated images":
+            images.write_bytes(images.read_bytes()[:-3])
+        case "binary: empty":
+            path.write_bytes(b"")
+        case "binary: a huge count":
+            path.write_bytes(struct.pack("<Q", 1 << 60) + path.read_bytes()[8:])
+        case "binary: a huge count of points":
+            images.write_bytes(images.read_bytes()[:-8] + struct.pack("<Q", 1 << 62))
+        case "binary: NaN focal length":
+            data = bytearray(path.read_bytes())
+            data[8 + 24 : 8 + 32] = struct.pack("<d", float("nan"))
+            path.write_bytes(data)
+        case "binary: fisheye":
+            data = bytearray(path.read_bytes())
+            data[12:16] = struct.pack("<i", 5)
+            path.write_bytes(data)
+        case "binary: no images file":
+            images.unlink()
+        case "text: NaN translation":
+            images.write_text(
+                images.read_text().replace("1 cam00", "1 cam00").replace(" 1 cam00.png", " 1 cam00.png", 1)
+            )
+            first, *rest = images.read_text().splitlines()[2:]
+            words = first.split()
+            words[5] = "nan"
+            images.write_text("\n".join([" ".join(words), *rest]))
+        case "text: zero quaternion":
+            first, *rest = images.read_text().splitlines()[2:]
+            words = first.split()
+            words[1:5] = ["0"] * 4
+            images.write_text("\n".join([" ".join(words), *rest]))
+        case "text: unknown camera":
+            images.write_text(images.read_text().replace("3 cam02.png", "77 cam02.png"))
+        case "text: a parameter is missing":
+            path.write_text(path.read_text().replace(" 0.0 0.0 0.0\n", " 0.0 0.0\n", 1))
+        case "text: too many images":
+            line = images.read_text().splitlines()[2]
+            images.write_text("\n\n".join([line] * 100))
+        case "toml: broken":
+            path.write_text("[cam_0\n")
+        case "toml: NaN rotation and a missing matrix":
+            text = path.read_text().replace("rotation = [", "rotation = [nan, ", 1)
+            path.write_text(text.replace("matrix", "motrix", 2).replace("motrix", "matrix", 1))
+        case "toml: fisheye":
+            path.write_text(path.read_text().replace('name = "cam01"', 'name = "cam01"\nfisheye = true'))
+    return path
+
+
+FAULTS = {
+    "binary: truncated cameras": ["promises|truncated"],
+    "binary: truncated images": ["truncated"],
+    "binary: empty": ["truncated"],
+    "binary: a huge count": ["promises 1152921504606846976"],
+    "binary: a huge count of points": ["promises 4611686018427387904"],
+    "binary: NaN focal length": ["cam00.intrinsics.fx"],
+    "binary: fisheye": ["number 5"],
+    "binary: no images file": ["cannot be read"],
+    "text: NaN translation": ["cam00.camera_from_world.translation"],
+    "text: zero quaternion": ["cam00.camera_from_world.rotation"],
+    "text: unknown camera": ["'cam02' names camera 77"],
+    "text: a parameter is missing": ["has 11 parameters"],
+    "text: too many images": ["images; a rig has at most"],
+    "toml: broken": ["cannot be understood"],
+    "toml: NaN rotation and a missing matrix": ["matrix is missing", "rotation"],
+    "toml: fisheye": ["cam01 is a fisheye camera"],
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_each_fault_is_named(kind: str, tmp_path: Path) -> None:
+    path = corrupted(kind, tmp_path)
+    for expected in FAULTS[kind]:
+        with pytest.raises(InputError, match=expected):
+            read_rig_file(path)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    kind=st.sampled_from(KINDS[1:]),
+    which=st.integers(0, 1),
+    cut=st.integers(0, 2000),
+    at=st.integers(0, 2000),
+    patch=st.binary(max_size=12),
+)
+def test_no_damage_escapes_as_another_error(
+    kind: str, which: int, cut: int, at: int, patch: bytes, tmp_path: Path
+) -> None:
+    write(kind, fan(3), tmp_path)
+    path = {"colmap text": tmp_path / "sparse/0/cameras.txt", "colmap binary": tmp_path / "cameras.bin"}.get(kind)
+    path = path or tmp_path / ("camera_array.toml" if kind == "caliscope" else "calibration.toml")
+    damaged = path.with_name(path.name.replace("cameras", "images")) if which and "colmap" in kind else path
+    data = damaged.read_bytes()
+    data = data[:at] + patch + data[at + len(patch) :]
+    damaged.write_bytes(data[: len(data) - cut] if cut < len(data) // 2 else data)
+    try:
+        rig = read_rig_file(path)
+    except InputError:
+        return
+    assert all(np.isfinite(camera.camera_from_world.rotation).all() for camera in rig)

@@ -1,0 +1,147 @@
+"""rig.toml: the example is read, and every wrong file is refused with what to do."""
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rig.errors import InputError
+from rig.formats.rig_toml import (
+    CameraConfig,
+    LightsConfig,
+    RigConfig,
+    ShotConfig,
+    TriggerConfig,
+    read_rig_config,
+    rig_config_from_document,
+)
+
+EXAMPLE = Path(__file__).resolve().parents[3] / "deploy" / "rig.example.toml"
+
+
+def document(**changes: Any) -> dict[str, Any]:
+    camera = {"name": "cam00", "driver": "opencv", "identity": "http://127.0.0.1:8000/cam00.mjpeg"}
+    return {"format": "eigenhead-rig/1", "cameras": [camera], **changes}
+
+
+def faults_of(changed: dict[str, Any]) -> str:
+    with pytest.raises(InputError) as caught:
+        rig_config_from_document(changed, Path())
+    return str(caught.value)
+
+
+def test_example_describes_eleven_cameras() -> None:
+    config = read_rig_config(EXAMPLE)
+    assert config.names == tuple(f"cam{i:02}" for i in range(11))
+    assert {camera.driver for camera in config.cameras} == {"genicam", "gphoto", "opencv"}
+    assert config.calibration_file == EXAMPLE.parent / "cameras.json"
+    assert config.lights.outputs == (0, 1)
+
+
+def test_example_shows_every_key() -> None:
+    written = tomllib.loads(EXAMPLE.read_text())
+    of_cameras = {key for camera in written["cameras"] for key in camera}
+    for kind, keys in (
+        (RigConfig, set(written) | {"folder"}),
+        (CameraConfig, of_cameras),
+        (TriggerConfig, set(written["trigger"])),
+        (LightsConfig, set(written["lights"])),
+        (ShotConfig, set(written["shot"])),
+    ):
+        assert {field.name for field in dataclasses.fields(kind)} == keys
+
+
+def test_defaults_suffice() -> None:
+    config = rig_config_from_document(document(), Path("/rigs"))
+    assert config.cameras[0].trigger == "external"
+    assert config.plates_folder == Path("/rigs/plates")
+    assert config.calibration_file is None
+
+
+def test_unknown_keys_are_refused_with_the_nearest() -> None:
+    changed = document(shot={"skew_most": 3.0}, triger={"port": "x"})
+    changed["cameras"][0]["identty"] = "x"
+    message = faults_of(changed)
+    assert "shot.skew_most: no such key; did you mean 'skew_most_ms'?" in message
+    assert "triger: no such key; did you mean 'trigger'?" in message
+    assert "cameras.cam00.identty: no such key; did you mean 'identity'?" in message
+
+
+@pytest.mark.parametrize("identity", ["0", "11", "/dev/video0", "usb:001,004", "cam#2", " 3 "])
+def test_a_camera_by_index_is_refused(identity: str) -> None:
+    changed = document()
+    changed["cameras"][0]["identity"] = identity
+    assert "is an index" in faults_of(changed)
+
+
+@pytest.mark.parametrize(
+    "identity",
+    ["40012345", "/dev/v4l/by-id/usb-046d_C920-video-index0", "rtsp://10.0.0.2/1", "Fake_1", "captures/a#cam00"],
+)
+def test_what_survives_a_reboot_is_accepted(identity: str) -> None:
+    changed = document()
+    changed["cameras"][0]["identity"] = identity
+    assert rig_config_from_document(changed, Path()).cameras[0].identity == identity
+
+
+@pytest.mark.parametrize("port", ["/dev/ttyUSB0", "/dev/ttyACM1", "COM3", "0"])
+def test_a_trigger_port_by_index_is_refused(port: str) -> None:
+    assert "/dev/serial/by-id" in faults_of(document(trigger={"port": port}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"format": "eigenhead-rig/9"}, "format: 'eigenhead-rig/9' is not allowed"),
+        ({"cameras": []}, "add one [[cameras]] table"),
+        ({"cameras": {}}, "cameras: is no list"),
+        ({"cameras": [7]}, "cameras[0]: is no table"),
+        ({"front": "cam0"}, "did you mean 'cam00'?"),
+        ({"lights": {"outputs": [5]}}, "5 is no output"),
+        ({"lights": {"keep_on": 1}}, "lights.keep_on: 1 is no true or false"),
+        ({"shot": {"warm_up_frames": 0}}, "warm_up_frames: 0 is too small; at least 1"),
+        ({"shot": {"timeout_s": "2"}}, "shot.timeout_s: '2' is no number"),
+        ({"trigger": {}}, "trigger.port: missing"),
+        ({"trigger": {"port": "/dev/serial/by-id/x", "pulse_us": 0}}, "pulse_us: 0"),
+    ],
+)
+def test_wrong_values_are_named(changes: dict[str, Any], expected: str) -> None:
+    assert expected in faults_of(document(**changes))
+
+
+@pytest.mark.parametrize(
+    ("camera", "expected"),
+    [
+        ({"driver": "opencvv"}, "did you mean 'opencv'?"),
+        ({"rotation_deg": 45}, "one of 0, 90, 180, 270"),
+        ({"rotation_deg": True}, "rotation_deg: True is not allowed"),
+        ({"channel": 12}, "channel: 12"),
+        ({"channel": 1}, "there is no [trigger] table"),
+        ({"delay_us": -1}, "delay_us: -1"),
+        ({"width": 1.5}, "width: 1.5 is no whole number"),
+        ({"name": "a/b"}, "name: "),
+        ({"identity": ""}, "identity: empty"),
+    ],
+)
+def test_wrong_cameras_are_named(camera: dict[str, Any], expected: str) -> None:
+    changed = document()
+    changed["cameras"][0] |= camera
+    assert expected in faults_of(changed)
+
+
+def test_every_fault_is_listed_and_doubles_are_found() -> None:
+    camera = {"name": "a", "driver": "opencv", "identity": "http://h/1", "channel": 2}
+    changed = document(cameras=[camera, dict(camera)], trigger={"port": "/dev/serial/by-id/x"})
+    message = faults_of(changed)
+    for what in ("name 'a'", "identity 'http://h/1'", "channel 2"):
+        assert f"cameras: {what} is used by 2 cameras" in message
+
+
+def test_files_that_are_no_rig(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"start from deploy/rig\.example\.toml"):
+        read_rig_config(tmp_path / "rig.toml")
+    (tmp_path / "rig.toml").write_text("format = ")
+    with pytest.raises(InputError, match="is no TOML"):
+        read_rig_config(tmp_path / "rig.toml")

@@ -1,0 +1,86 @@
+"""Faults planted in the studio's rig, and good rigs that none may be found in."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rig.camera import Distortion
+from rig.geometry import RigidTransform, rotation_from_vector
+from rig.plausibility import rig_faults
+from rig.rig import Rig
+from rig.studio.scene.layout import ARRANGEMENTS_DEG, arrangement, default_layout
+from tests.support.scenes import fan
+
+GL = np.diag([1.0, -1.0, -1.0])
+
+
+def posed(rig, pose):
+    return Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
+
+
+def lensed(rig, name, lens):
+    changed = [
+        replace(c, intrinsics=replace(c.intrinsics, distortion=lens)) if c.name == name else c for c in rig.cameras
+    ]
+    return Rig(tuple(changed))
+
+
+def in_another_world(rig, rng):
+    world_from_new = RigidTransform(rotation_from_vector(rng.normal(0, 1, 3)), rng.normal(0, 800, 3))
+    return posed(rig, lambda pose: pose @ world_from_new)
+
+
+def test_good_rigs_have_no_faults_in_any_world():
+    rng = np.random.default_rng(0)
+    for rig in (default_layout(), fan(), *map(arrangement, ARRANGEMENTS_DEG)):
+        assert rig_faults(rig) == []
+        for _ in range(5):
+            some = rig.subset(rng.choice(rig.names, rng.integers(3, len(rig) + 1), replace=False))
+            assert rig_faults(in_another_world(some, rng)) == []
+
+
+def test_strong_but_real_lenses_have_no_faults():
+    rig = default_layout()
+    wide = Rig(tuple(replace(c, intrinsics=replace(c.intrinsics, fx=600.0, fy=600.0)) for c in rig))
+    assert rig_faults(lensed(wide, "cam03", Distortion(k1=-0.3, k2=0.1, k3=-0.015))) == []
+    assert rig_faults(lensed(rig, "cam03", Distortion(k1=0.5, k2=-0.3))) == []
+
+
+@pytest.mark.parametrize("k1", [50.0, -50.0, 1e6])
+def test_an_absurd_lens_is_named(k1):
+    (fault,) = rig_faults(lensed(default_layout(), "cam05", Distortion(k1=k1)))
+    assert fault.startswith("cam05: the lens is absurd (k1 = ")
+
+
+def test_cameras_at_one_place_are_named():
+    place = np.array([1.0, 2.0, 3.0])
+    one = posed(default_layout(), lambda pose: RigidTransform(pose.rotation, -pose.rotation @ place))
+    (fault,) = rig_faults(one)
+    assert "every camera stands at one place" in fault
+
+
+def test_metres_are_recognised():
+    (fault,) = rig_faults(posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation / 1000)))
+    assert "look like metres" in fault
+    assert "multiply them by 1000" in fault
+
+
+@pytest.mark.parametrize(
+    ("written", "word"),
+    [
+        (lambda pose: pose.inverse(), "world_from_camera: "),
+        (lambda pose: RigidTransform(pose.rotation, pose.inverse().translation), "place in translation"),
+        (lambda pose: RigidTransform(GL @ pose.rotation, GL @ pose.translation), "y up and z backwards"),
+        (
+            lambda pose: RigidTransform(pose.rotation.T @ GL, pose.inverse().translation),
+            "world_from_camera with y up and z backwards",
+        ),
+    ],
+    ids=["inverse", "centres", "GL", "inverse GL"],
+)
+def test_another_convention_is_recognised_by_trying_it(written, word):
+    rng = np.random.default_rng(3)
+    for rig in (default_layout(), in_another_world(default_layout(), rng), arrangement("a")):
+        (fault,) = rig_faults(posed(rig, written))
+        assert word in fault

@@ -1,0 +1,60 @@
+"""``eigenhead doctor``: what it finds, and that it makes nothing."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from server.cli import doctor
+from server.services.keys import Keys
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+
+
+@pytest.fixture
+def examine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict]:
+    """Without the two checks that load what is heavy."""
+    for name in ("_egl", "_model"):
+        monkeypatch.setattr(doctor, name, lambda settings: (True, "not looked at"))
+    return lambda **given: doctor.examine(ServiceSettings(**given))
+
+
+def test_it_makes_nothing(examine: Callable[..., dict], tmp_path: Path) -> None:
+    found = examine(data=tmp_path / "none" / "yet")
+    assert found["data"]["ok"]
+    assert "will make it" in found["data"]["detail"]
+    assert "will make it" in found["database"]["detail"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_it_reads_a_database_without_touching_the_folder(examine: Callable[..., dict], tmp_path: Path) -> None:
+    engine = open_database(ServiceSettings(data=tmp_path))
+    Keys(engine).add("console", ("read",))
+    engine.dispose()
+    before = sorted(tmp_path.iterdir())
+    assert f"{tmp_path}, 0 workers alive, 1 API keys" in examine(data=tmp_path)["database"]["detail"]
+    assert sorted(tmp_path.iterdir()) == before
+    (tmp_path / "eigenhead.sqlite").write_bytes(b"no database" * 1000)
+    assert not examine(data=tmp_path)["database"]["ok"]
+
+
+def test_it_names_misspelt_variables_and_a_missing_rig_file(
+    examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EIGENHEAD_KEEP_JOB", "3")
+    found = examine(data=tmp_path, rig=tmp_path / "rig.toml")
+    assert not found["variables"]["ok"]
+    assert "EIGENHEAD_KEEP_JOB is not known; did you mean EIGENHEAD_KEEP_JOBS?" in found["variables"]["detail"]
+    assert not found["rig"]["ok"]
+    assert "rig.toml: cannot be read" in found["rig"]["detail"]
+
+
+def test_it_shows_where_data_models_and_keys_live(
+    examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("EIGENHEAD_MODELS", raising=False)
+    monkeypatch.setenv("EIGENHEAD_DATA", str(tmp_path))
+    found = examine()
+    assert found["data"]["detail"].startswith(str(tmp_path))
+    assert found["models"]["detail"].startswith(str(tmp_path / "models"))
+    assert found["database"]["detail"].startswith(str(tmp_path / "eigenhead.sqlite"))

@@ -1,0 +1,169 @@
+"""What a new user meets first: one rule for data and keys, clear refusals before the work, nothing overwritten."""
+
+import json
+import socket
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pipeline.eigenheads.data_folder import data_folder, models_folder
+from server.cli.main import main
+from tests.server.cli.test_main import run as run_apart
+from tests.support.services import small_capture
+
+
+@dataclass(frozen=True)
+class Done:
+    status: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Done]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """The command line in this process, with a data folder of the test's own."""
+    monkeypatch.setenv("EIGENHEAD_DATA", str(tmp_path / "variable"))
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    monkeypatch.delenv("EIGENHEAD_MODELS", raising=False)
+
+    def call(*arguments: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["eigenhead", *map(str, arguments)])
+        status = 0
+        try:
+            main()
+        except SystemExit as end:
+            status = int(end.code or 0)
+        told = capsys.readouterr()
+        return Done(status, told.out, told.err)
+
+    return call
+
+
+def test_data_keys_and_models_follow_one_rule(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("EIGENHEAD_DATA", "EIGENHEAD_MODELS", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert data_folder() == tmp_path / "home/.local/share/eigenhead"
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
+    assert (data_folder(), models_folder()) == (tmp_path / "xdg/eigenhead", tmp_path / "xdg/eigenhead/models")
+    monkeypatch.setenv("EIGENHEAD_DATA", str(tmp_path / "data"))
+    assert (data_folder(), models_folder()) == (tmp_path / "data", tmp_path / "data/models")
+    monkeypatch.setenv("EIGENHEAD_MODELS", str(tmp_path / "models"))
+    assert models_folder() == tmp_path / "models"
+
+
+def test_a_key_is_made_where_data_says_and_says_so(run: Run, tmp_path: Path) -> None:
+    made = run("keys", "add", "console", "--data", tmp_path / "heads", "--json")
+    assert json.loads(made.out)["data"] == str(tmp_path / "heads")
+    assert made.err == f"eigenhead: a key of the service whose data is {tmp_path / 'heads'}\n"
+    assert not (tmp_path / "variable").exists()
+    listed = json.loads(run("keys", "list", "--data", tmp_path / "heads", "--json").out)
+    assert [key["name"] for key in listed["keys"]] == ["console"]
+
+
+def test_models_lie_in_the_data_folder_that_is_named(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "heads" / "models").mkdir(parents=True)
+    (tmp_path / "heads" / "models" / "mine.npz").touch()
+    found = json.loads(run("model", "list", "--data", tmp_path / "heads", "--json").out)["models"]
+    assert found["mine"] == str(tmp_path / "heads" / "models" / "mine.npz")
+    assert "mine" not in json.loads(run("model", "list", "--data", tmp_path / "others", "--json").out)["models"]
+
+
+def test_serve_says_in_one_line_that_its_rig_file_is_missing(run: Run, tmp_path: Path) -> None:
+    done = run("serve", "--rig", tmp_path / "rig.toml")
+    assert (done.status, done.err.count("\n")) == (1, 1)
+    assert "rig.toml: cannot be read (No such file or directory)" in done.err
+
+
+def test_serve_says_in_one_line_that_its_port_is_taken(run: Run) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        done = run("serve", "--port", port)
+    assert (done.status, done.err.count("\n")) == (1, 1)
+    assert f"cannot listen on 127.0.0.1:{port}: another program listens there" in done.err
+
+
+@pytest.mark.parametrize("command", ["serve", "worker"])
+def test_a_database_that_is_down_is_one_line_without_its_password(
+    run: Run, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # and nobody listens
+        url = f"postgresql://eigenhead:secret@127.0.0.1:{closed.getsockname()[1]}/heads"
+        monkeypatch.setenv("EIGENHEAD_DATABASE_URL", url)
+        done = run(command, *(["--port", "0"] if command == "serve" else []))
+    assert (done.status, done.err.count("\n")) == (1, 1)
+    assert "cannot be used" in done.err
+    assert "secret" not in done.err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["reconstruct", "CAPTURE", "--out", "OUT", "--method", "magic"],
+        ["reconstruct", "CAPTURE", "--out", "OUT", "--detail", "everything"],
+        ["reconstruct", "CAPTURE", "--out", "OUT", "--surface", "feet"],
+        ["simulate", "OUT", "--fault", "dark:cam00=much"],
+        ["board", "--out", "OUT", "--kind", "chess"],
+        ["convert", "CAPTURE", "--out", "OUT", "--to", "paper"],
+    ],
+)
+def test_a_wrong_value_of_an_option_is_wrong_usage(run: Run, tmp_path: Path, arguments: list[str]) -> None:
+    places = {"CAPTURE": str(small_capture(tmp_path / "capture")), "OUT": str(tmp_path / "out")}
+    done = run(*[places.get(argument, argument) for argument in arguments])
+    assert done.status == 2, done.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "calibrate", "board", "model build"])
+def test_an_output_that_cannot_be_written_is_found_before_the_work(run: Run, tmp_path: Path, command: str) -> None:
+    (tmp_path / "file").touch()
+    capture, out = small_capture(tmp_path / "capture"), tmp_path / "file" / "inside" / "out"
+    arguments = {
+        "reconstruct": [capture],
+        "calibrate": [capture, "--board", capture / "cameras.json"],
+        "model build": [capture],
+    }
+    done = run(*command.split(), *arguments.get(command, []), "--out", out)
+    assert done.status == 1
+    assert f"{out} cannot be written" in done.err
+
+
+def test_an_empty_archive_is_refused(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "empty.zip").write_bytes(b"")
+    done = run("reconstruct", tmp_path / "empty.zip", "--out", tmp_path / "out")
+    assert (done.status, done.err.count("\n")) == (1, 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["empty.zip"]
+
+
+def test_nothing_that_is_there_is_overwritten_unasked(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "board.toml").write_text("mine")
+    done = run("board", "--out", tmp_path / "board.pdf")
+    assert done.status == 1
+    assert "board.toml is there already" in done.err
+    assert run("board", "--out", tmp_path / "board.pdf", "--overwrite").status == 0
+    assert "checkerboard" in (tmp_path / "board.toml").read_text()
+    capture = small_capture(tmp_path / "capture")
+    done = run("simulate", capture)
+    assert (done.status, done.err.count("\n")) == (1, 1)
+    assert (capture / "cameras.json").is_file()
+
+
+def test_a_damaged_picture_is_told_in_our_words_alone(tmp_path: Path) -> None:
+    """In a process of its own: OpenCV is told to be silent before it is loaded."""
+    capture = small_capture(tmp_path / "capture", size=64)
+    picture = capture / "images" / "cam01.png"
+    data = picture.read_bytes()
+    picture.write_bytes(data[: len(data) // 2])
+    done = run_apart("reconstruct", str(capture), "--out", str(tmp_path / "out"))
+    assert done.returncode == 1
+    assert "images/cam01.png" in done.stderr
+    assert done.stderr.count("\n") == 1

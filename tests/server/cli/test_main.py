@@ -1,0 +1,117 @@
+"""The command line: help, usage errors, one clear line, JSON alone on stdout."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tests.support.services import ROOT, small_capture
+
+COMMANDS = [
+    *("serve", "worker", "reconstruct", "simulate", "demo", "doctor", "board", "calibrate"),
+    *("keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
+    *("model list", "model info", "model import"),
+]
+
+
+def run(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-m", "server.cli", *arguments],
+        env=os.environ | environment,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command: str) -> None:
+    done = run(*command.split(), "--help")
+    assert done.returncode == 0
+    assert f"Example: eigenhead {command}" in done.stdout or "eigenhead worker" in done.stdout
+
+
+def test_help_is_quick() -> None:
+    """CPU time, which a busy machine does not stretch."""
+    began = time.perf_counter()
+    before = os.times().children_user
+    run("--help")
+    assert os.times().children_user - before < 0.3
+    assert time.perf_counter() - began < 10
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--colour"], ["reconstruct"], ["reconstruct", "/nowhere", "--out", "x"], ["serve", "--port", "99999999"]],
+)
+def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path) -> None:
+    done = run(*arguments, EIGENHEAD_DATA=str(tmp_path))
+    assert done.returncode == 2
+    assert done.stdout == ""
+
+
+def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    (folder / "images" / "cam01.png").unlink()
+    done = run("reconstruct", str(folder), "--out", str(tmp_path / "out"), "--json")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("eigenhead: capture: images/cam01.png is missing")
+    assert done.stderr.count("\n") == 1
+    (tmp_path / "bad.zip").write_bytes(b"no archive")
+    done = run("reconstruct", str(tmp_path / "bad.zip"), "--out", str(tmp_path / "out"))
+    assert done.returncode == 1
+    assert "no .zip, .tar or .tar.gz" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_keys_on_the_command_line(tmp_path: Path) -> None:
+    data = {"EIGENHEAD_DATA": str(tmp_path)}
+    made = json.loads(run("keys", "add", "console", "--scope", "read", "--json", **data).stdout)
+    assert made["key"].startswith(f"eh_{made['id']}_")
+    listed = json.loads(run("keys", "list", "--json", **data).stdout)["keys"]
+    assert [(key["id"], key["name"], key["scopes"]) for key in listed] == [(made["id"], "console", ["read"])]
+    assert run("keys", "remove", made["id"], **data).returncode == 0
+    assert run("keys", "remove", made["id"], **data).returncode == 1
+    assert run("keys", "add", "x", "--scope", "everything", **data).returncode == 2
+
+
+def test_a_board_with_its_description_beside_it(tmp_path: Path) -> None:
+    out = tmp_path / "boards" / "board.pdf"
+    done = run("board", "--kind", "charuco", "--squares", "7x5", "--square-mm", "30", "--out", str(out), "--json")
+    written = json.loads(done.stdout)
+    assert Path(written["pdf"]).read_bytes().startswith(b"%PDF")
+    described = tomllib.loads(Path(written["board"]).read_text())
+    assert {key: described[key] for key in ("kind", "columns", "rows", "square_mm")} == {
+        "kind": "charuco",
+        "columns": 7,
+        "rows": 5,
+        "square_mm": 30.0,
+    }
+    assert run("board", "--squares", "seven", "--out", str(out)).returncode == 2
+
+
+def test_what_the_default_model_is() -> None:
+    info = json.loads(run("model", "info", "--json").stdout)
+    assert info["landmarks"] == 26
+    assert set(info["subjects"]) == {"total", "male", "female"}
+    assert run("model", "info", "nobody").returncode == 1
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_the_doctor_finds_a_healthy_machine_and_names_what_is_wrong(tmp_path: Path) -> None:
+    done = run("doctor", "--json", EIGENHEAD_DATA=str(tmp_path))
+    findings = json.loads(done.stdout)
+    assert findings["egl"]["ok"]
+    assert findings["model"]["ok"]
+    (tmp_path / "eigenhead.sqlite").write_bytes(b"no database" * 1000)
+    done = run("doctor", EIGENHEAD_DATA=str(tmp_path))
+    assert done.returncode == 1
+    assert "WRONG  database" in done.stdout

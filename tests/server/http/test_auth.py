@@ -1,0 +1,175 @@
+"""API keys and scopes, the loopback rule, limits of a key, and webhooks that are signed and tried again."""
+
+import base64
+import hashlib
+import hmac
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from rig.formats.archive import pack_folder
+from server.address import is_loopback
+from server.services.keys import KeylessAddress, Keys, check_address
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningService, dict[str, str]]]:
+    """A service with one key for each scope."""
+    data = tmp_path_factory.mktemp("guarded") / "data"
+    engine = open_database(ServiceSettings(data=data))
+    keys = {scope: Keys(engine).add(scope, (scope,)) for scope in ("read", "capture", "submit", "admin")}
+    engine.dispose()
+    with running_service(data, jobs_per_key="3") as service:
+        yield service, keys
+
+
+def client_of(service: RunningService, key: str | None) -> httpx.Client:
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+    return httpx.Client(base_url=service.url, headers=headers, timeout=30)
+
+
+def test_each_scope_does_what_it_may_and_no_more(
+    guarded: tuple[RunningService, dict[str, str]], tmp_path: Path
+) -> None:
+    service, keys = guarded
+    pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
+    files = {"file": (tmp_path / "capture.tar").read_bytes()}
+    calls: dict[str, Any] = {
+        "read": lambda client: client.get("/v1/jobs"),
+        "capture": lambda client: client.post("/v1/captures/uploads", files=files),
+        "submit": lambda client: client.post("/v1/jobs", json={"capture_id": "0" * 28}),
+        "admin": lambda client: client.get("/v1/keys"),
+    }
+    for holder, key in keys.items():
+        with client_of(service, key) as client:
+            for scope, call in calls.items():
+                allowed = scope == holder or holder == "admin"
+                assert (call(client).status_code != 403) == allowed, (holder, scope)
+    for key in (None, "eh_000000000000_wrong", keys["read"][:-1] + "x", "nonsense"):
+        with client_of(service, key) as client:
+            for call in calls.values():
+                refused = call(client)
+                assert refused.status_code == 401
+                assert refused.json()["type"].endswith("key-missing" if key is None else "key-invalid")
+            assert client.get("/healthz").status_code == 200
+
+
+def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(
+    guarded: tuple[RunningService, dict[str, str]],
+) -> None:
+    service, keys = guarded
+    with client_of(service, keys["admin"]) as admin:
+        made = admin.post("/v1/keys", json={"name": "short", "scopes": ["read"]}).json()
+        with client_of(service, made["key"]) as client:
+            assert client.get("/v1/jobs").status_code == 200
+            assert admin.delete(f"/v1/keys/{made['id']}").status_code == 204
+            assert client.get("/v1/jobs").status_code == 401
+        assert admin.delete(f"/v1/keys/{keys['admin'].split('_')[1]}").status_code == 409
+
+
+def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]], tmp_path: Path) -> None:
+    service, keys = guarded
+    pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
+    with client_of(service, keys["admin"]) as client:
+        capture = client.post("/v1/captures/uploads", files={"file": (tmp_path / "capture.tar").read_bytes()}).json()
+        job = {"capture_id": capture["id"], "settings": {"front": "long"}}
+        jobs = [client.post("/v1/jobs", json=job) for _ in range(4)]
+        assert [response.status_code for response in jobs] == [202, 202, 202, 429]
+        assert "retry-after" in jobs[3].headers
+        for response in jobs[:3]:
+            client.post(f"/v1/jobs/{response.json()['id']}/cancel")
+
+
+def test_the_secret_is_not_stored(guarded: tuple[RunningService, dict[str, str]]) -> None:
+    service, keys = guarded
+    stored = b"".join(path.read_bytes() for path in service.data.glob("eigenhead.sqlite*"))
+    for key in keys.values():
+        assert key.split("_", 2)[2].encode() not in stored
+
+
+def test_no_listening_elsewhere_without_a_key(tmp_path: Path) -> None:
+    assert [is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "0.0.0.0", "10.0.0.7", "::")] == [
+        *[True] * 3,
+        *[False] * 3,
+    ]
+    open_ = ServiceSettings(data=tmp_path, host="0.0.0.0")
+    proxied = ServiceSettings(data=tmp_path, public_url="https://heads.example")
+    engine = open_database(open_)
+    with pytest.raises(KeylessAddress, match=r"0\.0\.0\.0"):
+        check_address(open_, Keys(engine))
+    with pytest.raises(KeylessAddress, match=r"https://heads\.example"):
+        check_address(proxied, Keys(engine))
+    Keys(engine).add("console", ("read",))
+    check_address(open_, Keys(engine))
+    check_address(proxied, Keys(engine))
+    engine.dispose()
+    command = [sys.executable, "-m", "server.cli", "serve", "--host", "0.0.0.0", "--port", "0"]
+    refused = subprocess.run(
+        command,
+        env=os.environ | {"EIGENHEAD_DATA": str(tmp_path / "other")},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert refused.returncode == 1
+    assert refused.stderr.count("\n") == 1
+    assert "API key" in refused.stderr
+
+
+@pytest.mark.slow
+def test_webhooks_are_signed_and_tried_again(tmp_path: Path) -> None:
+    received: list[tuple[dict[str, str], bytes]] = []
+
+    class Receiver(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["content-length"]))
+            received.append(({k.lower(): v for k, v in self.headers.items()}, body))
+            self.send_response(500 if len(received) == 1 else 204)  # the first attempt fails
+            self.end_headers()
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    receiver = HTTPServer(("127.0.0.1", 0), Receiver)
+    threading.Thread(target=receiver.serve_forever, daemon=True).start()
+    try:
+        with running_service(tmp_path / "data") as service, client_of(service, None) as client:
+            url = f"http://127.0.0.1:{receiver.server_port}/hook"
+            hook = client.post("/v1/webhooks", json={"url": url}).json()
+            assert "secret" not in client.get("/v1/webhooks").json()["webhooks"][0]
+            pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
+            capture = client.post(
+                "/v1/captures/uploads", files={"file": (tmp_path / "capture.tar").read_bytes()}
+            ).json()
+            job = client.post("/v1/jobs", json={"capture_id": capture["id"]}).json()
+            await_state(client, job["id"], ("succeeded",))
+            deadline = time.monotonic() + 30
+            while len(received) < 2 and time.monotonic() < deadline:
+                time.sleep(0.1)
+    finally:
+        receiver.shutdown()
+        receiver.server_close()
+    assert len(received) == 2
+    (first, body), (second, again) = received
+    assert first["webhook-id"] == second["webhook-id"]
+    assert body == again
+    assert json.loads(body) == {"type": "job.succeeded", "data": {"job_id": job["id"]}}
+    key = base64.b64decode(hook["secret"].removeprefix("whsec_"))
+    signed = f"{second['webhook-id']}.{second['webhook-timestamp']}.".encode() + again
+    expected = base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
+    assert second["webhook-signature"] == f"v1,{expected}"

@@ -1,0 +1,41 @@
+"""The service against its own description, by schemathesis: every check but positive data acceptance."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.support.services import ROOT, running_service
+
+SECONDS_MOST = 120  # drawing a shot of the simulated studio takes seconds, on a machine that is busy many
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.timeout(900)
+def test_schemathesis_finds_nothing(tmp_path: Path) -> None:
+    data, environment = tmp_path / "data", os.environ | {"EIGENHEAD_DATA": str(tmp_path / "data")}
+    command = [sys.executable, "-m", "server.cli", "keys", "add", "schemathesis"]
+    key = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+    with running_service(data) as service:
+        while not httpx.get(service.url + "/readyz", timeout=60).json()["ready"]:
+            time.sleep(0.2)
+        command = [
+            str(Path(sys.executable).with_name("st")),
+            "run",
+            service.url + "/openapi.json",
+            *("--checks", "all", "--exclude-checks", "positive_data_acceptance"),
+            *("-H", f"Authorization: Bearer {key}", "--max-examples", "10", "--seed", "1"),
+            *("--suppress-health-check", "all", "--generation-database", "none"),
+            *("--request-timeout", str(SECONDS_MOST), "--max-response-time", str(SECONDS_MOST)),
+        ]
+        hooks = {"SCHEMATHESIS_HOOKS": "tests.support.schemathesis_hooks", "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            command, env=os.environ | hooks, cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout[-8000:]
+        assert "unforeseen" not in service.log.read_text()

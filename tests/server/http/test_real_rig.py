@@ -1,0 +1,152 @@
+"""Real cameras behind the HTTP interface: a service with a rig.toml, and eleven streams and a box that it opens."""
+
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from rig.acquisition.commands import take_plates
+from rig.formats.cameras_json import write_rig
+from rig.formats.rig_toml import read_rig_config
+from rig.studio.devices.serve import DeviceFault, StudioDevices
+from server.console.live import RigSource
+from server.console.pages.rig import sync_of
+from server.services.rigs import open_rig
+from server.settings import ServiceSettings
+from tests.rig.acquisition.test_session import flat_rig
+from tests.support.board_pictures import BoardPictures
+from tests.support.services import running_service
+from tests.support.shared_data import shared
+from tests.support.textured_studio import NAMES, FlatStudio
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
+
+
+@pytest.fixture
+def studio(tmp_path: Path) -> Iterator[StudioDevices]:
+    folder = tmp_path / "studio"
+    write_rig(flat_rig(NAMES), folder / "cameras.json")
+    with StudioDevices(folder, NAMES, FlatStudio(False), FlatStudio(True), calibration="cameras.json") as devices:
+        take_plates(read_rig_config(folder / "rig.toml"))
+        devices.seat(True)
+        yield devices
+
+
+def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_path: Path) -> None:
+    rig_file = str(studio.folder / "rig.toml")
+    with (
+        running_service(tmp_path / "data", worker=False, rig=rig_file) as service,
+        httpx.Client(base_url=service.url, timeout=60) as client,
+    ):
+        state = client.get("/v1/rig").json()
+        assert (state["kind"], state["calibration"], len(state["cameras"])) == ("real", "own", 11)
+        made = client.post("/v1/captures", json={"label": "first", "expression": "neutral"})
+        assert made.status_code == 201, made.text
+        capture = made.json()
+        assert [camera["name"] for camera in capture["cameras"]] == list(NAMES)
+        sync = sync_of(capture["shot"])
+        assert all(sync[name]["status"] == "in sync" and sync[name]["skew_ms"] is not None for name in NAMES)
+        assert [found["id"] for found in client.get("/v1/captures").json()["captures"]] == [capture["id"]]
+        image = client.get(f"/v1/captures/{capture['id']}/images/cam05").content
+        assert _decoded(image).shape == (240, 320, 3)
+        state = client.get("/v1/rig").json()
+        assert state["ready"]
+        assert {camera["state"] for camera in state["cameras"]} == {"open"}
+        assert _decoded(client.get("/v1/rig/cameras/cam03/preview.jpg").content).shape == (240, 320, 3)
+
+        studio.inject(DeviceFault("hung", "cam02"))
+        failed = client.post("/v1/captures", json={})
+        assert failed.status_code == 503
+        assert any(error.startswith("cam02: missing") for error in failed.json()["errors"])
+        studio.clear()
+        studio.inject(DeviceFault("unplugged"))
+        failed = client.post("/v1/captures", json={})
+        assert failed.status_code == 503
+        assert any("trigger" in error for error in failed.json()["errors"])
+        studio.clear()
+        studio.seat(False)
+        plates = client.post("/v1/rig/background").json()
+        assert (plates["cameras"], plates["plates"]) == (list(NAMES), 5)
+        studio.seat(True)
+        assert client.post("/v1/captures", json={}).status_code == 201
+        assert client.post("/v1/captures", json={"seed": 1}).status_code == 422
+        assert len(client.get("/v1/captures").json()["captures"]) == 2
+
+
+@pytest.mark.timeout(600)
+def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> None:
+    """Four cameras that show the recorded board, shot by shot; the first shots lack a camera."""
+    board, names = BoardPictures(shared("data/multicam-board")), tuple(f"cam_{i}" for i in range(4))
+    (tmp_path / "studio").mkdir()
+    with (
+        StudioDevices(tmp_path / "studio", names, board, board) as studio,
+        running_service(tmp_path / "data", rig=str(studio.folder / "rig.toml")) as service,
+        httpx.Client(base_url=service.url, timeout=100) as client,
+    ):
+        state = client.get("/v1/rig").json()
+        assert (state["calibration"], state["ready"]) == (None, False)
+        assert client.post("/v1/rig/background").status_code == 200
+        refused = client.post("/v1/captures", json={})
+        assert refused.status_code == 503
+        assert refused.json()["type"].endswith("not-calibrated")
+        captures = []
+        for shot in range(26):
+            board.hold(studio, shot)
+            if shot == 0:
+                studio.inject(DeviceFault("hung", "cam_2"))
+            taken = client.post("/v1/captures", json={"label": "board", "board": True})
+            studio.clear()
+            assert taken.status_code == 201, taken.text
+            captures.append(taken.json())
+        assert [len(capture["cameras"]) for capture in captures] == [3, *[4] * 25]
+        assert captures[0]["board"]
+        of_board = captures[1]["id"]
+        assert client.post("/v1/jobs", json={"capture_id": of_board}).status_code == 409
+        assert client.put(f"/v1/captures/{of_board}/features", json={"points": {}}).status_code == 409
+        described = tomllib.loads((board.folder / "board.toml").read_text())
+        wanted = {"board": described, "captures": [capture["id"] for capture in captures]}
+        made = client.post("/v1/calibrations", json=wanted)
+        assert made.status_code == 202, made.text
+        done = made.json()
+        while done["state"] in ("queued", "running"):
+            time.sleep(0.5)
+            done = client.get(made.headers["location"]).json()
+        assert done["state"] == "succeeded", done["error"]
+        assert done["pictures"] == {"cam_0": 26, "cam_1": 26, "cam_2": 25, "cam_3": 26}
+        assert done["figures"]["rms_px"] <= 1.1
+        used = client.put("/v1/rig/calibration", json={"calibration_id": done["id"]}).json()
+        assert (used["calibration"], used["ready"]) == ("own", True)
+        board.hold(studio, 0)  # as on the clean plates
+        capture = client.post("/v1/captures", json={})
+        assert capture.status_code == 201, capture.text
+        assert (len(capture.json()["cameras"]), capture.json()["board"]) == (4, False)
+
+
+def test_the_live_view_takes_all_pictures_in_one_look(studio: StudioDevices, tmp_path: Path) -> None:
+    rig = open_rig(ServiceSettings(data=tmp_path / "data", rig=studio.folder / "rig.toml"))
+    try:
+        source = RigSource(rig)
+        looks = [source.frames() for _ in range(2)]
+        for frames in looks:
+            assert [frame["name"] for frame in frames] == list(NAMES)
+            assert {_decoded(frame["jpeg"]).shape for frame in frames} == {(240, 320, 3)}
+        judged = [[frame["name"] for frame in frames if "blur_px" in frame] for frames in looks]
+        assert judged == [["cam01"], ["cam02"]], "each look judges another camera"
+        studio.inject(DeviceFault("hung", "cam04"))
+        deadline = time.monotonic() + 20
+        while "fault" not in (lost := {frame["name"]: frame for frame in source.frames()}["cam04"]):
+            assert time.monotonic() < deadline
+        assert lost["jpeg"] is None
+    finally:
+        rig.close()
+
+
+def _decoded(data: bytes) -> np.ndarray:
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture

@@ -1,0 +1,58 @@
+"""What goes and what stays: by age, by number, by space; nothing that a job needs."""
+
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from rig.formats.archive import pack_folder
+from tests.support.services import RunningService, await_state, running_service, small_capture
+
+
+@pytest.fixture
+def capture_file(tmp_path: Path) -> bytes:
+    pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
+    return (tmp_path / "capture.tar").read_bytes()
+
+
+def upload(service: RunningService, data: bytes) -> str:
+    return httpx.post(service.url + "/v1/captures/uploads", files={"file": data}, timeout=30).json()["id"]
+
+
+def await_gone(client: httpx.Client, path: str, timeout_s: float = 60.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while client.get(path).status_code != 404:
+        assert time.monotonic() < deadline, f"{path} stays"
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_old_captures_go_unless_a_job_needs_them(tmp_path: Path, capture_file: bytes) -> None:
+    age = str(8 / 86400)
+    with (
+        running_service(tmp_path / "data", keep_captures_days=age, sweep_s="0.3") as service,
+        httpx.Client(base_url=service.url, timeout=30) as client,
+    ):
+        needed, idle = upload(service, capture_file), upload(service, capture_file)
+        job = client.post("/v1/jobs", json={"capture_id": needed, "settings": {"front": "long"}}).json()["id"]
+        await_gone(client, f"/v1/captures/{idle}")
+        assert client.get(f"/v1/captures/{needed}").status_code == 200
+        client.post(f"/v1/jobs/{job}/cancel")
+        await_gone(client, f"/v1/captures/{needed}")
+
+
+@pytest.mark.slow
+def test_only_the_newest_results_stay(tmp_path: Path, capture_file: bytes) -> None:
+    with (
+        running_service(tmp_path / "data", keep_jobs="2", sweep_s="0.3") as service,
+        httpx.Client(base_url=service.url, timeout=30) as client,
+    ):
+        capture = upload(service, capture_file)
+        jobs = [client.post("/v1/jobs", json={"capture_id": capture}).json()["id"] for _ in range(4)]
+        await_state(client, jobs[-1], ("succeeded",))
+        for job in jobs[:2]:
+            await_gone(client, f"/v1/jobs/{job}")
+            assert not (service.data / "jobs" / job).exists()
+        for job in jobs[2:]:
+            assert client.get(f"/v1/jobs/{job}/result/head.ply").status_code == 200

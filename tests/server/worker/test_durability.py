@@ -1,0 +1,287 @@
+"""What SIGKILL at any moment may not do: lose a job, run it to two ends, or change a byte of its result."""
+
+import hashlib
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import sqlalchemy as sa
+
+from rig.formats.archive import pack_folder
+from server.settings import ServiceSettings
+from tests.support.postgres import running_postgres
+from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture
+
+JOBS, KILLS = 100, 30
+
+
+@contextmanager
+def database(kind: str) -> Iterator[dict[str, Any]]:
+    if kind == "sqlite":
+        yield {}
+        return
+    with running_postgres() as url:
+        yield {"database_url": url}
+
+
+def worker_pids(service: RunningService) -> list[int]:
+    """Worker processes of a service's data folder, told by their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (folder / "cmdline").read_bytes()
+            environment = (folder / "environ").read_bytes()
+        except OSError:
+            continue
+        if b"\0worker\0" in command and f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0":
+            found.append(int(folder.name))
+    return found
+
+
+def make_capture(service: RunningService, folder: Path) -> str:
+    pack_folder(small_capture(folder), folder.with_suffix(".tar"))
+    with folder.with_suffix(".tar").open("rb") as stream:
+        response = httpx.post(service.url + "/v1/captures/uploads", files={"file": stream}, timeout=60)
+    assert response.status_code == 201, response.text
+    return response.json()["id"]
+
+
+def submit(service: RunningService, capture: str, number: int, settings: dict[str, Any] | None = None) -> str:
+    """Until it is accepted, as a client does: the key makes it one job."""
+    deadline = time.monotonic() + 60
+    while True:
+        try:
+            response = httpx.post(
+                service.url + "/v1/jobs",
+                json={"capture_id": capture, "settings": settings},
+                headers={"Idempotency-Key": f"job {number}"},
+                timeout=10,
+            )
+            if response.status_code == 202:
+                return response.json()["id"]
+        except httpx.TransportError:
+            pass
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_hundred_jobs_survive_thirty_kills(kind: str, tmp_path: Path) -> None:
+    rng = random.Random(20240501)
+    with (
+        database(kind) as settings,
+        running_service(tmp_path / "data", silent_s="5", tiny_s="0.3", jobs_per_key="1000", **settings) as service,
+    ):
+        capture = make_capture(service, tmp_path / "capture")
+        jobs = [submit(service, capture, 0)]
+        with httpx.Client(base_url=service.url) as client:
+            undisturbed = await_state(client, jobs[0], ("succeeded",), 60)["files"]
+        jobs += [submit(service, capture, number) for number in range(1, JOBS // 2)]
+        for number in range(KILLS):
+            time.sleep(rng.uniform(0.2, 2.0))
+            if number < JOBS // 2:
+                jobs.append(submit(service, capture, JOBS // 2 + number))
+            if number % 3 == 2:
+                service.kill()
+                service.start()
+            else:
+                for pid in worker_pids(service):
+                    os.kill(pid, signal.SIGKILL)
+        jobs += [submit(service, capture, number) for number in range(JOBS // 2 + KILLS, JOBS)]
+        assert len(set(jobs)) == JOBS
+        with httpx.Client(base_url=service.url, timeout=30) as client:
+            for job in jobs:
+                done = await_state(client, job, ("succeeded", "failed", "cancelled"), 240)
+                assert (done["state"], done["files"]) == ("succeeded", undisturbed)
+            listed = client.get("/v1/jobs", params={"limit": 1000}).json()["jobs"]
+        assert sorted(job["id"] for job in listed) == sorted(jobs)
+        heads = {
+            hashlib.sha256((service.data / "jobs" / job / "result/head.ply").read_bytes()).hexdigest() for job in jobs
+        }
+        assert heads == {undisturbed["head.ply"]["sha256"]}
+        assert not [path for job in jobs for path in (service.data / "jobs" / job).glob("attempt-*")]
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.timeout(900)
+def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path) -> None:
+    """Five reconstructions of a simulated shot, four SIGKILLs into one that runs: every second one takes the service
+    too. report.json tells times of its own; every other file is the undisturbed one."""
+    rng = random.Random(4)
+    with (
+        running_service(
+            tmp_path / "data", work="server.tasks.reconstruct:reconstruct_capture", silent_s="5"
+        ) as service,
+        httpx.Client(base_url=service.url, timeout=120) as client,
+    ):
+        capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
+        settings = {"detail": "span"}
+        first = submit(service, capture, 0, settings)
+        undisturbed = files_of(await_state(client, first, ("succeeded", "failed"), 240))
+        assert {"head.ply", "head.glb", "contact_sheet.png"} <= undisturbed.keys()
+        jobs = [submit(service, capture, number, settings) for number in range(1, 6)]
+        for number in range(4):
+            await_running(client, jobs)
+            time.sleep(rng.uniform(0.2, 3.0))
+            if number % 2:
+                service.kill()
+            for pid in worker_pids(service):
+                os.kill(pid, signal.SIGKILL)
+            if number % 2:
+                service.start()
+        ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
+        assert [job["state"] for job in ended] == ["succeeded"] * 5
+        assert [files_of(job) for job in ended] == [undisturbed] * 5
+
+
+def files_of(job: dict[str, Any]) -> dict[str, str]:
+    """sha256 of a job's files, without what tells how long it took."""
+    return {name: file["sha256"] for name, file in job["files"].items() if name != "report.json"}
+
+
+def await_running(client: httpx.Client, jobs: list[str]) -> None:
+    """Until one of the jobs runs."""
+    deadline = time.monotonic() + 60
+    while all(client.get(f"/v1/jobs/{job}").json()["state"] != "running" for job in jobs):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@contextmanager
+def pinned_worker(service: RunningService, core: int | None = None) -> Iterator["subprocess.Popen[bytes]"]:
+    """A worker of its own, perhaps bound to one core with everything that it starts."""
+    environment = os.environ | service.environment | {"EIGENHEAD_DATA": str(service.data)}
+    pin = (lambda: os.sched_setaffinity(0, {core})) if core is not None else None
+    with service.log.open("ab") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "server.cli", "worker"], env=environment, cwd=ROOT, stderr=log, preexec_fn=pin
+        )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def stop_between_writes(process: "subprocess.Popen[bytes]", sqlite: Path | None) -> None:
+    """SIGSTOP, at a moment when the process does not hold SQLite's one write lock (docs/service.md says why)."""
+    deadline = time.monotonic() + 20
+    while True:
+        process.send_signal(signal.SIGSTOP)
+        if sqlite is None:
+            return
+        with closing(sqlite3.connect(sqlite, timeout=0.5)) as probe:
+            try:
+                probe.execute("BEGIN IMMEDIATE")
+            except sqlite3.OperationalError:
+                process.send_signal(signal.SIGCONT)
+            else:
+                return
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@contextmanager
+def open_transaction(settings: dict[str, Any], job: str) -> Iterator[None]:
+    """On PostgreSQL, a session of ours that locked the job's row and says no more."""
+    if not settings:
+        yield
+        return
+    engine = sa.create_engine(ServiceSettings(**settings).url)
+    connection = engine.connect()
+    query = "SELECT status FROM dbos.workflow_status WHERE workflow_uuid = :job FOR NO KEY UPDATE"
+    assert connection.scalar(sa.text(query), {"job": job}) == "PENDING"
+    try:
+        yield
+    finally:
+        connection.invalidate()  # the server has ended it
+        engine.dispose()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: str, tmp_path: Path) -> None:
+    """Both workers here are on this machine, where a dead process is noticed at once; to test the silence that another
+    machine would see, the first is stopped (SIGSTOP), which looks alive to everything but its heartbeat. On PostgreSQL
+    a session beside it stays inside a transaction on the job's row, as that of a host that lost its power would."""
+    with (
+        database(kind) as settings,
+        running_service(tmp_path / "data", worker=False, tiny_s="3", **settings) as service,
+        httpx.Client(base_url=service.url, timeout=30) as client,
+    ):
+        capture = make_capture(service, tmp_path / "capture")
+        with pinned_worker(service) as first:
+            job = submit(service, capture, 0)
+            await_state(client, job, ("running",))
+            stop_between_writes(first, service.data / "eigenhead.sqlite" if kind == "sqlite" else None)
+            stopped = time.monotonic()
+            with open_transaction(settings, job), pinned_worker(service):
+                await_state(client, job, ("succeeded",), 40)
+                taken_s = time.monotonic() - stopped
+            assert taken_s < 30 + 3
+            first.send_signal(signal.SIGCONT)  # it comes back, finds its job done by another, and does no harm
+            time.sleep(5)
+            assert client.get(f"/v1/jobs/{job}").json()["state"] == "succeeded"
+            again = submit(service, capture, 1)
+            assert await_state(client, again, ("succeeded",))["files"] == client.get(f"/v1/jobs/{job}").json()["files"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_killed_uploads_and_restarts_keep_what_was_accepted(tmp_path: Path) -> None:
+    """The service is killed while uploads run; every accepted capture is there afterwards, whole, and no other."""
+    with running_service(tmp_path / "data", worker=False) as service:
+        folder = small_capture(tmp_path / "capture")
+        pack_folder(folder, tmp_path / "capture.tar")
+        data, accepted, rng = (tmp_path / "capture.tar").read_bytes(), [], random.Random(1)
+        for _ in range(6):
+            killer = subprocess.Popen(["sleep", str(rng.uniform(0.05, 1.0))])
+            while killer.poll() is None:
+                try:
+                    response = httpx.post(service.url + "/v1/captures/uploads", files={"file": data}, timeout=5)
+                    accepted.append(response.json()["id"])
+                except httpx.TransportError:
+                    break
+                if len(accepted) % 3 == 0 and killer.poll() is not None:
+                    break
+            service.kill()
+            service.start()
+        captures = httpx.get(service.url + "/v1/captures").json()["captures"]
+        assert {capture["id"] for capture in captures} >= set(accepted)
+        for capture in captures:
+            for name, digest in capture["inputs"].items():
+                path = service.data / "captures" / capture["id"] / "files" / name
+                assert hashlib.sha256(path.read_bytes()).hexdigest() == digest
+
+
+def test_a_damaged_record_is_set_aside_and_reported_and_strangers_files_stay(tmp_path: Path) -> None:
+    with running_service(tmp_path / "data", worker=False, sweep_s="0.2") as service:
+        kept, damaged = (make_capture(service, tmp_path / name) for name in ("one", "two"))
+        (service.data / "captures" / damaged / "record.json").write_text('{"format": "eigenhead-capt')
+        (service.data / "captures" / "mine").mkdir()
+        (service.data / "captures" / "mine" / "notes.txt").write_text("not yours")
+        (service.data / "incoming" / "notes.txt").write_text("not yours")
+        captures = httpx.get(service.url + "/v1/captures").json()["captures"]
+        assert [capture["id"] for capture in captures] == [kept]
+        assert httpx.get(f"{service.url}/v1/captures/{damaged}").status_code == 404
+        aside = [path.name for path in (service.data / "set-aside").iterdir()]
+        assert [damaged in name for name in aside] == [True]
+        assert damaged in httpx.get(service.url + "/readyz", timeout=30).json()["checks"]["records"]["detail"]
+        time.sleep(0.6)
+        assert (service.data / "captures" / "mine" / "notes.txt").read_text() == "not yours"
+        assert (service.data / "incoming" / "notes.txt").read_text() == "not yours"
+        assert "eigenhead_damaged_records 1.0" in httpx.get(service.url + "/metrics").text

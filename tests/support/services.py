@@ -1,0 +1,128 @@
+"""Real services for the tests: processes of their own, on free ports, with data folders of their own."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+from rig.camera import Camera, Intrinsics
+from rig.capture import Capture
+from rig.formats.capture_folder import write_capture
+from rig.geometry import RigidTransform
+from rig.rig import Rig
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass
+class RunningService:
+    """A service process, perhaps with its worker, that can be killed and started again on the same data and port."""
+
+    data: Path
+    environment: dict[str, str]
+    port: int
+    worker: bool = True
+    process: "subprocess.Popen[bytes] | None" = None
+    log: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.log = self.data.parent / f"{self.data.name}.log"
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "server.cli", "serve", "--data", str(self.data), "--port", str(self.port)]
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                command + ([] if self.worker else ["--no-worker"]),
+                env=os.environ | self.environment,
+                cwd=ROOT,
+                stderr=log,
+                start_new_session=True,
+            )
+        self.await_answer()
+
+    def await_answer(self, timeout_s: float = 180.0) -> None:
+        assert self.process is not None
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            if self.process.poll() is not None:
+                break
+            try:
+                httpx.get(self.url + "/healthz", timeout=1.0)
+                return
+            except httpx.TransportError:
+                time.sleep(0.05)
+        raise AssertionError(f"the service did not start:\n{self.log.read_text()[-3000:]}")
+
+    def kill(self) -> None:
+        """SIGKILL of the service process alone."""
+        assert self.process is not None
+        self.process.kill()
+        self.process.wait()
+
+    def stop(self) -> None:
+        if self.process is None or self.process.poll() is not None:
+            return
+        self.process.terminate()
+        try:
+            self.process.wait(15)
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+
+@contextmanager
+def running_service(data: Path, *, worker: bool = True, **settings: str) -> Iterator[RunningService]:
+    """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given, and there are no pages,
+    which take their time to import. A test that fails shows the end of the log."""
+    chosen = {"work": "tests.support.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
+    environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
+    service = RunningService(data, environment, free_port(), worker)
+    try:
+        service.start()
+        yield service
+    except BaseException:
+        sys.stdout.write(f"{service.log}:\n{service.log.read_text()[-4000:]}")
+        raise
+    finally:
+        service.stop()
+
+
+def free_port() -> int:
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return sock.getsockname()[1]
+
+
+def await_state(client: httpx.Client, job: str, states: tuple[str, ...], timeout_s: float = 30.0) -> dict:
+    deadline = time.monotonic() + timeout_s
+    while True:
+        document = client.get(f"/v1/jobs/{job}").json()
+        if document["state"] in states:
+            return document
+        assert time.monotonic() < deadline, document
+        time.sleep(0.05)
+
+
+def small_capture(folder: Path, seed: int = 0, cameras: int = 3, size: int = 24) -> Path:
+    """A capture folder of noise: what it shows does not matter here."""
+    rng = np.random.default_rng(seed)
+    poses = [RigidTransform(np.eye(3), np.array([40.0 * i, 0.0, 1000.0])) for i in range(cameras)]
+    intrinsics = Intrinsics(size, size, 30.0, 30.0, size / 2, size / 2)
+    rig = Rig(tuple(Camera(f"cam{i:02}", intrinsics, pose) for i, pose in enumerate(poses)))
+    images = {name: rng.integers(0, 256, (size, size, 3), dtype=np.uint8) for name in rig.names}
+    plates = {name: (rng.integers(0, 256, (size, size, 3), dtype=np.uint8),) for name in rig.names}
+    write_capture(folder, Capture(images, plates), rig)
+    return folder

@@ -1,0 +1,57 @@
+"""Work that stands for a reconstruction where the engine around it is tested: real files, real time, no head."""
+
+import hashlib
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from rig.atomic_write import write_atomically
+from rig.errors import InputError
+from rig.formats.capture_folder import read_capture
+from server.tasks.child import Bench, Report
+
+
+def work(
+    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Takes ``EIGENHEAD_TINY_S`` seconds and writes files that follow from the capture alone."""
+    shot, _ = read_capture(Path(capture))
+    seconds = float(os.environ.get("EIGENHEAD_TINY_S", "0.2"))
+    mode = settings.get("front") or ""
+    if mode in ("long", "deaf"):
+        seconds = 20.0
+    if mode == "fail":
+        raise InputError("capture", ["cam00 sees nobody", "cam01 sees nobody"])
+    if mode == "crash":
+        os.kill(os.getpid(), 11)
+    if mode == "bug":
+        raise ZeroDivisionError("planted")
+    began = time.monotonic()
+    while (share := (time.monotonic() - began) / seconds) < 1:
+        if mode != "deaf":
+            report("fit", share)
+        time.sleep(0.01)
+    if mode == "moved":
+        warning = {"code": "camera-moved", "message": "cam02 has moved by 5.0 px"}
+        report_json = json.dumps({"warnings": [{"code": "other", "message": "?"}, warning]})
+        write_atomically(Path(result) / "report.json", report_json.encode())
+    for name in ("head.ply", "head.glb", "overlays/cam00.png"):
+        digest = hashlib.sha256(f"{name}{sorted(shot.digests.items())}".encode()).digest()
+        repeats = int(os.environ.get("EIGENHEAD_TINY_BYTES", "64000")) // len(digest)
+        write_atomically(Path(result) / name, digest * repeats)
+    return {}
+
+
+def busy(
+    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """About a second of one core, by count and not by clock, so that a busy core takes longer."""
+    digest = b""
+    for step in range(100):
+        report("fit", step / 100)
+        for _ in range(9000):
+            digest = hashlib.sha256(digest).digest()
+    write_atomically(Path(result) / "head.ply", digest)
+    return {}
