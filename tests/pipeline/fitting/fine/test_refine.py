@@ -118,7 +118,6 @@ def head_points(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generato
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="0.29 mm against 0.1: open since the prior's variance is estimated from photographs")
 def test_a_planted_head_is_found_within_its_intervals(model: HeadModel) -> None:
     rng = np.random.default_rng(11)
     faces, count = model.levels["full"].faces, 60
