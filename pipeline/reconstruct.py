@@ -11,12 +11,14 @@ from pipeline.alignment.landmarks import feature_alignment
 from pipeline.alignment.silhouette_search import search_alignment
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.estimate import estimate_depth
+from pipeline.dense.part_votes import PartVotes, vote_parts
+from pipeline.dense.parts import HAIR, PartMap, classify_parts
 from pipeline.dense.surface.signed_distance import NoSurface
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.fitting.contour import finish, solve_contour
-from pipeline.fitting.fine.dense_points import dense_points, head_place
+from pipeline.fitting.fine.dense_points import dense_points
 from pipeline.fitting.fine.depth_offset import without_common_offset
 from pipeline.fitting.fine.eyelids import look_at_eyes
 from pipeline.fitting.fine.refine import Displaced, refine_to_surface
@@ -46,6 +48,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 
 VIEWS_LEAST = 3
+PHOTO_DETAIL = (None, "photo", "fine")  # levels that look inside the outline
 Report = Callable[[str, float], None]
 Segment = Callable[..., dict[str, Silhouette]]
 
@@ -113,7 +116,7 @@ def reconstruct(
     front = front_camera(rig, settings)
     start, warnings = align(model, capture, silhouettes, rig, settings, front, report)
     clock("fit")
-    fit, model, detail = fit_head(model, start, capture, silhouettes, rig, settings, renderer, report)
+    fit, model, detail, parts = fit_head(model, start, capture, silhouettes, rig, settings, renderer, clock)
     full, finer = model.levels["full"], None
     mesh, quality = fitted_mesh(model, fit), vertex_deviation_mm(model, fit)
     fine = detail.level == "photo" and settings.detail == "fine"
@@ -122,9 +125,10 @@ def reconstruct(
         clock("depth")
         told_depth = partial(_of_stage, clock.report, "depth")
         maps = estimate_depth(capture.images, silhouettes, rig, mesh, settings.dense, report=told_depth)
+    votes = vote_parts(maps, parts, rig)
     if fine:
         clock("fine")
-        finer, detail = fine_head(model, fit, quality, maps, capture, rig, settings, report)
+        finer, detail = fine_head(model, fit, quality, maps, votes, capture, rig, settings, report)
         if finer is not None:
             mesh, quality = Mesh(finer.vertices, full.faces), finer.deviation_mm
     clock("texture")
@@ -132,7 +136,7 @@ def reconstruct(
     coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture)
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
-        bust, bust_warnings = find_bust(maps, capture, silhouettes, rig, mesh, settings, clock)
+        bust, bust_warnings = find_bust(maps, votes, capture, silhouettes, rig, mesh, settings, clock)
     atlas = None
     if settings.outputs.atlas:
         clock("atlas")
@@ -187,6 +191,7 @@ def reconstruct(
 
 def find_bust(
     maps: tuple[DepthMap, ...],
+    votes: PartVotes | None,
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
@@ -197,7 +202,7 @@ def find_bust(
     """All that the cameras see, as one closed surface; a warning where the photographs do not tell it."""
     clock("bust")
     try:
-        bust = make_bust(maps, capture, silhouettes, rig, head_world, settings, report=clock.report)
+        bust = make_bust(maps, capture, silhouettes, rig, head_world, votes, settings, report=clock.report)
     except NoSurface as reason:
         return None, [ReportWarning("no-bust", str(reason))]
     return bust, list(bust.surface.warnings)
@@ -263,22 +268,49 @@ def fit_head(
     rig: Rig,
     settings: Settings,
     renderer: Renderer,
-    report: Report,
-) -> tuple[Fit, HeadModel, Detail]:
-    """Section 4.4 by the solver that the settings name: the fit, the model with the modes that it has, and how deep it
-    went."""
+    clock: Clock,
+) -> tuple[Fit, HeadModel, Detail, Mapping[str, PartMap]]:
+    """Section 4.4 by the solver that the settings name: the fit, the model with the modes that it has, how deep it
+    went, and what the pixels show (nothing where nobody asks for it)."""
+    report = clock.report
     if settings.method == "simplex":
         # The simplex never moves the pose, and what seven points leave (3 degrees, 5 mm) would all become shape.
         posed = solve_contour(model, start, silhouettes, rig, settings.fitting, features=capture.features)
         place = posed.state.world_from_head
         fit = fit_simplex(model, place, silhouettes, rig, settings.fitting, renderer=renderer, report=report)
-        return fit, model, Detail("span", "the simplex searches the eigenheads alone")
+        parts = find_parts(model, fitted_mesh(model, fit), capture, silhouettes, rig, settings, clock)
+        return fit, model, Detail("span", "the simplex searches the eigenheads alone"), parts
     solved = solve_contour(model, start, silhouettes, rig, settings.fitting, features=capture.features, report=report)
     detail = Detail("span" if settings.detail == "span" else "kernel", "the settings ask for it")
-    if settings.detail in (None, "photo", "fine"):
-        solved, detail = refine_with_photographs(solved, capture.images, settings.photo)
+    state, own = solved.state, solved.problem.model
+    head_world = Mesh(state.world_from_head.apply(own.vertices(state.coefficients)), own.levels["full"].faces)
+    parts = find_parts(own, head_world, capture, silhouettes, rig, settings, clock)
+    if settings.detail in PHOTO_DETAIL:
+        hair = {name: part.probability[..., HAIR] for name, part in parts.items()}
+        solved, detail = refine_with_photographs(solved, capture.images, settings.photo, hair=hair)
     model, eigenheads = solved.problem.model, min(settings.fitting.modes, len(model.modes))
-    return with_estimated_prior(model, finish(solved), eigenheads), model, detail
+    return with_estimated_prior(model, finish(solved), eigenheads), model, detail, parts
+
+
+def find_parts(
+    model: HeadModel,
+    head_world: Mesh,
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    settings: Settings,
+    clock: Clock,
+) -> dict[str, PartMap]:
+    """Skin, hair and clothes in every photograph, where the settings ask for what depends on it."""
+    if settings.detail not in PHOTO_DETAIL and settings.outputs.surface == "head":
+        return {}
+    clock("parts")
+    places = {name: head_world.vertices[vertex] for name, vertex in model.landmarks.items()}
+    region = model.levels["full"].face_region
+    given = (capture.images, silhouettes, rig, head_world, region, places, settings.parts)
+    found = classify_parts(*given, report=partial(_of_stage, clock.report, "parts"))
+    clock("fit")
+    return found
 
 
 def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
@@ -291,6 +323,7 @@ def fine_head(
     fit: Fit,
     deviation_mm: np.ndarray,
     depth: tuple[DepthMap, ...],
+    votes: PartVotes | None,
     capture: Capture,
     rig: Rig,
     settings: Settings,
@@ -298,7 +331,7 @@ def fine_head(
 ) -> tuple[Displaced | None, Detail]:
     """The fit's head drawn to what the dense stage knows, and why no deeper where that is too little."""
     mesh = fitted_mesh(model, fit)
-    surface = dense_points(depth, head_place(model, mesh, fit.world_from_head), settings.fine)
+    surface = dense_points(depth, votes, mesh, settings.fine)
     surface = without_common_offset(surface, mesh, model.levels["full"].face_region)
     eyes = look_at_eyes(model, mesh.vertices, capture.images, rig)
     eigenheads = min(settings.fitting.modes, len(fit.coefficients))

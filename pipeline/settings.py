@@ -77,6 +77,18 @@ class FittingSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class PartSettings:
+    """What every pixel shows: skin, hair or clothes. Chosen on studio captures and two captures rendered by another
+    program."""
+
+    cell_mm: float = 2.2  # of the grid that parts are told on: four pixels of the usual rig
+    steps: int = 4  # of expectation and maximisation
+    strength: float = 0.7  # of what a cell looks like: colour and structure of neighbours are not independent
+    smooth_mm: float = 9.0  # over which neighbours agree
+    edge: float = 0.05  # contrast (0 to 1, as displayed) that ends such a neighbourhood
+
+
+@dataclass(frozen=True, slots=True)
 class PhotoSettings:
     """Photo-consistency inside the outline. Chosen on two captures rendered by another program."""
 
@@ -186,6 +198,7 @@ class Settings:
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
     fitting: FittingSettings = field(default_factory=FittingSettings)
+    parts: PartSettings = field(default_factory=PartSettings)
     photo: PhotoSettings = field(default_factory=PhotoSettings)
     fine: FineSettings = field(default_factory=FineSettings)
     dense: DenseSettings = field(default_factory=DenseSettings)

@@ -1,4 +1,4 @@
-"""What every pixel of the subject shows: skin, hair or clothes (issue 16, item 4), learned from the capture itself.
+"""What every pixel of the subject shows: skin, hair or clothes, learned from the capture itself.
 
 What the middle of the fitted face shows is skin. What lies beside the head above the chin is hair unless it looks like
 that skin, as a bald crown does; what lies below is clothes unless it looks like skin. From those starts expectation and
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipeline.dense.part_cells import Cells, grey_of, head_guide, make_cells
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.rig import Rig
 
@@ -39,17 +40,6 @@ OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a 
 FLOOR = 0.02  # of a part's looks that its histogram has not shown
 
 Report = Callable[[str, float], None]
-
-
-@dataclass(frozen=True, slots=True)
-class PartSettings:
-    """Chosen on studio captures and two captures rendered by another program."""
-
-    cell_mm: float = 2.2  # of the grid that parts are told on: four pixels of the usual rig
-    steps: int = 4  # of expectation and maximisation
-    strength: float = 0.7  # of what a cell looks like: colour and structure of neighbours are not independent
-    smooth_mm: float = 9.0  # over which neighbours agree
-    edge: float = 0.05  # contrast (0 to 1, as displayed) that ends such a neighbourhood
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -35,7 +35,7 @@ from pipeline.fitting.rim import find_rim, make_topology, pack_views
 from pipeline.imaging.cpu_raster import camera_depths, depth_maps
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.multiview.visual_hull import visual_hull
-from pipeline.reconstruct import align, basis, fit_head, front_camera, without_moved_cameras
+from pipeline.reconstruct import Clock, align, basis, fit_head, front_camera, without_moved_cameras
 from pipeline.settings import Settings, document_from_settings
 from pipeline.silhouettes.segment import segment
 from pipeline.texture.vertex_colours import texture
@@ -188,7 +188,8 @@ def every_level(
     for level in levels:
         asked = replace(settings, detail=level)
         began = time.perf_counter()
-        fit, deep, detail = fit_head(basis(model, asked), start, capture, silhouettes, rig, asked, renderer, _silent)
+        given = (basis(model, asked), start, capture, silhouettes, rig, asked, renderer)
+        fit, deep, detail, _ = fit_head(*given, Clock(_silent))
         found[level] = Fitted(fit, deep, detail.level, time.perf_counter() - began)
     return found
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.dense.depth_map import DepthMap
+from pipeline.dense.part_votes import PartVotes
 from pipeline.dense.surface.fusion import BustSurface, fuse
 from pipeline.imaging.cpu_raster import depth_maps as rastered_depths
 from pipeline.imaging.silhouette import Silhouette
@@ -41,6 +42,7 @@ def make_bust(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     head_world: Mesh,
+    votes: PartVotes | None,
     settings: Settings,
     *,
     report: Report,
@@ -49,7 +51,7 @@ def make_bust(
 
     Raises NoSurface where fewer than three views know any depth.
     """
-    surface = fuse(depth_maps, silhouettes, rig, head_world, settings.bust, report=report)
+    surface = fuse(depth_maps, silhouettes, rig, head_world, votes, settings.bust, report=report)
     mesh = surface.mesh_world
     normals = mesh.normals()
     depths = rastered_depths(rig, mesh)

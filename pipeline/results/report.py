@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.dense.surface.parts_by_place import PART_NAMES
+from pipeline.dense.part_votes import PART_NAMES
 from pipeline.imaging.silhouette import ViewQuality
 from pipeline.results.bust import Bust
 from pipeline.results.reconstruction import CameraFigures, Reconstruction

@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.dense.parts import PartSettings, classify_parts
+from pipeline.dense.parts import classify_parts
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.reconstruct import reconstruct
-from pipeline.settings import Settings
+from pipeline.settings import PartSettings, Settings
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.formats.capture_folder import read_capture

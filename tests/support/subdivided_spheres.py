@@ -6,9 +6,10 @@ import numpy as np
 import scipy.sparse as sparse
 import trimesh
 
+from pipeline.dense.part_votes import SKIN
 from pipeline.eigenheads.subdivision import row_count, subdivision
 from pipeline.fitting.fine.nodes import Nodes, node_mesh
-from pipeline.fitting.fine.surface_points import SKIN, SurfacePoints
+from pipeline.fitting.fine.surface_points import SurfacePoints
 
 RADIUS_MM = 80.0
 

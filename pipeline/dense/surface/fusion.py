@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.dense.depth_map import DepthMap
+from pipeline.dense.part_votes import SKIN, UNSEEN, PartVotes, part_codes
 from pipeline.dense.surface.contradiction import silence_contradicted
 from pipeline.dense.surface.crossings import without_crossings
 from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
-from pipeline.dense.surface.parts_by_place import parts_by_place
 from pipeline.dense.surface.quality import deviation_mm
 from pipeline.dense.surface.refinement import refine_vertices
 from pipeline.dense.surface.signed_distance import Level, NoSurface, solve
@@ -55,6 +55,7 @@ def fuse(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     head_world: Mesh | None,
+    votes: PartVotes | None,
     settings: BustSettings,
     *,
     report: Report,
@@ -66,6 +67,7 @@ def fuse(
         silhouettes: by camera, at least of the depth maps' cameras.
         rig: the cameras as calibrated, world frame.
         head_world: the fitted head, closed but for its neck (mm); None where there is none.
+        votes: what the places show; without them all that is seen counts as skin.
         settings: spacing of the vertices.
         report: called with the stage's progress.
 
@@ -86,7 +88,8 @@ def fuse(
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
     mesh, _ = without_crossings(mesh, safe)
     report("bust", 0.9)
-    part = parts_by_place(mesh, measured.views, head_world)
+    shown = np.full(len(mesh.vertices), SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
+    part = np.where(measured.views > 0, shown, UNSEEN).astype(np.uint8)
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(_mask_warnings(names, contradicted))
     return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, warnings)

@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
+from pipeline.dense.part_votes import SKIN
 from pipeline.fitting.fine.association import associate, interpolated
-from pipeline.fitting.fine.surface_points import SKIN, SurfacePoints, thinned
+from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from rig.mesh import Mesh
 
 CELL_MM, REACH_MM, AGREEMENT, LEAST_POINTS = 2.0, 2.0, 0.8, 300

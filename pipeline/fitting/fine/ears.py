@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from pipeline.dense.part_votes import SKIN
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import associate
-from pipeline.fitting.fine.surface_points import SKIN, SurfacePoints
+from pipeline.fitting.fine.surface_points import SurfacePoints
 from rig.geometry import rotation_from_vector
 from rig.mesh import vertex_normals
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from pipeline.dense.part_votes import SKIN, UNSEEN
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import Associated, associate, interpolated
@@ -32,7 +33,7 @@ from pipeline.fitting.fine.solve import (
     normal_directions,
     solve_field,
 )
-from pipeline.fitting.fine.surface_points import SKIN, UNSEEN, SurfacePoints, thinned
+from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.fitting.fit import Fit
 from pipeline.settings import FineSettings
 from rig.mesh import vertex_normals

@@ -5,9 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-UNSEEN, SKIN, HAIR, CLOTHES = 0, 1, 2, 3
-"""Parts of a surface, as ``bust.ply`` counts them."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:

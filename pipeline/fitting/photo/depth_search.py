@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.fitting.photo.camera_term import gram_matrices, lean
 from pipeline.fitting.photo.correlation import choose_views, correlate, sweep
-from pipeline.fitting.photo.hair_mask import Sight, under_hair
 from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.fitting.photo.patches import Patches
 from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations, moved_views
@@ -55,7 +54,6 @@ class Looks:
     facing: Float32[np.ndarray, "k s"]  # cosine between normal and line of sight, 0 where a camera does not see it
     pixel: Float[np.ndarray, "k s 2"]  # where each camera sees a sample, and how that moves along the normal, px / mm;
     along: Float[np.ndarray, "k s 2"]  # both 0 where it does not
-    covered: tuple[Bool[np.ndarray, "_ _"], ...]  # where each camera sees the head
 
 
 def look(
@@ -70,11 +68,11 @@ def look(
     points, outward = patches.points(vertices), patches.normals(normals)
     cameras = moved_cameras(problem, state)
 
-    def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         camera, distance = cameras[k], distance_of(problem.views, k)
         facing, ends = np.zeros(len(points), np.float32), np.zeros((2, len(points), 2))
         if not speaks[k]:
-            return facing, ends[0], ends[1], np.zeros(distance.shape, bool)
+            return facing, ends[0], ends[1]
         depth, _ = rasterise(
             camera.project(coarse), camera_depths(camera, coarse), model.levels[DEPTH_LEVEL].faces, *distance.shape
         )
@@ -82,11 +80,11 @@ def look(
         seen = np.flatnonzero(facing)
         here, further = camera.project(points[seen]), camera.project(points[seen] + outward[seen])
         ends[:, seen] = here, further - here
-        return facing, ends[0], ends[1], np.isfinite(depth)
+        return facing, ends[0], ends[1]
 
     with ThreadPoolExecutor() as pool:
-        facing, pixel, along, covered = zip(*pool.map(one, range(len(cameras))), strict=True)
-    return Looks(cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along), covered)
+        facing, pixel, along = zip(*pool.map(one, range(len(cameras))), strict=True)
+    return Looks(cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along))
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
@@ -126,24 +124,6 @@ def facing_of(
     out = np.zeros(len(points), np.float32)
     out[rows[seen]] = facing[seen]
     return out
-
-
-def hair_patches(
-    problem: ContourProblem, state: State, patches: Patches, photographs: Photographs, looks: Looks
-) -> Bool[np.ndarray, " c"]:
-    """The patches that lie under hair, by its colour."""
-    chin = looks.vertices[problem.model.landmarks["gnathion"]]
-    ends = np.stack([chin, chin + 10.0 * state.world_from_head.rotation[:, 1]])
-    sights = []
-    for k in np.flatnonzero(photographs.speaks).tolist():
-        low, high = looks.cameras[k].project(ends)
-        sights.append(
-            Sight(
-                photographs.colour[k], looks.covered[k], distance_of(problem.views, k), looks.pixel[k],
-                looks.facing[k] > 0, low, high - low,
-            )
-        )  # fmt: skip
-    return under_hair(problem.model, patches, sights)
 
 
 def observe(

@@ -17,10 +17,9 @@ INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
-    """Of the solver's views: pictures as taken and grey, the noise (grey levels) of each, and whether it shows anything
-    at all. A view without a photograph is black."""
+    """Of the solver's views: pictures in grey, the noise (grey levels) of each, and whether it shows anything at all. A
+    view without a photograph is black."""
 
-    colour: tuple[UInt8[np.ndarray, "_ _ 3"], ...]
     grey: tuple[Float32[np.ndarray, "_ _"], ...]
     noise: Float[np.ndarray, " k"]
     speaks: Bool[np.ndarray, " k"]
@@ -28,14 +27,14 @@ class Photographs:
 
 def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Views) -> Photographs:
     """Those of the views; a view without a photograph, or with nothing to see in it, does not speak."""
-    colour, grey, noise, speaks = [], [], [], []
+    grey, noise, speaks = [], [], []
     for k, name in enumerate(views.names):
         width, height = views.size[k]
-        colour.append(images.get(name, np.zeros((height, width, 3), np.uint8)))
-        grey.append(colour[-1].astype(np.float32) @ LUMINANCE)
+        image = images.get(name, np.zeros((height, width, 3), np.uint8))
+        grey.append(image.astype(np.float32) @ LUMINANCE)
         noise.append(noise_level(grey[-1]))
         speaks.append(shows_texture(grey[-1], distance_of(views, k) < -INSIDE_PX, noise[-1]))
-    return Photographs(tuple(colour), tuple(grey), np.array(noise), np.array(speaks))
+    return Photographs(tuple(grey), np.array(noise), np.array(speaks))
 
 
 def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:

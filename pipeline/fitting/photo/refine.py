@@ -4,7 +4,7 @@ Enters: a solved contour problem and the photographs. Leaves: the same problem w
 of the surface, solved again. Three rounds, coarse to fine: each patch of the current surface (``patches``) moves along
 its normals through the images of the cameras that see it; where its views look most alike, the surface is said to be
 (``consistency``), and how far the views would rather slide says where the cameras are (``registration``). No peak
-inside the reach, or a low one (occluded, specular, textureless), is silence, and so is hair (``hairline``). The
+inside the reach, or a low one (occluded, specular, textureless), is silence, and so is hair (``hair_mask``). The
 observations enter the normal equations beside rims, features and priors (``surface``), robustly; where they are silent
 the kernels carry on smoothly.
 """
@@ -20,7 +20,8 @@ from pipeline.diagnostics import Detail
 from pipeline.eigenheads.gaussian_process import with_fine_kernel
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.contour import Solved, run_stage
-from pipeline.fitting.photo.depth_search import Round, hair_patches, look, observe
+from pipeline.fitting.photo.depth_search import Round, look, observe
+from pipeline.fitting.photo.hair_mask import HairProbability, under_hair
 from pipeline.fitting.photo.images import load_photographs
 from pipeline.fitting.photo.patches import Patches, make_patches
 from pipeline.fitting.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
@@ -39,11 +40,22 @@ MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's o
 
 
 def refine_with_photographs(
-    solved: Solved, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], settings: PhotoSettings
+    solved: Solved,
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    settings: PhotoSettings,
+    *,
+    hair: HairProbability | None = None,
 ) -> tuple[Solved, Detail]:
     """Goes on from the contours' solution with what the photographs show inside the outline, in a finer basis.
 
-    Where they show too little, the solution is left as it is; the second value says which and why.
+    Args:
+        solved: the contours' solution.
+        images: sRGB photographs by camera.
+        settings: lengths and thresholds.
+        hair: how probably each pixel shows hair, by camera; without it everything inside the outline is skin.
+
+    Returns:
+        The solution; where the photographs show too little, as it was. And which of the two, and why.
     """
     problem = solved.problem
     photographs = load_photographs(images, problem.views)
@@ -56,17 +68,18 @@ def refine_with_photographs(
     stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
     state, evaluations, reason, share = solved.state, solved.evaluations, solved.stopped_because, 0.0
     evidence, misfit = solved.evidence, solved.misfit_mm
+    centres = model.vertices(np.zeros(0))[patches.centre]
     lost = np.zeros(0, int)
     for each in ROUNDS:
         looks = look(problem, state, patches, photographs.speaks, settings)
-        hair = hair_patches(problem, state, patches, photographs, looks)
-        surface, lost = observe(problem, state, photographs, patches, looks, hair, basis, each, settings)
+        hidden = under_hair(patches, hair or {}, problem.views.names, looks.pixel, looks.facing > 0, centres)
+        surface, lost = observe(problem, state, photographs, patches, looks, hidden, basis, each, settings)
         share = len(surface.vertex) / max(len(patches.centre), 1)
         if share < settings.least_share:
             why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"
             return solved, Detail("kernel", why)
-        hidden = {LEVEL: near_hair(model, patches.centre[hair])}
-        evidence = StageEvidence(solved.evidence.noise, PhotoEvidence(surface, hidden))
+        outline = {LEVEL: near_hair(model, patches.centre[hidden])}
+        evidence = StageEvidence(solved.evidence.noise, PhotoEvidence(surface, outline))
         state, used, reason = run_stage(problem, evidence, state, stage, lambda fraction: None)
         misfit = unfollowed(model, surface, state, lost)
         evaluations += used

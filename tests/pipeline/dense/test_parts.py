@@ -11,7 +11,6 @@ from pipeline.dense.parts import (
     CLOTHES,
     HAIR,
     SKIN,
-    PartSettings,
     classify_parts,
     colour_looks,
     detail_looks,
@@ -21,6 +20,7 @@ from pipeline.dense.parts import (
 )
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
+from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy

@@ -42,7 +42,7 @@ def photographed() -> tuple[Bust, Capture, dict]:
     head, capture = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32)), Capture(images)
     report = {"report": lambda stage, share: None}
     return (
-        make_bust(made.maps, capture, made.silhouettes, made.rig, head, SETTINGS, **report),
+        make_bust(made.maps, capture, made.silhouettes, made.rig, head, None, SETTINGS, **report),
         capture,
         made.silhouettes,
     )

@@ -21,7 +21,7 @@ SPACING = BustSettings(spacing_mm=3.0)
 
 
 def fused(made: Scene, head: Mesh | None = None, settings: BustSettings = SPACING) -> BustSurface:
-    return fuse(made.maps, made.silhouettes, made.rig, head, settings, report=lambda stage, share: None)
+    return fuse(made.maps, made.silhouettes, made.rig, head, None, settings, report=lambda stage, share: None)
 
 
 def seen_errors(surface: BustSurface, made: Scene) -> np.ndarray:

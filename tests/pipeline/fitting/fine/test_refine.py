@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from pipeline.dense.part_votes import HAIR, SKIN
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.eyelids import EyeEvidence, bridged
 from pipeline.fitting.fine.folds import folded
 from pipeline.fitting.fine.refine import Displaced, draw_to_surface, refine_to_surface
-from pipeline.fitting.fine.surface_points import HAIR, SKIN, SurfacePoints, thinned
+from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.settings import FineSettings

@@ -10,7 +10,6 @@ from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.head_problem import apply_step
 from pipeline.fitting.photo.correlation import choose_views, correlate
 from pipeline.fitting.photo.depth_search import facing_of, look, pixels_per_mm
-from pipeline.fitting.photo.hair_mask import spread_from_border
 from pipeline.fitting.photo.patches import Patches, spread_samples
 from pipeline.fitting.photo.refine import finer, refine_with_photographs
 from pipeline.fitting.problem import Stage, State, SurfaceObservations
@@ -205,15 +204,6 @@ def test_noise_level_of_planted_noise() -> None:
     rng = np.random.default_rng(0)
     ramp = np.linspace(20, 200, 320)[None].repeat(240, axis=0)
     assert noise_level((ramp + rng.normal(0, 3.0, ramp.shape)).astype(np.float32)) == pytest.approx(3.0, rel=0.05)
-
-
-def test_hair_hangs_together_with_the_border() -> None:
-    """A row of patches 3 mm apart: dark ones at the border and, apart from them, a brow."""
-    centres = np.column_stack([3.0 * np.arange(20), np.zeros(20), np.zeros(20)])
-    hair = np.isin(np.arange(20), [0, 1, 2, 10, 11])
-    found = spread_from_border(centres, hair, np.arange(20) == 0)
-    assert found[:4].all()
-    assert not found[4:].any()
 
 
 def test_pixels_per_mm_is_the_pinhole_s(bump: Scene) -> None:

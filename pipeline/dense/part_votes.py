@@ -1,0 +1,83 @@
+"""What a place of the surface shows, by all the views that see it: their part maps vote, cell by cell.
+
+A pixel alone may be a freckle or a gap between strands; and views that see a place from the side know less of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.dense.depth_map import DepthMap, points_world
+from pipeline.dense.parts import PartMap
+from rig.rig import Rig
+
+UNSEEN, SKIN, HAIR, CLOTHES = 0, 1, 2, 3
+"""Parts of a surface, as ``bust.ply`` counts them."""
+PART_NAMES = ("unseen", "skin", "hair", "clothes")
+CELL_MM = 4.0  # edge of a cell
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartVotes:
+    """Cells of the visible surface: their mean places (world, mm) and the mean probability of skin, hair, clothes."""
+
+    corner: Float[np.ndarray, " 3"]
+    size: Int[np.ndarray, " 3"]  # cells along each axis
+    keys: Int[np.ndarray, " g"]  # ascending
+    places: Float[np.ndarray, "g 3"]
+    probability: Float[np.ndarray, "g 3"]
+
+
+def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> PartVotes | None:
+    """The votes of all known pixels.
+
+    Args:
+        depth_maps: one a view.
+        parts: of the same views, on the photographs' own grids.
+        rig: the cameras as calibrated.
+
+    Returns:
+        The cells; None where no view has both depth and parts.
+    """
+    clouds = [(points_world(each), parts[each.camera.name]) for each in depth_maps if each.camera.name in parts]
+    clouds = [(points, part) for points, part in clouds if len(points)]
+    if not clouds:
+        return None
+    points = np.concatenate([points for points, _ in clouds])
+    shown = np.concatenate([_shown(points, part, rig) for points, part in clouds])
+    corner = points.min(axis=0)
+    cell = np.floor((points - corner) / CELL_MM).astype(np.int64)
+    size = cell.max(axis=0) + 1
+    keys, group = np.unique(_keys(cell, size), return_inverse=True)
+    count = np.bincount(group)[:, None]
+
+    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
+        return np.stack([np.bincount(group, values[:, k]) for k in range(3)], axis=1) / count
+
+    return PartVotes(corner, size, keys, mean(points), mean(shown))
+
+
+def _shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
+    height, width = part.probability.shape[:2]
+    column, row = np.rint(np.nan_to_num(rig[part.camera].project(points), nan=-1.0)).astype(int).T
+    framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return part.probability[np.where(framed, row, 0), np.where(framed, column, 0)] * framed[:, None]
+
+
+def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.ndarray, " n"]:
+    return (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+
+
+def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    """SKIN, HAIR or CLOTHES at each point, whichever its own cell (or, without one, the nearest) shows most."""
+    cell = np.floor((points - votes.corner) / CELL_MM).astype(np.int64)
+    inside = ((cell >= 0) & (cell < votes.size)).all(axis=1)
+    keys = np.where(inside, _keys(cell, votes.size), -1)
+    row = np.minimum(np.searchsorted(votes.keys, keys), len(votes.keys) - 1)
+    lost = np.flatnonzero(votes.keys[row] != keys)
+    if len(lost):
+        row[lost] = KDTree(votes.places).query(points[lost])[1]
+    return (SKIN + votes.probability[row].argmax(axis=1)).astype(np.uint8)
