@@ -21,8 +21,9 @@ from rig.rig import Rig
 from server.console import comparison, coverage, guides
 from server.console.identity import cookie_secret, is_foreign, is_rebound
 from server.console.live import message_of
-from server.console.pages.jobs import chosen_settings, log_lines
+from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
+from server.console.studio_view import Frame
 from server.errors import Conflict, Forbidden, NotFound, Unknown
 from server.services.keys import Keys
 from server.settings import ServiceSettings
@@ -230,7 +231,7 @@ def test_a_jobs_log_has_one_line_a_stage() -> None:
 
 
 def test_the_restart_form_becomes_settings() -> None:
-    event = {"method": "simplex", "detail": "", "front": "cam03", "more": '{"fitting": {"modes": 80}}'}
+    event: SettingsForm = {"method": "simplex", "detail": "", "front": "cam03", "more": '{"fitting": {"modes": 80}}'}
     assert chosen_settings(event) == {"method": "simplex", "front": "cam03", "fitting": {"modes": 80}}
     assert chosen_settings({}) == {}
     for wrong in ("{", "[1]"):
@@ -239,7 +240,10 @@ def test_the_restart_form_becomes_settings() -> None:
 
 
 def test_a_look_on_the_wire_holds_every_picture() -> None:
-    frames = [{"name": "a", "jpeg": b"abc", "mean": 1.0}, {"name": "b", "jpeg": None, "fault": "unplugged"}]
+    frames: list[Frame] = [
+        {"name": "a", "jpeg": b"abc", "mean": 1.0},
+        {"name": "b", "jpeg": None, "fault": "unplugged"},
+    ]
     message = message_of(frames, "")
     header, body = struct.unpack(">II", message[:8])
     told = json.loads(message[8 : 8 + header])
