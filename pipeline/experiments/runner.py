@@ -5,18 +5,17 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pipeline.eigenheads.data_folder import models_folder
 from pipeline.eigenheads.model import HeadModel, assemble, load_model, model_path
 from pipeline.eigenheads.sources.imports import import_model
 from pipeline.experiments import markdown
+from pipeline.experiments.outcome import Outcome
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.images import write_image
 
 Report = Callable[[str, float], None]
-Outcome = dict[str, Any]
 
 
 class UnknownExperiment(EigenheadError):

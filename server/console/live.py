@@ -11,7 +11,8 @@ from typing import Protocol
 import structlog
 
 from rig.acquisition.image_checks import blur_px, exposure
-from server.console.studio_view import Frame, frames
+from server.console.live_frame import LiveFrame
+from server.console.studio_view import frames
 from server.services.rigs import ImageRgb, RigBackend, jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child
@@ -29,7 +30,7 @@ log = structlog.get_logger()
 class Source(Protocol):
     """Where pictures come from. Blocks."""
 
-    def frames(self) -> list[Frame]:
+    def frames(self) -> list[LiveFrame]:
         """One a camera: name, jpeg (None without a picture), mean, clipped, perhaps blur_px and fault."""
         ...
 
@@ -40,7 +41,7 @@ class StudioSource:
     def __init__(self) -> None:
         self._child, self._looks = Child(), 0
 
-    def frames(self) -> list[Frame]:
+    def frames(self) -> list[LiveFrame]:
         self._looks += 1
         return self._child.remote(frames)(look=self._looks)
 
@@ -54,7 +55,7 @@ class RigSource:
     def __init__(self, rig: RigBackend) -> None:
         self._rig, self._looks = rig, 0
 
-    def frames(self) -> list[Frame]:
+    def frames(self) -> list[LiveFrame]:
         pictures = self._rig.look()
         names = [camera.name for camera in self._rig.describe().cameras]
         self._looks += 1
@@ -64,12 +65,12 @@ class RigSource:
         pass
 
 
-def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> Frame:
+def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": "The camera shows nothing. Check its cable and power."}
     small = reduced(picture, WIDTH)
     level = exposure(small)
-    found: Frame = {
+    found: LiveFrame = {
         "name": name,
         "mean": round(level.mean, 1),
         "clipped": round(level.clipped_share, 4),
@@ -145,7 +146,7 @@ class LiveView:
         return message_of(found, self.fault)
 
 
-def message_of(frames: list[Frame], fault: str) -> bytes:
+def message_of(frames: list[LiveFrame], fault: str) -> bytes:
     """A look on the wire; ``bytes`` in the header is the length of each camera's JPEG."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
     text = json.dumps({"cameras": header, "fault": fault}).encode()

@@ -16,7 +16,7 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene, view_light
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, expose
-from server.console.studio_view import Frame
+from server.console.live_frame import LiveFrame
 from server.tasks.child import Bench
 from server.tasks.subjects import drawn_subject
 
@@ -27,7 +27,7 @@ QUICK = replace(PRESET, samples=1)  # the pictures are shown at a third of their
 SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 
-def frames(bench: Bench, look: int) -> list[Frame]:
+def frames(bench: Bench, look: int) -> list[LiveFrame]:
     """One frame a camera; now and then one of them has blur_px."""
     views = bench.keep("live", _draw)
     rng = bench.keep("noise", np.random.default_rng)
@@ -50,13 +50,15 @@ def _draw() -> dict[str, tuple[Sensor, np.ndarray, np.ndarray]]:
     return found
 
 
-def _frame(name: str, lit: tuple[Sensor, np.ndarray, np.ndarray], rng: np.random.Generator, *, sharp: bool) -> Frame:
+def _frame(
+    name: str, lit: tuple[Sensor, np.ndarray, np.ndarray], rng: np.random.Generator, *, sharp: bool
+) -> LiveFrame:
     sensor, light, small = lit
     picture = expose(small, sensor, rng)
     level = exposure(picture)
     done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     assert done
-    found: Frame = {
+    found: LiveFrame = {
         "name": name,
         "mean": round(level.mean, 1),
         "clipped": round(level.clipped_share, 4),

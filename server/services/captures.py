@@ -12,7 +12,7 @@ from server.errors import Conflict, NotFound
 from server.services.jobs import Jobs, refuse_board
 from server.services.rigs import SHOT_BYTES, RigBackend
 from server.settings import ServiceSettings
-from server.storage.records import CaptureContent, CaptureRecord, JsonObject
+from server.storage.records import CaptureContent, CaptureRecord
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.child import Children
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
@@ -60,7 +60,7 @@ class Captures:
             with self._children.one() as child:
                 ingest = child.remote(ingest_board if board else ingest_folder)
                 content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels)
-            return self._add(capture, "rig", content, about, dict(shot))
+            return self._add(capture, "rig", content, about, shot)
 
     def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
         """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
@@ -157,7 +157,7 @@ class Captures:
         source: str,
         content: CaptureContent,
         about: About,
-        shot: JsonObject | None = None,
+        shot: Mapping[str, object] | None = None,
     ) -> CaptureRecord:
         if about.session is not None:
             self._store.session(about.session)

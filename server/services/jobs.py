@@ -6,6 +6,7 @@ input, its state the workflow's status. Progress comes from the event log, files
 
 import hashlib
 import json
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,7 +24,7 @@ from server.services.records import Failure, Job
 from server.settings import ServiceSettings
 from server.storage.database import alive_workers, job_index, workers
 from server.storage.events import EventLog, JobEvent
-from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JsonObject
+from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest
 from server.storage.store import Store, StoredFile, is_id, new_id
 
 APPLICATION = "eigenhead"
@@ -50,7 +51,7 @@ class Work:
     """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None."""
 
     model: str | None = None
-    settings: JsonObject | None = None
+    settings: Mapping[str, object] | None = None
 
     def check(self) -> None:
         """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""

@@ -1,8 +1,9 @@
 """What the services give to routes, pages and the command line."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from server.storage.records import FileEntry, JsonObject
+from server.storage.records import FileEntry
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,7 @@ class Job:
     capture_id: str | None
     session: str | None
     model: str | None
-    settings: JsonObject
+    settings: Mapping[str, object]
     restart_of: str | None
     queue: str | None
     priority: int
@@ -60,8 +61,8 @@ class Calibration:
     pictures: dict[str, int]
     state: str
     error: Failure | None = None
-    figures: JsonObject = field(default_factory=dict)
-    checks: tuple[JsonObject, ...] = ()
+    figures: Mapping[str, object] = field(default_factory=dict)
+    checks: tuple[Mapping[str, object], ...] = ()
     warnings: tuple[str, ...] = ()
     front: str | None = None
     in_use: bool = False

@@ -4,12 +4,13 @@ What lies on disk is read once, where it comes in, into a frozen record; a recor
 job engine keeps the requests and results of jobs as they are, across upgrades of this program: those stay mappings.
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Generic, NotRequired, TypedDict, TypeVar
 
 from pydantic import TypeAdapter
 
-JsonObject = dict[str, Any]  # settings of the pipeline before they are checked, certificates, figures
+JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
 T = TypeVar("T")
 
 
@@ -49,7 +50,7 @@ class CaptureRecord:
     inputs: dict[str, str]
     bytes: int
     features: bool
-    shot: JsonObject | None = None
+    shot: Mapping[str, object] | None = None
     board: bool = False
 
 
@@ -90,7 +91,7 @@ class RecordFormat(Generic[T]):
     def __init__(self, kind: type[T], name: str) -> None:
         self._adapter, self.name = TypeAdapter(kind), name
 
-    def document(self, record: T) -> JsonObject:
+    def document(self, record: T) -> dict[str, object]:
         return {"format": self.name, **asdict(record)}  # pyright: ignore[reportArgumentType]
 
     def read(self, document: object) -> T:
@@ -111,7 +112,7 @@ class JobRequest(TypedDict):
 
     capture_id: str
     model: str | None
-    settings: JsonObject
+    settings: Mapping[str, object]
     restart_of: NotRequired[str]
 
 
@@ -125,8 +126,8 @@ class FileEntry(TypedDict):
 class CalibrationOutcome(TypedDict):
     """What a calibration found, as the job engine keeps it; ``sha256`` is of its cameras.json."""
 
-    figures: JsonObject
-    checks: list[JsonObject]
+    figures: Mapping[str, object]
+    checks: list[Mapping[str, object]]
     warnings: list[str]
     front: str | None
     sha256: str

@@ -20,7 +20,7 @@ import secrets
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +30,7 @@ import structlog
 
 from rig.atomic_write import write_atomically
 from server.errors import DiskFull, NotFound
-from server.storage.records import CAPTURE, SESSION, CaptureRecord, JsonObject, RecordFormat, SessionRecord
+from server.storage.records import CAPTURE, SESSION, CaptureRecord, RecordFormat, SessionRecord
 
 ID = re.compile(r"^[0-9a-f]{28}$")
 FOLDERS = ("captures", "sessions", "jobs", "incoming", "uploads", "trash", "set-aside", "calibrations", "cache", "rig")
@@ -224,5 +224,5 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def _encoded(document: JsonObject) -> bytes:
+def _encoded(document: Mapping[str, object]) -> bytes:
     return json.dumps(document, indent=1, ensure_ascii=False).encode()

@@ -62,8 +62,8 @@ def calibrate_folder(
     write_atomically(Path(result) / "calibration.json", json.dumps(document, indent=1).encode())
     digest = hashlib.sha256((Path(result) / "cameras.json").read_bytes()).hexdigest()
     return {
-        "figures": dict(document["figures"]),
-        "checks": [dict(check) for check in document["checks"]],
+        "figures": document["figures"],
+        "checks": [*document["checks"]],
         "warnings": document["warnings"],
         "front": document["front"],
         "sha256": digest,

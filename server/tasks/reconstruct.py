@@ -1,10 +1,10 @@
 """What a job runs in a worker's child process: files in, ``reconstruct()``, files out."""
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from server.storage.records import JsonObject
 from server.tasks.child import Bench, Report
 
 
@@ -21,12 +21,19 @@ class CaptureWork(Protocol):
         result: str,
         cache: str,
         model: str | None,
-        settings: JsonObject,
+        settings: Mapping[str, object],
     ) -> object: ...
 
 
 def reconstruct_capture(
-    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: JsonObject
+    bench: Bench,
+    report: Report,
+    *,
+    capture: str,
+    result: str,
+    cache: str,
+    model: str | None,
+    settings: Mapping[str, object],
 ) -> None:
     """Reconstructs the capture folder ``capture`` into the result folder ``result``. ``cache`` is where
     silhouettes of this capture are kept.

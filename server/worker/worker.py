@@ -169,7 +169,7 @@ class Worker:
         settings = request.get("settings") or {}
         try:
             folder.mkdir(parents=True)
-            method = settings.get("method", "contour")
+            method = str(settings.get("method", "contour"))
             course = Course(self._expectation.of(method))
             meter = ProgressMeter(self.events, job_id, course)
             with self._children.one() as child:

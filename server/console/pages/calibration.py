@@ -16,7 +16,6 @@ from server.errors import Conflict, Unusable
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
-from server.storage.records import JsonObject
 
 LABEL = "calibration board"
 SHOTS_LEAST = 3
@@ -64,7 +63,7 @@ class RigLine(TypedDict):
 
 
 class CalibrationState(TypedDict):
-    calibrations: list[JsonObject]
+    calibrations: list[Mapping[str, object]]
     rig: RigLine
     board: Mapping[str, object]
     shots: int

@@ -1,8 +1,9 @@
 """Jobs: the queue, stage and progress, log, cancel, restart with other settings; what a finished one says of itself."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import NotRequired, TypedDict
+from typing import NotRequired, TypedDict, cast
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
@@ -17,7 +18,6 @@ from server.services.jobs import FINISHED, Work
 from server.services.records import Job
 from server.services.service import Service
 from server.storage.events import JobEvent
-from server.storage.records import JsonObject
 
 SHOWN = 200
 LOG_LINES = 200
@@ -56,8 +56,32 @@ class JobDetail(TypedDict):
     pictures: bool
 
 
+class JobLine(TypedDict):
+    """A job in the list: all but its files, and the label and time of its capture."""
+
+    id: str
+    state: str
+    stage: str
+    progress: float
+    eta_s: float | None
+    error: dict[str, object] | None
+    notice: str | None
+    capture_id: str | None
+    session: str | None
+    model: str | None
+    settings: dict[str, object]
+    restart_of: str | None
+    queue: str | None
+    priority: int
+    created: str | None
+    started: str | None
+    finished: str | None
+    capture: str
+    captured: str | None
+
+
 class JobsState(TypedDict):
-    jobs: list[JsonObject]
+    jobs: list[JobLine]
     models: list[str]
 
 
@@ -115,10 +139,9 @@ def jobs_list(service: Service) -> list[ListedJob]:
     return found
 
 
-def job_line(listed: ListedJob) -> JsonObject:
-    """A job in the list: all but its files."""
+def job_line(listed: ListedJob) -> JobLine:
     job = {key: value for key, value in asdict(listed.job).items() if key != "files"}
-    return {**job, "capture": listed.capture, "captured": listed.captured}
+    return cast(JobLine, {**job, "capture": listed.capture, "captured": listed.captured})
 
 
 def job_detail(service: Service, job_id: str) -> JobDetail:
@@ -173,7 +196,7 @@ def restart(page: Page, event: RestartForm) -> str:
     return f"Queued job {job.id[-6:]}."
 
 
-def chosen_settings(event: SettingsForm) -> JsonObject:
+def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
     """Settings from the form: method, detail and front, and further ones as JSON. Raises InputError."""
     try:
         settings = json.loads(event.get("more") or "{}")

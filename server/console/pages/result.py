@@ -1,5 +1,6 @@
 """The head: turned, coloured, measured, compared, fetched."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypedDict
 
@@ -12,7 +13,6 @@ from server.console.page import Page, shared, show
 from server.console.pages.jobs import ListedJob, jobs_list
 from server.console.pages.rig import read_report
 from server.services.service import Service
-from server.storage.records import JsonObject
 
 THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of three.js
 MOSTLY = 0.25  # of a contour, as on the page Jobs
@@ -27,7 +27,7 @@ class ResultLine(TypedDict):
     capture_id: str | None
     created: str | None
     finished: str | None
-    settings: JsonObject
+    settings: Mapping[str, object]
     model: str | None
 
 

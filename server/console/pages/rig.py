@@ -8,15 +8,14 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.results.report import Report
-from rig.acquisition.shot import CameraSyncDocument
+from rig.acquisition.shot import CameraSyncDocument, SyncDocument
 from server.console.media import live_view
 from server.console.page import Action, Page, shared, show
 from server.console.pages.captures import SessionLine, sessions_list
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
-from server.storage.records import JsonObject
-from server.tasks.simulate import SimulatedSync
+from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
 
 class Tile(TypedDict):
@@ -87,9 +86,10 @@ def rig_state(service: Service) -> RigShown:
     }
 
 
-def sync_of(shot: JsonObject) -> dict[str, CameraSyncDocument | SimulatedSync]:
+def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
     """Status and skew of each camera in a capture's certificate, of a real rig or of the simulated studio."""
-    return shot.get("sync", shot).get("cameras", {})
+    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
+    return certificate.get("cameras", {})
 
 
 def calibration_in_use(service: Service) -> InUse | None:
@@ -99,7 +99,11 @@ def calibration_in_use(service: Service) -> InUse | None:
     known: list[Calibration] = shared.get("calibrations", 2.0, service.calibrations.find)
     for found in known:
         if found.in_use:
-            return {"label": found.label, "created": found.created, "rms_px": found.figures.get("rms_px")}
+            return {
+                "label": found.label,
+                "created": found.created,
+                "rms_px": cast(float | None, found.figures.get("rms_px")),
+            }
     return None
 
 

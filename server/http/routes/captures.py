@@ -13,7 +13,7 @@ from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, Ne
 from server.services.captures import About
 from server.services.jobs import Work
 from server.services.keys import Caller
-from server.storage.records import CaptureRecord, JsonObject
+from server.storage.records import CaptureRecord
 from server.wire.multipart import ARCHIVE, described_form, receive_capture
 from server.wire.problems import Responses, documented
 from server.wire.send_file import send_file
@@ -141,7 +141,7 @@ async def reconstruct_upload(
     return JobOut.model_validate(job)
 
 
-def _settings_of(text: str | None) -> JsonObject | None:
+def _settings_of(text: str | None) -> dict[str, object] | None:
     if not text:
         return None
     try:
