@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from calibration.quality.checks import (
 from calibration.quality.outliers import Dropped
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
-from rig.formats.cameras_json import document_from_rig
+from rig.formats.cameras_json import CamerasDocument, document_from_rig
 from rig.rig import Rig
 
 
@@ -30,6 +30,60 @@ class CalibrationRefused(EigenheadError):
         self.reasons = tuple(reasons)
         self.calibration = calibration
         super().__init__("the calibration is refused: " + "; ".join(self.reasons))
+
+
+class CameraFigures(TypedDict):
+    rms_px: float
+    alone_rms_px: float
+    views: int
+    corners: int
+    pose_sigma_px: float
+    focal_sigma_px: float
+
+
+class Figures(TypedDict):
+    """The numbers of ``calibrate --json``."""
+
+    rms_px: float
+    used_share: float
+    corners: int
+    sync_px: float
+    cameras: dict[str, CameraFigures]
+
+
+class CheckDocument(TypedDict):
+    name: str
+    passed: bool | None
+    detail: str
+    advice: str
+
+
+class DroppedDocument(TypedDict):
+    shot: str
+    camera: str | None
+    reason: str
+
+
+class OffsetsDocument(TypedDict):
+    used: bool
+    unit: str
+    cameras: dict[str, float]
+    sigma: dict[str, float]
+    rms_without_px: float
+    rms_with_px: float
+
+
+class CalibrationDocument(TypedDict):
+    """``calibration.json``."""
+
+    figures: Figures
+    front: str
+    checks: list[CheckDocument]
+    dropped: list[DroppedDocument]
+    warnings: list[str]
+    time_offsets: OffsetsDocument | None
+    intrinsics_sigma: dict[str, dict[str, float]]
+    rig: CamerasDocument
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +111,10 @@ class Calibration:
     checks: tuple[Check, ...]
     warnings: tuple[str, ...]
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> Figures:
         """The numbers of ``calibrate --json``."""
         everything = np.concatenate([miss for _, _, miss in self.misses.values()])
-        cameras = {}
+        cameras: dict[str, CameraFigures] = {}
         for camera in self.rig:
             own = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
             cameras[camera.name] = {
@@ -79,10 +133,10 @@ class Calibration:
             "cameras": cameras,
         }
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> CalibrationDocument:
         """Everything but the residuals, as JSON."""
         names = self.rig.names
-        offsets = None
+        offsets: OffsetsDocument | None = None
         if self.offsets is not None:
             offsets = {
                 "used": self.offsets_used,
@@ -92,8 +146,9 @@ class Calibration:
                 "rms_without_px": self.offsets.rms_without_px,
                 "rms_with_px": self.offsets.rms_with_px,
             }
-        sigma = {
-            name: dict(zip(INTRINSICS, values.tolist(), strict=True)) for name, values in self.intrinsics_sigma.items()
+        sigma: dict[str, dict[str, float]] = {
+            name: {of: value for of, value in zip(INTRINSICS, values.tolist(), strict=True)}
+            for name, values in self.intrinsics_sigma.items()
         }
         return {
             "figures": self.figures(),

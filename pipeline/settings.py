@@ -221,7 +221,7 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
     return settings
 
 
-def document_from_settings(settings: Settings) -> dict[str, Any]:
+def document_from_settings(settings: Settings) -> dict[str, object]:
     return dataclasses.asdict(settings)
 
 

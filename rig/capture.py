@@ -4,12 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from types import MappingProxyType
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
+Filed = TypeVar("Filed")
 
 
 Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
@@ -42,7 +43,7 @@ def refiled(
         points: the same of the feature points that were picked in its image.
     """
 
-    def given(filed: Mapping[str, Any], source: Mapping[str, str]) -> dict[str, Any]:
+    def given(filed: Mapping[str, Filed], source: Mapping[str, str]) -> dict[str, Filed]:
         wanted = {name: source.get(name, name) for name in filed.keys() | source.keys()}
         return {name: filed[wanted[name]] for name in sorted(wanted) if wanted[name] in filed}
 

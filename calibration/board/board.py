@@ -7,6 +7,7 @@ numbered row by row.
 """
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -110,7 +111,7 @@ def read_board(path: Path) -> Board:
     return board_from_document(document, path.name)
 
 
-def board_from_document(document: dict[str, Any], subject: str = "board.toml") -> Board:
+def board_from_document(document: Mapping[str, Any], subject: str = "board.toml") -> Board:
     """The board of decoded TOML. Raises InputError naming every fault."""
     known = set(Board.__dataclass_fields__)
     faults = [f"unknown key {key!r}; known are {', '.join(sorted(known))}" for key in document if key not in known]
@@ -139,7 +140,7 @@ def board_from_document(document: dict[str, Any], subject: str = "board.toml") -
     return Board(**{**document, **floats})
 
 
-def _dictionary_faults(document: dict[str, Any]) -> list[str]:
+def _dictionary_faults(document: Mapping[str, Any]) -> list[str]:
     name = document.get("dictionary", "DICT_4X4_1000")
     if not isinstance(name, str) or not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
         return [f"dictionary is {name!r:.60}, wanted one of OpenCV's, such as 'DICT_4X4_1000'"]

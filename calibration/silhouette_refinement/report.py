@@ -2,18 +2,49 @@
 
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float
 
 from calibration.report import STYLE, listed, table
 from calibration.silhouette_refinement.refine import Refinement, robust_rms
-from rig.formats.cameras_json import document_from_rig
+from rig.formats.cameras_json import CamerasDocument, document_from_rig
 from rig.geometry import vector_from_rotation
 from rig.rig import Rig
 
 BINS, HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 24, 420.0, 160.0
+
+
+class HeldOut(TypedDict):
+    """Residuals of the captures held out, and how many equations they are."""
+
+    before_px: float
+    after_px: float
+    noise_px: float
+    equations: int
+
+
+class RefinedCamera(TypedDict):
+    before_px: float
+    after_px: float
+    equations: int
+    change_px: float
+    turn_mrad: float
+    shift_mm: float
+    focal_change: float
+
+
+class RefinementDocument(TypedDict):
+    """What ``refine --json`` prints."""
+
+    kept: bool
+    reason: str
+    captures: list[str]
+    held_out: HeldOut
+    cameras: dict[str, RefinedCamera]
+    warnings: list[str]
+    rig: CamerasDocument
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +56,7 @@ class RefinementRun:
     captures: tuple[str, ...]
     warnings: tuple[str, ...] = ()
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> RefinementDocument:
         """What ``refine --json`` prints."""
         found = self.refinement
         return {
@@ -87,7 +118,7 @@ def refinement_page(run: RefinementRun) -> str:
     return "\n".join(parts)
 
 
-def _camera(run: RefinementRun, name: str) -> dict[str, Any]:
+def _camera(run: RefinementRun, name: str) -> RefinedCamera:
     found, start, end = run.refinement, run.start[name], run.refinement.proposed[name]
     motion = end.camera_from_world @ start.camera_from_world.inverse()
     after = found.after.of(name)

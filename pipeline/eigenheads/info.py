@@ -1,12 +1,37 @@
 """What a head model is made of, as ``eigenhead model info --json`` says it."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TypedDict
 
 from pipeline.eigenheads.model import HeadModel
 
 
-def model_info(model: HeadModel) -> dict[str, Any]:
-    """Plain values. Vertices and faces are the full level's; what nobody measured is None."""
+class LevelInfo(TypedDict):
+    vertices: int
+    faces: int
+
+
+class ModelInfo(TypedDict):
+    """Vertices and faces are the full level's; what nobody measured is None."""
+
+    name: str
+    licence: str
+    sha256: str
+    subjects: dict[str, int]
+    modes: int
+    vertices: int
+    faces: int
+    landmarks: int
+    generalisation_mm: float | None
+    specificity_mm: float | None
+    source: str
+    notice: str
+    figures: Mapping[str, object]
+    levels: dict[str, LevelInfo]
+
+
+def model_info(model: HeadModel) -> ModelInfo:
+    """Plain values."""
     full = model.levels["full"]
     return {
         "name": model.name,

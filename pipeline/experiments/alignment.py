@@ -10,13 +10,13 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pipeline.alignment import silhouette_search
 from pipeline.alignment.silhouette_search import search_alignment
 from pipeline.eigenheads.model import HeadModel, with_modes
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, worn_silhouettes
 from pipeline.fitting.contour import fit_contour
@@ -35,7 +35,7 @@ RIGHT_DEG, RIGHT_MM = 2.0, 3.0
 def alignment(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 200,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Share of right alignments, their errors, and the seconds of the search."""
     records = Records(folder, "alignment", key_of(model.sha256, Settings(), *CONTOUR, silhouette_search))
     span, rows = with_modes(model, 60), []

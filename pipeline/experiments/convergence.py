@@ -6,12 +6,12 @@ over the face is under 0.3 mm. Beside them heads drawn as the model says, z ~ N(
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
 from pipeline.fitting.contour import fit_contour
@@ -28,7 +28,7 @@ SHARES = {"section52": 1.0, "normal": 0.2}  # of the draws
 def convergence(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 500,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Share of the draws that arrive, and the errors, of both kinds."""
     records = Records(folder, "convergence", key_of(model.sha256, FittingSettings(), *CONTOUR))
     span, rig = with_modes(model, 60), exact(default_layout())

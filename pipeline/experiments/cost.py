@@ -9,12 +9,13 @@ outlier is forgiven. The simplex has the true alignment; errors are over the fac
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypedDict
 
 import numpy as np
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, mean_error_mm, random_subjects, worn_silhouettes
 from pipeline.fitting.contour import fit_contour
@@ -30,9 +31,17 @@ from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 
+
+class SimplexCost(TypedDict):
+    """Which pixels count, and whether by eq. (5) or eq. (4)."""
+
+    speaking: Literal["face", "all"]
+    weighted: bool
+
+
 STYLE = HairStyle(thickness_mm=16.0, over_ears=True, fringe_mm=8.0)
 UNFORGIVING_PX = 1e3
-SIMPLEX: dict[str, dict[str, Any]] = {
+SIMPLEX: dict[str, SimplexCost] = {
     "simplex_eq4": {"speaking": "all", "weighted": False},
     "simplex_eq5": {"speaking": "all", "weighted": True},
     "simplex_eq5_face": {"speaking": "face", "weighted": True},
@@ -46,7 +55,7 @@ FORGIVING = {
 def cost(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Errors by solver and cost, and of the mean head."""
     sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "cost", key_of(model.sha256, FittingSettings(), STYLE, *sources))

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -27,6 +27,7 @@ from scipy.spatial import KDTree
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import Records, Row
 from pipeline.experiments.span import weighted_quantile
 from pipeline.fitting.fit import Fit
@@ -97,7 +98,7 @@ def run(
     in_span: int = 10,
     held_out: bool = True,
     folder: Path | None = None,
-) -> dict[str, Any]:
+) -> Outcome:
     """``{"figures": {...}, "rows": [...]}``; ``figures`` is flat, ``<subject>_<model>_<level>_<quantity>``.
 
     ``models``: by the name that the figures carry; the first one is used for draws, faults and held-out cameras.

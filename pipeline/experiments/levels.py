@@ -8,12 +8,12 @@ it. Beside it the contour solver on images of full, half and a quarter of the si
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
 from pipeline.fitting.contour import fit_contour
@@ -41,7 +41,7 @@ SCALES = {"full images": 1.0, "half images": 0.5, "quarter images": 0.25}
 def levels(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Seconds, evaluations and errors by hierarchy."""
     sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "levels", key_of(model.sha256, FittingSettings(), *sources))

@@ -8,7 +8,6 @@ the truth plus the prior.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import HeadModel, with_modes
+from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_errors, random_subjects
 from pipeline.fitting.contour import fit_contour, schedule
 from pipeline.fitting.fit import Fit
@@ -38,7 +38,7 @@ UNROBUST_PX = 1e3  # a robust scale so wide that the bound knows of no outliers
 
 def limit(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 15, draws: int = 2
-) -> dict[str, Any]:
+) -> Outcome:
     """eta and coverage over ``subjects`` x ``draws`` for each noise."""
     span, rig = with_modes(model, 60), exact(default_layout())
     planted = random_subjects(subjects, seed=91)
@@ -70,7 +70,7 @@ def _row(
     sigma: float,
     bound: float,
     rng: np.random.Generator,
-) -> dict[str, Any]:
+) -> Row:
     noisy = {name: with_noise(silhouette, sigma, CORRELATION_PX, rng) for name, silhouette in clean.items()}
     fit = fit_contour(model, subject.start, noisy, rig, settings_for(sigma))
     errors = face_errors(model, fit, subject)

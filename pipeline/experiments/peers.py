@@ -38,6 +38,7 @@ from scipy.optimize import minimize
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown, soft_rasteriser
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, mean_error_mm, subjects_of_section_5_2
 from pipeline.fitting.contour import fit_contour
@@ -92,7 +93,7 @@ Minimiser = Callable[[Counted, Float[np.ndarray, " m"], int], Float[np.ndarray, 
 def peers(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 10,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Seconds, evaluations and errors of every solver on ``subjects`` of section 5.2's hundred, evenly taken."""
     span, rig = with_modes(model, MODES), exact(default_layout())
     everyone = subjects_of_section_5_2(model, 100)

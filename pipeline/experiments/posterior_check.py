@@ -13,13 +13,13 @@ contours they are given, since a step must not take a tenth of a second.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments.limit import CORRELATION_PX, UNROBUST_PX, settings_for, with_noise
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, exact_silhouettes, face_rows, random_subjects
 from pipeline.fitting.contour import run_stage
@@ -45,7 +45,7 @@ class Chain:
 def posterior_check(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Chain over Laplace: standard deviations of coefficients and pose, and of the face's points along the axes."""
     records = Records(folder, "posterior", key_of(model.sha256, *CONTOUR, STEPS, BETA))
     span, rig = with_modes(model, 60), exact(default_layout())

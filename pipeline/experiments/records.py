@@ -6,9 +6,9 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from pipeline.estimation import levenberg_marquardt, terms
+from pipeline.experiments.outcome import Row
 from pipeline.fitting import (
     clutter,
     contour,
@@ -23,8 +23,6 @@ from pipeline.fitting import (
     rim_term,
 )
 from rig.atomic_write import write_atomically
-
-Row = dict[str, Any]
 
 # What rows of the contour solver depend on, for keys.
 CONTOUR = (

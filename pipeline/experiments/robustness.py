@@ -21,13 +21,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import limit, markdown
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import (
     Planted,
@@ -65,7 +65,7 @@ KNOCKS_DEG = (1.0, 5.0)
 def robustness(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """Errors by condition, their ratios to the base and to the bound, and how often faults are found."""
     records = Records(folder, "robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
     span = with_modes(model, 60)

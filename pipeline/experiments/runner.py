@@ -5,18 +5,26 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pipeline.eigenheads.data_folder import models_folder
 from pipeline.eigenheads.model import HeadModel, assemble, load_model, model_path
 from pipeline.eigenheads.sources.imports import import_model
-from pipeline.experiments import markdown
+from pipeline.experiments import detail, markdown, span, tables
+from pipeline.experiments.alignment import alignment
+from pipeline.experiments.convergence import convergence
+from pipeline.experiments.cost import cost
+from pipeline.experiments.levels import levels
+from pipeline.experiments.limit import limit
+from pipeline.experiments.outcome import Outcome
+from pipeline.experiments.posterior_check import posterior_check
+from pipeline.experiments.robustness import robustness
+from pipeline.experiments.views import views
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.images import write_image
+from rig.render.renderer import Renderer
 
 Report = Callable[[str, float], None]
-Outcome = dict[str, Any]
 
 
 class UnknownExperiment(EigenheadError):
@@ -72,29 +80,23 @@ def run_experiment(
     return found
 
 
-def _drawn(module: str) -> Callable[[Task], Outcome]:
+def _drawn(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
     """An experiment that needs a renderer, the model and a number of subjects."""
 
     def run(task: Task) -> Outcome:
-        from rig.render.renderer import Renderer
-
-        chosen = getattr(importlib.import_module(f".{module}", __package__), module)
         count = {"subjects": task.subjects} if task.subjects else {}
         with Renderer.create() as renderer:
-            return chosen(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
+            return experiment(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
 
     return run
 
 
-def _table(name: str) -> Callable[[Task], Outcome]:
+def _table(table: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
     def run(task: Task) -> Outcome:
-        from pipeline.experiments import tables
-        from rig.render.renderer import Renderer
-
         given = {"subjects": task.subjects, "simplex_subjects": task.simplex}
         count = {key: value for key, value in given.items() if value is not None}
         with Renderer.create() as renderer:
-            return getattr(tables, name)(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
+            return table(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
 
     return run
 
@@ -103,20 +105,17 @@ def _peers(task: Task) -> Outcome:
     for package in ("cma", "pybobyqa", "jax"):
         if importlib.util.find_spec(package) is None:
             raise MissingPeers(package)
-    return _drawn("peers")(task)
+    from pipeline.experiments.peers import peers
+
+    return _drawn(peers)(task)
 
 
 def _limit(task: Task) -> Outcome:
-    from pipeline.experiments.limit import limit
-    from rig.render.renderer import Renderer
-
     with Renderer.create() as renderer:
         return limit(task.head, renderer=renderer, report=task.report, subjects=task.subjects or 15)
 
 
 def _span(task: Task) -> Outcome:
-    from pipeline.experiments import span
-
     other = _facekit(task.shared)
     truths = [span.read_truth(path) for path in _truths(task.shared).values()]
     truths += span.random_draws(other, task.subjects or 20)
@@ -124,9 +123,6 @@ def _span(task: Task) -> Outcome:
 
 
 def _detail(task: Task) -> Outcome:
-    from pipeline.experiments import detail
-    from rig.render.renderer import Renderer
-
     other = _facekit(task.shared)
     captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
     with Renderer.create() as renderer:
@@ -143,18 +139,18 @@ def _detail(task: Task) -> Outcome:
 
 
 EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
-    "table1": _table("table1"),
-    "table2": _table("table2"),
-    "table3": _table("table3"),
-    "cost": _drawn("cost"),
-    "levels": _drawn("levels"),
+    "table1": _table(tables.table1),
+    "table2": _table(tables.table2),
+    "table3": _table(tables.table3),
+    "cost": _drawn(cost),
+    "levels": _drawn(levels),
     "peers": _peers,
     "limit": _limit,
-    "robustness": _drawn("robustness"),
-    "convergence": _drawn("convergence"),
-    "alignment": _drawn("alignment"),
-    "posterior": _drawn("posterior_check"),
-    "views": _drawn("views"),
+    "robustness": _drawn(robustness),
+    "convergence": _drawn(convergence),
+    "alignment": _drawn(alignment),
+    "posterior": _drawn(posterior_check),
+    "views": _drawn(views),
     "span": _span,
     "detail": _detail,
 }

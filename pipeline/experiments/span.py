@@ -19,6 +19,7 @@ from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.pca import rigid_fit
 from pipeline.eigenheads.subdivision import vertex_areas
 from pipeline.eigenheads.training.model_metrics import of_draws
+from pipeline.experiments.outcome import Outcome
 from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.geometry import RigidTransform
@@ -45,7 +46,7 @@ def run(
     *,
     counts: Sequence[int] = (60, 0),
     report: Report | None = None,
-) -> dict:
+) -> Outcome:
     """``{"figures": {...}, "rows": [...]}``: floors of each model on each truth, for each count of modes (0: all).
 
     ``figures`` is flat: ``<model>_<modes>_<truth>_{median,mean}_mm`` and ``_largest_sigma`` for each single truth, and

@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown, pictures
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, binary_silhouettes, exact, subjects_of_section_5_2
 from pipeline.fitting.contour import fit_contour
@@ -59,7 +59,7 @@ def table1(
     subjects: int = 100,
     simplex_subjects: int = 100,
     folder: Path | None = None,
-) -> dict[str, Any]:
+) -> Outcome:
     """Tables 1 and 2, and pictures like figures 4 and 5. ``simplex_subjects``: how many the simplex fits too."""
     rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder, all_too=True)
     figures: dict[str, float] = {"subjects": len(rows), "simplex_subjects": sum("simplex" in row for row in rows)}
@@ -98,7 +98,7 @@ def table2(
     subjects: int = 100,
     simplex_subjects: int = 100,
     folder: Path | None = None,
-) -> dict[str, Any]:
+) -> Outcome:
     """Table 2 alone, from table 1's rows."""
     rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder, all_too=True)
     figures = _correlations(rows)
@@ -113,7 +113,7 @@ def table3(
     subjects: int = 100,
     simplex_subjects: int = 25,
     folder: Path | None = None,
-) -> dict[str, Any]:
+) -> Outcome:
     """The four arrangements of section 5.3."""
     figures, rows, table = {}, {}, []
     for name in ARRANGEMENTS:

@@ -10,7 +10,6 @@ limit, and by the error of fits to heads with hair.
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +17,7 @@ from jaxtyping import Float
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.experiments import markdown
 from pipeline.experiments.limit import UNROBUST_PX, settings_for
+from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import Planted, exact, face_rows, mean_error_mm, random_subjects, worn_silhouettes
 from pipeline.fitting.contour import fit_contour
@@ -43,7 +43,7 @@ Information = Float[np.ndarray, "k p p"]
 def views(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
     folder: Path | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> Outcome:  # fmt: skip
     """The planned directions, and limit and error of every arrangement over ``subjects`` heads not planned on."""
     span = with_modes(model, 60)
     records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
@@ -64,7 +64,7 @@ def views(
     return _outcome(rows, tuple(rigs), directions)
 
 
-def _outcome(rows: list[Row], names: tuple[str, ...], directions: list[tuple[int, int]]) -> dict[str, Any]:
+def _outcome(rows: list[Row], names: tuple[str, ...], directions: list[tuple[int, int]]) -> Outcome:
     figures, table = {}, []
     for name in names:
         of = [row for row in rows if row["arrangement"] == name]

@@ -7,7 +7,6 @@ tangent planes wherever a sample is close, so that the density of samples does n
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
@@ -96,6 +95,6 @@ def _by_part(
     return {name: figures_of(distances[of]) for name, of in chosen.items() if of.sum() > LEAST_POINTS}
 
 
-def document(score: VisibleScore) -> dict[str, Any]:
+def document(score: VisibleScore) -> dict[str, object]:
     """The score as JSON types."""
     return {"recall": score.recall, "precision": score.precision, "closed": score.closed}

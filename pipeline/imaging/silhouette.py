@@ -1,7 +1,7 @@
 """Silhouettes and the paper's costs (section 4.3)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ class ViewQuality:
     components: int = 1
     holes: int = 0
     warnings: tuple[str, ...] = ()
-    figures: dict[str, Any] = field(default_factory=dict)
+    figures: Mapping[str, float | list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

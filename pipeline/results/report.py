@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -18,7 +18,102 @@ from rig.mesh import boundary_edges
 FORMAT = "eigenhead-report/1"
 
 
-def report_document(result: Reconstruction) -> dict[str, Any]:
+class ViewReport(TypedDict):
+    """How far a camera's silhouette was to be trusted."""
+
+    usable: bool
+    contrast: float | None
+    cut_off: list[str]
+    components: int
+    holes: int
+    warnings: list[str]
+    figures: dict[str, object]
+
+
+class CameraReport(TypedDict):
+    """``camera_shift``: rotation (rad) and translation (mm), left perturbation of camera_from_world."""
+
+    used: bool
+    iou: float | None
+    contour_rms_px: float | None
+    excluded_share: float | None
+    samples: int
+    xor_cost: float | None
+    xor_cost_start: float | None
+    camera_shift: list[float] | None
+    view: ViewReport | None
+
+
+class WarningReport(TypedDict):
+    code: str
+    message: str
+
+
+class NamedModel(TypedDict):
+    name: str
+    sha256: str
+
+
+class Measured(TypedDict):
+    """In mm, with its standard deviation."""
+
+    value: float
+    std: float
+
+
+class Placed(TypedDict):
+    """A landmark in the world (mm), with its standard deviation."""
+
+    position: list[float]
+    std: float
+
+
+class SimilarityReport(TypedDict):
+    scale: float
+    rotation: list[list[float]]
+    translation: list[float]
+
+
+class BustReport(TypedDict):
+    """Of the whole visible surface; ``closed``: every edge has two faces."""
+
+    spacing_mm: float
+    vertices: int
+    faces: int
+    seen_share: float
+    closed: bool
+    parts: dict[str, float]
+    quality: dict[str, float | None]
+    filled: int
+
+
+class Report(TypedDict):
+    """``report.json``."""
+
+    format: str
+    version: str
+    model: NamedModel
+    method: str
+    detail: dict[str, str]
+    front: str
+    cameras: dict[str, CameraReport]
+    pictures: dict[str, str]
+    coefficients: list[float]
+    world_from_head: SimilarityReport
+    landmarks: dict[str, Placed]
+    measurements: dict[str, Measured]
+    quality: dict[str, float | None]
+    texture: dict[str, object]
+    bust: BustReport | None
+    evaluations: int
+    stopped_because: str
+    seconds: dict[str, float]
+    settings: dict[str, object]
+    inputs: dict[str, str]
+    warnings: list[WarningReport]
+
+
+def report_document(result: Reconstruction) -> Report:
     """The decoded report: JSON types only, every number finite (what is not known is null)."""
     filled = int(np.count_nonzero(result.views == 0))
     document = {
@@ -47,17 +142,17 @@ def report_document(result: Reconstruction) -> dict[str, Any]:
     return _plain(document)
 
 
-def similarity_document(transform: Similarity) -> dict[str, Any]:
+def similarity_document(transform: Similarity) -> SimilarityReport:
     """The paper's form ``x_world = s (R x_head + t)``: its translation is ours divided by the scale."""
+    translation = transform.translation / transform.scale
     return {
         "scale": transform.scale,
-        "rotation": transform.rotation,
-        "translation": transform.translation / transform.scale,
+        "rotation": transform.rotation.tolist(),
+        "translation": translation.tolist(),
     }
 
 
-def _bust(bust: Bust) -> dict[str, Any]:
-    """Of the whole visible surface; ``closed``: every edge has two faces."""
+def _bust(bust: Bust) -> dict[str, object]:
     surface = bust.surface
     return {
         "spacing_mm": bust.spacing_mm,
@@ -71,7 +166,7 @@ def _bust(bust: Bust) -> dict[str, Any]:
     }
 
 
-def _camera(result: Reconstruction, name: str, figures: CameraFigures) -> dict[str, Any]:
+def _camera(result: Reconstruction, name: str, figures: CameraFigures) -> dict[str, object]:
     silhouette = result.silhouettes.get(name)
     shift = result.fit.camera_shift.get(name)
     return {
@@ -87,7 +182,7 @@ def _camera(result: Reconstruction, name: str, figures: CameraFigures) -> dict[s
     }
 
 
-def _quality(quality: ViewQuality) -> dict[str, Any]:
+def _quality(quality: ViewQuality) -> dict[str, object]:
     return {
         "usable": quality.usable,
         "contrast": quality.contrast,

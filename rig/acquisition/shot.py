@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, Literal
+from typing import Literal, TypedDict
 
 import numpy as np
 from jaxtyping import UInt8
@@ -89,6 +89,47 @@ class CameraSync:
     sequence: int | None
 
 
+class CameraSyncDocument(TypedDict):
+    status: Status
+    arrival_ms: float | None
+    skew_ms: float | None
+    frame: int | None
+
+
+class SyncDocument(TypedDict):
+    """A certificate in JSON; times in milliseconds."""
+
+    trigger_utc: str
+    fired: bool
+    uncertainty_ms: float | None
+    skew_most_ms: float | None
+    spread_ms: float | None
+    cameras: dict[str, CameraSyncDocument]
+
+
+class CheckDocument(TypedDict):
+    mean: float
+    clipped_share: float
+    blur_px: float | None
+    background_found: float | None
+    background_moved_px: float | None
+
+
+class FaultDocument(TypedDict):
+    code: str
+    camera: str | None
+    detail: str
+
+
+class ShotDocument(TypedDict):
+    """``shot.json`` (``eigenhead-shot/1``)."""
+
+    format: str
+    sync: SyncDocument
+    checks: dict[str, CheckDocument]
+    faults: list[FaultDocument]
+
+
 @dataclass(frozen=True, slots=True)
 class SyncCertificate:
     """How far the pictures of a shot belong to one moment. ``trigger_s`` is time.monotonic; None: nothing fired."""
@@ -111,7 +152,7 @@ class SyncCertificate:
         skews = {line.camera: "" if line.skew_s is None else f"  {line.skew_s * 1000:+.1f} ms" for line in self.cameras}
         return [f"{line.camera:<{width}}  {line.status}{skews[line.camera]}" for line in self.cameras]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> SyncDocument:
         """For JSON; times in milliseconds."""
         return {
             "trigger_utc": self.trigger_utc,
@@ -154,7 +195,7 @@ class Shot:
         """Whether it is worth reconstructing: every camera's picture, of one moment, of its own view."""
         return not any(fault.is_error for fault in self.faults)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> ShotDocument:
         """For shot.json in the capture folder."""
         return {
             "format": "eigenhead-shot/1",
@@ -316,7 +357,7 @@ def _level(name: str, plates: Plates) -> float:
     return LEVEL_WITHOUT_PLATES if plate is None else max(float(plate[::4, ::4].mean()), 1.0)
 
 
-def _check_document(check: PictureCheck) -> dict[str, Any]:
+def _check_document(check: PictureCheck) -> CheckDocument:
     registration = check.registration
     return {
         "mean": round(check.exposure.mean, 2),

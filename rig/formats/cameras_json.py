@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -15,6 +15,31 @@ from rig.rig import Rig
 FORMAT = "eigenhead-cameras/1"
 CAMERAS_LEAST, CAMERAS_MOST = 3, 64
 PIXELS_MOST = 20_000  # a side; larger is a damaged or hostile file, not a camera
+
+
+class PoseDocument(TypedDict):
+    rotation: list[list[float]]
+    translation: list[float]
+
+
+class CameraDocument(TypedDict):
+    """``covariance``: 6 x 6, rotation (rad) then translation (mm)."""
+
+    name: str
+    width: int
+    height: int
+    intrinsics: dict[str, float]
+    distortion: dict[str, str | float]
+    camera_from_world: PoseDocument
+    covariance: NotRequired[list[list[float]]]
+
+
+class CamerasDocument(TypedDict):
+    """``cameras.json``."""
+
+    format: str
+    unit: str
+    cameras: list[CameraDocument]
 
 
 def read_rig(path: Path) -> Rig:
@@ -30,7 +55,7 @@ def write_rig(rig: Rig, path: Path) -> None:
     write_atomically(path, json.dumps(document_from_rig(rig), indent=1).encode())
 
 
-def document_from_rig(rig: Rig) -> dict[str, Any]:
+def document_from_rig(rig: Rig) -> CamerasDocument:
     return {"format": FORMAT, "unit": "mm", "cameras": [_camera_document(camera) for camera in rig]}
 
 
@@ -66,10 +91,10 @@ def name_fault(name: Any) -> str | None:
     return None
 
 
-def _camera_document(camera: Camera) -> dict[str, Any]:
+def _camera_document(camera: Camera) -> CameraDocument:
     k = camera.intrinsics
     d = k.distortion
-    document: dict[str, Any] = {
+    document: CameraDocument = {
         "name": camera.name,
         "width": k.width,
         "height": k.height,

@@ -6,7 +6,8 @@ way in and added on the way out. Its scale is free and taken as millimetres."""
 
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,17 +38,16 @@ def read_colmap(folder: Path, suffix: str = ".bin") -> Rig:
     """The rig in a COLMAP model: every image is a camera of this project, named after the image file."""
     files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
-    parsers: tuple[Callable[..., Any], ...] = (
-        (_binary_cameras, _binary_images) if suffix == ".bin" else (_text_cameras, _text_images)
-    )
-    cameras, images = (parsed(path, parse) for path, parse in zip(files, parsers, strict=True))
-    names = _image_names([image["name"] for image in images])
+    binary = suffix == ".bin"
+    cameras = parsed(files[0], _binary_cameras if binary else _text_cameras)
+    images = parsed(files[1], _binary_images if binary else _text_images)
+    names = _image_names([image.name for image in images])
     faults: list[str] = []
     entries = []
     for name, image in zip(names, images, strict=True):
-        camera = cameras.get(image["camera"])
+        camera = cameras.get(image.camera)
         if camera is None:
-            faults.append(f"image {name!r} names camera {image['camera']}, which cameras{suffix} lacks")
+            faults.append(f"image {name!r} names camera {image.camera}, which cameras{suffix} lacks")
             continue
         entries.append(_colmap_entry(name, image, camera, faults))
     return judged_rig(entries, subject, faults)
@@ -91,7 +91,26 @@ class _Records:
         return text
 
 
-def _binary_cameras(data: bytes) -> dict[int, dict[str, Any]]:
+@dataclass(frozen=True, slots=True)
+class ColmapCamera:
+    """``values``: the model's parameters, in its order."""
+
+    model: str
+    width: int
+    height: int
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ColmapImage:
+    """``pose``: quaternion and translation; ``camera``: its number."""
+
+    pose: list[float]
+    camera: int
+    name: str
+
+
+def _binary_cameras(data: bytes) -> dict[int, ColmapCamera]:
     records = _Records(data)
     cameras = {}
     for _ in range(records.count(24)):
@@ -100,21 +119,21 @@ def _binary_cameras(data: bytes) -> dict[int, dict[str, Any]]:
         if name is None:
             raise ValueError(_model_fault(f"number {model}", number))
         values = records.take(f"{len(COLMAP_MODELS[name][1])}d")
-        cameras[number] = {"model": name, "width": width, "height": height, "values": values}
+        cameras[number] = ColmapCamera(name, width, height, values)
     return cameras
 
 
-def _binary_images(data: bytes) -> list[dict[str, Any]]:
+def _binary_images(data: bytes) -> list[ColmapImage]:
     records = _Records(data)
     images = []
     for _ in range(_limited(records.count(73))):
         _, *pose, camera = records.take("i7di")
-        images.append({"pose": pose, "camera": camera, "name": records.text()})
+        images.append(ColmapImage(pose, camera, records.text()))
         records.skip(24 * records.count(24))
     return images
 
 
-def _text_cameras(data: bytes) -> dict[int, dict[str, Any]]:
+def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
     cameras = {}
     for line in _text_lines(data):
         if not line.split():
@@ -126,11 +145,11 @@ def _text_cameras(data: bytes) -> dict[int, dict[str, Any]]:
         if len(values) != wanted:
             raise ValueError(f"camera {number[:20]} has {len(values)} parameters; {name} has {wanted}")
         numbers = tuple(float(value) for value in values)
-        cameras[int(number)] = {"model": name, "width": int(width), "height": int(height), "values": numbers}
+        cameras[int(number)] = ColmapCamera(name, int(width), int(height), numbers)
     return cameras
 
 
-def _text_images(data: bytes) -> list[dict[str, Any]]:
+def _text_images(data: bytes) -> list[ColmapImage]:
     images = []
     lines = _text_lines(data)
     for line in lines:
@@ -140,7 +159,7 @@ def _text_images(data: bytes) -> list[dict[str, Any]]:
         if len(words) != 10:
             raise ValueError(f"an image line has {len(words)} entries, wanted 10")
         pose = [float(word) for word in words[1:8]]
-        images.append({"pose": pose, "camera": int(words[8]), "name": words[9].strip()})
+        images.append(ColmapImage(pose, int(words[8]), words[9].strip()))
         next(lines, "")  # its 2D points
         _limited(len(images))
     return images
@@ -168,12 +187,12 @@ def _image_names(files: list[str]) -> list[str]:
     return folders if len(set(stems)) < len(stems) and all(folders) else stems
 
 
-def _colmap_entry(name: str, image: dict[str, Any], camera: dict[str, Any], faults: list[str]) -> dict[str, Any]:
-    parameters = dict(zip(COLMAP_MODELS[camera["model"]][1], camera["values"], strict=True))
+def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[str]) -> dict[str, object]:
+    parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
     if any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
         faults.append(f"image {name!r}: k4, k5, k6 of FULL_OPENCV are not zero; calibrate with k1 k2 p1 p2 k3 only")
     focal = parameters.get("f", 0.0)
-    w, x, y, z = _unit_quaternion(image["pose"][:4])
+    w, x, y, z = _unit_quaternion(image.pose[:4])
     rotation = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -181,8 +200,8 @@ def _colmap_entry(name: str, image: dict[str, Any], camera: dict[str, Any], faul
     ]
     return {
         "name": name,
-        "width": camera["width"],
-        "height": camera["height"],
+        "width": camera.width,
+        "height": camera.height,
         "intrinsics": {
             "fx": parameters.get("fx", focal),
             "fy": parameters.get("fy", focal),
@@ -190,7 +209,7 @@ def _colmap_entry(name: str, image: dict[str, Any], camera: dict[str, Any], faul
             "cy": parameters["cy"] - 0.5,
         },
         "distortion": {key: parameters.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")},
-        "camera_from_world": {"rotation": rotation, "translation": list(image["pose"][4:])},
+        "camera_from_world": {"rotation": rotation, "translation": list(image.pose[4:])},
     }
 
 

@@ -1,7 +1,7 @@
 """Feature points in a file: ``features.json`` (``eigenhead-features/1``)."""
 
 import json
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -10,6 +10,13 @@ from rig.rig import Rig
 
 FEATURES_FORMAT = "eigenhead-features/1"
 POINTS_MOST = 200  # feature points in features.json
+
+
+class FeaturesDocument(TypedDict):
+    """Pixels by point and camera."""
+
+    format: str
+    points: dict[str, dict[str, list[float]]]
 
 
 def features_from_bytes(data: bytes, rig: Rig, faults: list[str]) -> Features:
@@ -50,7 +57,7 @@ def features_from_document(document: Any, rig: Rig, faults: list[str]) -> Featur
     return features
 
 
-def document_from_features(features: Features) -> dict[str, Any]:
+def document_from_features(features: Features) -> FeaturesDocument:
     points = {k: {name: [float(x) for x in pixel] for name, pixel in views.items()} for k, views in features.items()}
     return {"format": FEATURES_FORMAT, "points": points}
 

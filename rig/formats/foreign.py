@@ -2,9 +2,9 @@
 ``eigenhead-cameras/1`` document would be."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,10 +12,11 @@ from rig.errors import InputError
 from rig.formats.cameras_json import FORMAT, rig_from_document
 from rig.rig import Rig
 
+T = TypeVar("T")
 BYTES_MOST = 1 << 29  # a sparse model of a rig is a few megabytes; its 2D points may be many
 
 
-def parsed(path: Path, parse: Callable[[bytes], Any]) -> Any:
+def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
     """``parse`` of the file's bytes, with whatever damage it meets reported as InputError."""
     try:
         if path.stat().st_size > BYTES_MOST:
@@ -29,7 +30,7 @@ def parsed(path: Path, parse: Callable[[bytes], Any]) -> Any:
         raise InputError(path.name, [f"cannot be understood ({str(error)[:200]})"]) from error
 
 
-def judged_rig(entries: list[dict[str, Any]], subject: str, faults: list[str]) -> Rig:
+def judged_rig(entries: Sequence[Mapping[str, object]], subject: str, faults: list[str]) -> Rig:
     """The rig of ``entries``. Raises InputError naming ``faults`` and those that ``rig_from_document`` finds."""
     try:
         rig = rig_from_document({"format": FORMAT, "unit": "mm", "cameras": entries}, subject)

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def _glb(mesh: Mesh, normals: np.ndarray, look: str, values: np.ndarray, jpeg: b
     for array, target in zip(arrays, (34962, 34962, 34962, 34963), strict=True):
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(array), "target": target})
         offset += len(array)
-    surface: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": 0.8}
+    surface: dict[str, object] = {"metallicFactor": 0, "roughnessFactor": 0.8}
     document = {
         "asset": {"version": "2.0", "generator": "eigenhead"},
         "scene": 0,
@@ -82,7 +83,7 @@ def write_glb(path: Path, mesh: Mesh, **properties: Any) -> None:
     write_atomically(path, glb_bytes(mesh, **properties))
 
 
-def _glb_container(document: dict[str, Any], payload: bytes) -> bytes:
+def _glb_container(document: Mapping[str, object], payload: bytes) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     payload += b"\0" * (-len(payload) % 4)

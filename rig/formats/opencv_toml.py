@@ -4,6 +4,7 @@ board, see
 
 import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,13 @@ def write_caliscope(rig: Rig, path: Path) -> None:
     """Writes ``camera_array.toml``: metres, cameras numbered in the rig's order, names kept beside the numbers."""
     blocks = []
     for number, camera in enumerate(rig):
-        keys = {"cam_id": number, "name": camera.name, "rotation_count": 0, "ignore": False, "fisheye": False}
+        keys: dict[str, object] = {
+            "cam_id": number,
+            "name": camera.name,
+            "rotation_count": 0,
+            "ignore": False,
+            "fisheye": False,
+        }
         keys |= _toml_intrinsics(camera)
         keys["rotation"] = camera.camera_from_world.rotation.tolist()
         keys["translation"] = (camera.camera_from_world.translation / 1000.0).tolist()
@@ -54,7 +61,7 @@ def write_aniposelib(rig: Rig, path: Path) -> None:
     """Writes an aniposelib calibration, in millimetres (which ``metadata`` says)."""
     blocks = []
     for number, camera in enumerate(rig):
-        keys = {"name": camera.name, **_toml_intrinsics(camera)}
+        keys: dict[str, object] = {"name": camera.name, **_toml_intrinsics(camera)}
         keys["rotation"] = vector_from_rotation(camera.camera_from_world.rotation).tolist()
         keys["translation"] = camera.camera_from_world.translation.tolist()
         blocks.append(_toml_block(f"cam_{number}", keys))
@@ -62,7 +69,7 @@ def write_aniposelib(rig: Rig, path: Path) -> None:
     write_atomically(path, "\n".join(blocks).encode())
 
 
-def _toml_entry(name: str, table: Any, millimetres: float, faults: list[str]) -> dict[str, Any]:
+def _toml_entry(name: str, table: Any, millimetres: float, faults: list[str]) -> dict[str, object]:
     if not isinstance(table, dict):
         faults.append(f"{name} is no table")
         return {}
@@ -99,7 +106,7 @@ def _toml_entry(name: str, table: Any, millimetres: float, faults: list[str]) ->
 _MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 
 
-def _aniposelib_unit(document: dict[str, Any], pairs: list[tuple[str, Any]]) -> float:
+def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]]) -> float:
     """Millimetres in one unit of the file. Its ``metadata.unit`` says so; without it, the size of the rig does:
     aniposelib takes the unit of the board, and cameras within 30 of each other are a rig in metres."""
     metadata = document.get("metadata")
@@ -124,7 +131,7 @@ def looks_like_aniposelib(path: Path) -> bool:
     return bool(tables) and all({"matrix", "rotation", "translation"} <= table.keys() for table in tables)
 
 
-def _toml_intrinsics(camera: Camera) -> dict[str, Any]:
+def _toml_intrinsics(camera: Camera) -> dict[str, list]:
     k = camera.intrinsics
     return {
         "size": [k.width, k.height],
@@ -133,6 +140,6 @@ def _toml_intrinsics(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _toml_block(title: str, keys: dict[str, Any]) -> str:
+def _toml_block(title: str, keys: Mapping[str, object]) -> str:
     # Strings, booleans, numbers and nested lists of them read the same in JSON and TOML.
     return "\n".join([f"[{title}]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items()), ""])

@@ -237,7 +237,7 @@ def _read_table(kind: type, table: Any, where: str, faults: list[str]) -> Any:
     prefix = f"{where}." if where else ""
     before = len(faults)
     faults.extend(f"{prefix}{key}: no such key{_nearest(key, fields)}" for key in table if key not in fields)
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for name, field in fields.items():
         if name in table:
             values[name] = _read_value(hints[name], table[name], prefix + name, faults)

@@ -11,16 +11,21 @@ import hashlib
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import httpx
 
 from rig.errors import EigenheadError
 from rig.formats.archive import is_archive, pack_folder
+from server.cli.documents import CaptureDocument, ErrorDocument, JobDocument
 from server.storage.result_folder import fresh_folder
+
+if TYPE_CHECKING:
+    from server.storage.records import JsonObject
 
 PART_BYTES = 8 << 20
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -46,11 +51,21 @@ class Unreachable(EigenheadError):
 class JobEnded(EigenheadError):
     """A job that ended without a result; ``job`` is its document."""
 
-    def __init__(self, job: dict[str, Any]) -> None:
-        error = job.get("error") or {}
-        faults = "".join(f"\n  - {fault}" for fault in error.get("errors", []))
-        super().__init__(f"the job {job['state']}: {error.get('detail', 'no reason given')}{faults}")
+    def __init__(self, job: JobDocument) -> None:
+        error = job.get("error")
+        faults = "" if error is None else "".join(f"\n  - {fault}" for fault in error["errors"])
+        detail = "no reason given" if error is None else error["detail"]
+        super().__init__(f"the job {job['state']}: {detail}{faults}")
         self.job = job
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event of a job's stream: a progress, or at the end the whole job."""
+
+    kind: str
+    id: str
+    document: "JsonObject"
 
 
 class Client:
@@ -83,7 +98,7 @@ class Client:
     def delete(self, path: str) -> None:
         self._request("DELETE", path)
 
-    def upload(self, source: Path, *, report: Report | None = None, **about: str) -> dict[str, Any]:
+    def upload(self, source: Path, *, report: Report | None = None, **about: str) -> CaptureDocument:
         """Uploads a capture folder or an archive of one, resuming after every break; returns the capture.
 
         ``about`` may hold session, label and expression. Raises ServiceError naming every fault of the capture.
@@ -100,15 +115,15 @@ class Client:
         capture_id: str,
         *,
         model: str | None = None,
-        settings: dict[str, Any] | None = None,
+        settings: Mapping[str, object] | None = None,
         key: str | None = None,
-    ) -> dict[str, Any]:
+    ) -> JobDocument:
         """Queues a job. The idempotency ``key`` (one is made up) makes it safe to send again."""
-        request: dict[str, Any] = {"capture_id": capture_id, "model": model, "settings": settings}
+        request = {"capture_id": capture_id, "model": model, "settings": settings}
         headers = {"Idempotency-Key": key or hashlib.sha256(f"{capture_id}{time.time_ns()}".encode()).hexdigest()}
         return self.post("/v1/jobs", request, headers)
 
-    def events(self, job_id: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    def events(self, job_id: str) -> Iterator[tuple[str, "JsonObject"]]:
         """(kind, document) of the job's events up to the end, across broken connections. Raises Unreachable where no
         connection comes about for ``patience_s``; how long a job is silent does not matter."""
         last, deadline = "0", time.monotonic() + self._patience_s
@@ -116,10 +131,10 @@ class Client:
             try:
                 with self._stream(job_id, last) as events:
                     try:
-                        for kind, identity, document in events:
-                            last = identity
-                            yield kind, document
-                            if kind == "end":
+                        for event in events:
+                            last = event.id
+                            yield event.kind, event.document
+                            if event.kind == "end":
                                 return
                     finally:
                         deadline = time.monotonic() + self._patience_s
@@ -128,13 +143,14 @@ class Client:
                     raise Unreachable(self.url, error) from error
             time.sleep(0.3)
 
-    def wait(self, job_id: str, *, report: Report | None = None) -> dict[str, Any]:
+    def wait(self, job_id: str, *, report: Report | None = None) -> JobDocument:
         """The succeeded job. Raises JobEnded for one that failed or was cancelled."""
         for kind, document in self.events(job_id):
             if kind == "end":
-                if document["state"] != "succeeded":
-                    raise JobEnded(document)
-                return document
+                job = cast(JobDocument, document)
+                if job["state"] != "succeeded":
+                    raise JobEnded(job)
+                return job
             if report is not None and "stage" in document:
                 report(document["stage"], document["progress"])
         raise AssertionError("a stream of events ends with 'end'")
@@ -153,7 +169,7 @@ class Client:
                 path.write_bytes(data)
         return [folder / name for name in job["files"]]
 
-    def _upload_archive(self, archive: Path, report: Report, about: dict[str, str]) -> dict[str, Any]:
+    def _upload_archive(self, archive: Path, report: Report, about: dict[str, str]) -> CaptureDocument:
         if not is_archive(archive):
             raise ServiceError(422, "no-archive", f"{archive.name} is no .zip, .tar or .tar.gz", [])
         size = archive.stat().st_size
@@ -190,7 +206,7 @@ class Client:
         return int(head.headers["upload-offset"]), head.headers.get("location")
 
     @contextmanager
-    def _stream(self, job_id: str, last: str) -> Iterator[Iterator[tuple[str, str, dict[str, Any]]]]:
+    def _stream(self, job_id: str, last: str) -> Iterator[Iterator[Event]]:
         """The events of one connection that came about. Raises httpx.TransportError for one that did not."""
         headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
         timeout = httpx.Timeout(10.0, read=30.0)  # the service sends a comment every 15 s
@@ -219,22 +235,25 @@ class Client:
             wait = min(2.0, wait * 2)
 
 
-def _events(response: httpx.Response, last: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
+def _events(response: httpx.Response, last: str) -> Iterator[Event]:
     fields: dict[str, str] = {}
     for line in response.iter_lines():
         if line:
             name, _, value = line.partition(":")
             fields[name] = value.strip()
         elif "data" in fields:
-            yield fields.get("event", ""), fields.get("id", last), json.loads(fields["data"])
+            yield Event(fields.get("event", ""), fields.get("id", last), json.loads(fields["data"]))
             fields = {}
 
 
 def _raise_for(response: httpx.Response) -> None:
     if response.status_code < 400:
         return
-    problem: dict[str, Any] = {}
+    problem: ErrorDocument | None = None
     with suppress(ValueError):
         problem = response.json()
-    detail = problem.get("detail") or f"{response.request.method} {response.request.url.path}: {response.status_code}"
-    raise ServiceError(response.status_code, problem.get("type", ""), detail, problem.get("errors", []))
+    detail = f"{response.request.method} {response.request.url.path}: {response.status_code}"
+    if not problem:
+        raise ServiceError(response.status_code, "", detail, [])
+    kind, errors = problem.get("type", ""), problem.get("errors", [])
+    raise ServiceError(response.status_code, kind, problem.get("detail") or detail, errors)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -34,7 +34,29 @@ class ServiceDied(EigenheadError):
         super().__init__(f"the service did not start:\n{log.read_text(errors='replace')[-2000:]}")
 
 
-def run_demo(out: Path, *, seed: int, compare: bool, report: Report) -> dict[str, Any]:
+class MethodDocument(TypedDict):
+    """One solver's result: where it lies and how far it is from the truth."""
+
+    ply: str
+    error_mm: dict[str, float]
+    seconds: float
+    evaluations: int
+    stopped_because: str
+    warnings: list[str]
+
+
+class DemoDocument(TypedDict):
+    """What ``demo --json`` prints; the contour solver's result, and by name that of each method."""
+
+    ply: str
+    contact_sheet: str
+    seconds: float
+    error_mm: dict[str, float]
+    warnings: list[str]
+    methods: dict[str, MethodDocument]
+
+
+def run_demo(out: Path, *, seed: int, compare: bool, report: Report) -> DemoDocument:
     """Starts a service in a temporary data folder, triggers its simulated rig, submits a job, follows it, and fetches
     its result into ``out``.
 
@@ -79,7 +101,7 @@ def _part(report: Report, name: str, start: float, share: float) -> Report:
     return lambda stage, fraction: report(name + stage, start + share * fraction)
 
 
-def _described(folder: Path, truth: Path) -> dict[str, Any]:
+def _described(folder: Path, truth: Path) -> MethodDocument:
     document = json.loads((folder / "report.json").read_text())
     return {
         "ply": str(folder / "head.ply"),
@@ -91,7 +113,7 @@ def _described(folder: Path, truth: Path) -> dict[str, Any]:
     }
 
 
-def side_by_side(found: dict[str, dict[str, Any]], target: Path) -> None:
+def side_by_side(found: dict[str, MethodDocument], target: Path) -> None:
     """The contact sheets of both results as one: input and start, then each solver's silhouettes and head."""
     columns = []
     for method, described in found.items():

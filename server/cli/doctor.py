@@ -7,7 +7,7 @@ import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 from urllib.parse import quote
 
 import sqlalchemy as sa
@@ -24,7 +24,12 @@ OTHER_VARIABLES = frozenset({MODELS, PREFIX + "DEBUG", PREFIX + "CACHE"})  # rea
 MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
-def examine(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
+class Finding(TypedDict):
+    ok: bool
+    detail: str
+
+
+def examine(settings: ServiceSettings) -> dict[str, Finding]:
     """Findings by name: ``ok`` and a ``detail`` that says what to do. Looks, and makes nothing."""
     checks: dict[str, Callable[[ServiceSettings], tuple[bool, str]]] = {
         "python": _python,
@@ -39,7 +44,7 @@ def examine(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
         "rig": _rig,
         "port": _port,
     }
-    findings = {}
+    findings: dict[str, Finding] = {}
     for name, check in checks.items():
         try:
             ok, detail = check(settings)

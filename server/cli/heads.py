@@ -67,7 +67,7 @@ def reconstruct(
     """Reconstruct one capture without the service."""
     from server.cli.reconstruct_local import reconstruct_locally, settings_document
 
-    outputs: dict[str, Any] = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
+    outputs: dict[str, object] = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
     outputs |= {"surface": surface} if surface else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
     with progress_bar() as report:

@@ -3,10 +3,10 @@
 import json
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rig.errors import InputError
 from rig.formats.archive import extract_archive
@@ -15,14 +15,15 @@ from server.storage.result_folder import fresh_folder
 from server.tasks.progress import Course, Expectation
 
 if TYPE_CHECKING:
+    from pipeline.results.report import Report as ReportDocument
     from pipeline.settings import Settings
 
 Report = Callable[[str, float], None]
 
 
-def settings_document(path: Path | None, **given: str | dict[str, Any] | None) -> dict[str, Any]:
+def settings_document(path: Path | None, **given: str | Mapping[str, object] | None) -> dict[str, object]:
     """Settings from a TOML or JSON file, then from options; tables are merged. Raises InputError."""
-    document: dict[str, Any] = {}
+    document: dict[str, object] = {}
     if path is not None:
         try:
             text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
@@ -34,13 +35,13 @@ def settings_document(path: Path | None, **given: str | dict[str, Any] | None) -
     for name, value in given.items():
         old = document.get(name)
         if value is not None:
-            document[name] = old | value if isinstance(old, dict) and isinstance(value, dict) else value
+            document[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, Mapping) else value
     return document
 
 
 def reconstruct_locally(
-    capture: Path, out: Path, *, model: str | None, settings: dict[str, Any], report: Report
-) -> dict[str, Any]:
+    capture: Path, out: Path, *, model: str | None, settings: Mapping[str, object], report: Report
+) -> "ReportDocument":
     """Reconstructs a capture folder or archive into ``out`` and returns report.json. What can be wrong with settings,
     capture and ``out`` is found before anything heavy is loaded."""
     from pipeline.settings import settings_from_document

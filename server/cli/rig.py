@@ -73,7 +73,7 @@ def rig_capture(
         shot = capture(read_rig_config(rig), folder, report=report)
     seconds = {"warm_up": round(at["shot"] - at["warm up"], 3), "capture": round(at["done"] - at["shot"], 3)}
     told = f"{len(shot.images)} pictures in {seconds['capture']:.2f} s, after {seconds['warm_up']:.2f} s of warm-up"
-    document = {"capture": str(folder), "seconds": seconds} | shot.document()
+    document = {"capture": str(folder), "seconds": seconds, **shot.document()}
     answer(document, json_out, [str(folder), told, *shot.certificate.lines(), *map(str, shot.faults)])
 
 

@@ -1,7 +1,8 @@
 """Where the board was seen, camera by camera: what a person who carries it needs to know for the next shot."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -16,8 +17,21 @@ CORNERS_SHOWN = 60
 CELLS_ENOUGH = 0.75
 VIEWS_ENOUGH = 6  # per camera: Zhang's method has nothing more to gain from the count of views than that
 
+Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the image's width and height
 
-def detect_shot(bench: Bench, report: Report, *, files: str, board: dict[str, Any]) -> dict[str, list[list[float]]]:
+
+class Coverage(TypedDict):
+    """What was seen of the board by one camera."""
+
+    name: str
+    views: int
+    covered: float
+    enough: bool
+    corners: list[list[float]]
+    last: list[list[float]]
+
+
+def detect_shot(bench: Bench, report: Report, *, files: str, board: Mapping[str, object]) -> Corners:
     """Runs in a child: corners of the board in each image of a capture, as shares of width and height; none where the
     board is not seen. Raises InputError for a board that cannot be."""
     described = board_from_document(board)
@@ -41,9 +55,9 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
     return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
 
-def summary(cameras: list[str], shots: list[dict[str, list[list[float]]]]) -> list[dict[str, Any]]:
+def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
     """One line a camera: views with the board, share of the image covered, its corners, and whether that is enough."""
-    lines = []
+    lines: list[Coverage] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]
         corners = np.array([corner for shot in seen for corner in shot]).reshape(-1, 2)
@@ -64,7 +78,7 @@ def summary(cameras: list[str], shots: list[dict[str, list[list[float]]]]) -> li
     return lines
 
 
-def advice(lines: list[dict[str, Any]]) -> str:
+def advice(lines: list[Coverage]) -> str:
     """The next thing to do."""
     if not lines or not any(line["views"] for line in lines):
         return "Hold the board where several cameras see it whole, and take a shot."

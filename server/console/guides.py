@@ -5,7 +5,7 @@ Pure functions of a rig and pixels; lens distortion is kept, so that a guide is 
 
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -34,12 +34,20 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
     return seen[_near_image(rig[target], seen)]
 
 
-def helps(rig: Rig, points: Pixels, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> dict[str, Any]:
-    """For every point: ``guides`` {point: {camera: curves}}, ``reprojected`` {point: {camera: pixel}}, ``off_px``
-    {point: {camera: px}} of what was picked, and ``predicted`` {point: {camera: pixel}} from the model's landmarks."""
-    guides: dict[str, Any] = {}
-    reprojected: dict[str, Any] = {}
-    off: dict[str, Any] = {}
+class Helps(TypedDict):
+    """By point and camera: the curves of the other views' rays, where the triangulated point is seen, how far off (px)
+    what was picked is, and where the model's landmarks would be."""
+
+    guides: dict[str, dict[str, list[list[list[float]]]]]
+    reprojected: dict[str, dict[str, list[float]]]
+    off_px: dict[str, dict[str, float]]
+    predicted: dict[str, dict[str, list[float]]]
+
+
+def helps(rig: Rig, points: Pixels, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> Helps:
+    guides: dict[str, dict[str, list[list[list[float]]]]] = {}
+    reprojected: dict[str, dict[str, list[float]]] = {}
+    off: dict[str, dict[str, float]] = {}
     located: dict[str, np.ndarray] = {}
     for name, views in points.items():
         guides[name] = {

@@ -6,8 +6,8 @@ pages, and a sign-in outlives a restart of the service.
 """
 
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from nicegui import app as pages
 from starlette.datastructures import Headers
@@ -32,12 +32,12 @@ def sign_in(service: Service, token: str) -> Caller | None:
     return service.keys.caller(token.strip())
 
 
-def caller_of(service: Service, stored: dict[str, Any]) -> Caller | None:
+def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
     """Who the browser with this user storage is; None where a key is still to be given. Blocks."""
     keys = {key.id: key for key in service.keys.all()}
     if not keys and service.settings.is_private:
         return Caller(LOCAL, frozenset(SCOPES))
-    key = keys.get(stored.get(KEY_ID, ""))
+    key = keys.get(str(stored.get(KEY_ID, "")))
     return None if key is None else Caller(key.id, frozenset(key.scopes))
 
 

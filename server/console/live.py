@@ -6,11 +6,12 @@ import struct
 import threading
 import time
 from collections.abc import AsyncIterator
-from typing import Any, Protocol
+from typing import Protocol
 
 import structlog
 
 from rig.acquisition.image_checks import blur_px, exposure
+from server.console.live_frame import LiveFrame
 from server.console.studio_view import frames
 from server.services.rigs import ImageRgb, RigBackend, jpeg, reduced
 from server.services.service import Service
@@ -29,7 +30,7 @@ log = structlog.get_logger()
 class Source(Protocol):
     """Where pictures come from. Blocks."""
 
-    def frames(self) -> list[dict[str, Any]]:
+    def frames(self) -> list[LiveFrame]:
         """One a camera: name, jpeg (None without a picture), mean, clipped, perhaps blur_px and fault."""
         ...
 
@@ -40,7 +41,7 @@ class StudioSource:
     def __init__(self) -> None:
         self._child, self._looks = Child(), 0
 
-    def frames(self) -> list[dict[str, Any]]:
+    def frames(self) -> list[LiveFrame]:
         self._looks += 1
         return self._child.remote(frames)(look=self._looks)
 
@@ -54,9 +55,9 @@ class RigSource:
     def __init__(self, rig: RigBackend) -> None:
         self._rig, self._looks = rig, 0
 
-    def frames(self) -> list[dict[str, Any]]:
+    def frames(self) -> list[LiveFrame]:
         pictures = self._rig.look()
-        names = [camera["name"] for camera in self._rig.describe()["cameras"]]
+        names = [camera.name for camera in self._rig.describe().cameras]
         self._looks += 1
         return [_frame(name, pictures.get(name), self._looks % len(names) == i) for i, name in enumerate(names)]
 
@@ -64,16 +65,21 @@ class RigSource:
         pass
 
 
-def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> dict[str, Any]:
+def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
     if picture is None:
         return {"name": name, "jpeg": None, "fault": "The camera shows nothing. Check its cable and power."}
     small = reduced(picture, WIDTH)
     level = exposure(small)
-    found: dict[str, Any] = {"name": name, "mean": round(level.mean, 1), "clipped": round(level.clipped_share, 4)}
+    found: LiveFrame = {
+        "name": name,
+        "mean": round(level.mean, 1),
+        "clipped": round(level.clipped_share, 4),
+        "jpeg": jpeg(small),
+    }
     if sharp:
         blur = blur_px(picture)
         found["blur_px"] = None if blur is None else round(blur, 2)
-    return found | {"jpeg": jpeg(small)}
+    return found
 
 
 class LiveView:
@@ -106,7 +112,7 @@ class LiveView:
                 self._thread.start()
 
     def _look_around(self) -> None:
-        simulated = self._service.rig.describe()["kind"] == "simulated"
+        simulated = self._service.rig.describe().kind == "simulated"
         source: Source = StudioSource() if simulated else RigSource(self._service.rig)
         blur: dict[str, float | None] = {}
         try:
@@ -140,7 +146,7 @@ class LiveView:
         return message_of(found, self.fault)
 
 
-def message_of(frames: list[dict[str, Any]], fault: str) -> bytes:
+def message_of(frames: list[LiveFrame], fault: str) -> bytes:
     """A look on the wire; ``bytes`` in the header is the length of each camera's JPEG."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
     text = json.dumps({"cameras": header, "fault": fault}).encode()

@@ -22,6 +22,7 @@ from server.console.silhouettes import draw
 from server.errors import Conflict, NotFound
 from server.services.keys import Caller
 from server.services.service import Service
+from server.storage.records import CaptureRecord
 from server.wire.multipart import receive_board_pictures, receive_capture
 from server.wire.send_file import send_file
 
@@ -98,7 +99,7 @@ async def upload(who: Taker, request: Request) -> Response:
         record, _ = await receive_capture(who[0], request)
     except Exception as error:
         return as_problem(error).response()
-    return JSONResponse({"id": record["id"]}, 201)
+    return JSONResponse({"id": record.id}, 201)
 
 
 @pages.post("/console/calibrations")
@@ -107,7 +108,7 @@ async def upload_board_pictures(who: Taker, request: Request) -> Response:
         made = await receive_board_pictures(who[0], request)
     except Exception as error:
         return as_problem(error).response()
-    return JSONResponse({"id": made["id"]}, 202)
+    return JSONResponse({"id": made.id}, 202)
 
 
 @pages.get("/console/jobs/{job_id}/overlays/{name}")
@@ -128,12 +129,12 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
     job = service.jobs.get(job_id)
     mine = _result_folder(service, job_id)
     if other == "truth":
-        theirs = service.store.folder("captures", job["capture_id"]) / "truth" / "head.ply"
+        theirs = service.store.folder("captures", job.capture_id or "") / "truth" / "head.ply"
         if not theirs.is_file():
-            raise NotFound("truth of the capture", job["capture_id"])
+            raise NotFound("truth of the capture", job.capture_id or "")
         return _floats(comparison.to_surface(mine, theirs))
     other_job = service.jobs.get(other)
-    same = other_job["capture_id"] == job["capture_id"]
+    same = other_job.capture_id == job.capture_id
     return _floats(comparison.to_surface(mine, _result_folder(service, other) / "head.ply", align=not same))
 
 
@@ -165,8 +166,8 @@ def make_thumbnail(source: Path, target: Path) -> None:
     unfinished.rename(target)
 
 
-def _image_name(record: dict[str, Any], camera: str) -> str:
-    for name in record["inputs"]:
+def _image_name(record: CaptureRecord, camera: str) -> str:
+    for name in record.inputs:
         if Path(name).parent.name == "images" and Path(name).stem == camera:
             return name
     raise NotFound("camera", camera)

@@ -6,7 +6,6 @@ from fastapi import FastAPI
 from nicegui import app as pages
 from nicegui import ui
 from nicegui.storage import Storage
-from starlette._utils import get_route_path
 from starlette.responses import PlainTextResponse
 from starlette.routing import Match, Mount
 from starlette.types import Receive, Scope, Send
@@ -59,6 +58,13 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
     theme.install()
 
 
+def path_below(scope: Scope) -> str:
+    """The path that is asked for, below where the service is mounted (``root_path``)."""
+    path, root = scope["path"], scope.get("root_path", "")
+    below = path.removeprefix(root)
+    return below if below == "" or below.startswith("/") else path
+
+
 class PagesMount(Mount):
     """The mount of the pages: it answers for their paths alone, and to nobody whom another web page sent."""
 
@@ -68,7 +74,7 @@ class PagesMount(Mount):
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
         if scope["type"] in ("http", "websocket"):
-            path = get_route_path(scope)
+            path = path_below(scope)
             if path not in PAGES and not path.startswith(FOLDERS):
                 return Match.NONE, {}
         return super().matches(scope)

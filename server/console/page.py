@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from threading import Lock
-from typing import Any
+from typing import Any, TypedDict
 
 import anyio
 import anyio.to_thread
@@ -35,13 +35,14 @@ _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a captur
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """What an event of a page does: ``function(page, event)`` in a thread, for callers with ``scope``.
+    """What an event of a page does: ``function(page, event)`` in a thread, for callers with ``scope``. Page and event
+    are of the type that the function says: the page's own, and what its component sends.
 
     What it returns, if anything, is said in the corner.
     """
 
     scope: str
-    function: Callable[["Page", dict[str, Any]], str | None]
+    function: Callable[[Any, Any], str | None]
 
 
 @dataclass
@@ -89,11 +90,11 @@ class Page(Element):
 
     actions: Mapping[str, Action] = {}
 
-    def __init__(self, frame: Frame, caller: Caller, **initial: Any) -> None:
+    def __init__(self, frame: Frame, caller: Caller, **initial: str | None) -> None:
         super().__init__()
         self.frame, self.caller, self.service = frame, caller, service_of_pages()
-        self.choice: dict[str, Any] = initial
-        self._props["state"] = {"loading": True}
+        self.choice = initial
+        self.props["state"] = {"loading": True}
         self._in_turn = anyio.Lock()
         self._told = ""
         self.on("act", self._act)
@@ -102,7 +103,7 @@ class Page(Element):
         ui.timer(REFRESH_S, self.refresh, immediate=True)
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
 
-    def look(self) -> dict[str, Any]:
+    def look(self) -> Mapping[str, object]:
         """The state document. Runs in a thread."""
         raise NotImplementedError
 
@@ -112,13 +113,13 @@ class Page(Element):
             told = ""
         except Exception as error:  # the page stays, says so once, and looks again
             problem = problem_from(error)
-            state, told = self._props["state"], problem.detail
+            state, told = self.props["state"], problem.detail
             if told != self._told:
                 self.frame.say("fault", told, problem.errors)
         self._told = told
         self.frame.show(removed=[{"id": i, "title": removal.title} for i, removal in removals.waiting().items()])
-        if state != self._props["state"]:
-            self._props["state"] = state
+        if state != self.props["state"]:
+            self.props["state"] = state
             self.update()
 
     async def _refresh_status(self) -> None:
@@ -133,17 +134,17 @@ class Page(Element):
         await self.refresh()
 
     async def _undo(self, event: GenericEventArguments) -> None:
-        await self._do({"name": "undo", "id": event.args})
+        await self._do("undo", {"id": event.args})
 
     async def _act(self, event: GenericEventArguments) -> None:
         async with self._in_turn:  # two quick keys must not overtake each other in the threads
-            await self._do(dict(event.args))
+            arguments = dict(event.args)
+            await self._do(arguments.pop("name"), arguments)
 
-    async def _do(self, arguments: dict[str, Any]) -> None:
-        name = arguments.pop("name")
+    async def _do(self, name: str, event: Mapping[str, object]) -> None:
         try:
             action = UNDO if name == "undo" else self.actions[name]
-            said = await anyio.to_thread.run_sync(self._run, action, arguments, limiter=_threads)
+            said = await anyio.to_thread.run_sync(self._run, action, event, limiter=_threads)
             if said:
                 self.frame.say("done", said)
         except Exception as error:
@@ -152,13 +153,19 @@ class Page(Element):
         await self.refresh()
         self.run_method("acted", name)
 
-    def _run(self, action: Action, arguments: dict[str, Any]) -> str | None:
+    def _run(self, action: Action, event: Mapping[str, object]) -> str | None:
         current = caller_of(self.service, {"key_id": self.caller.key})
         permit(current, action.scope)
-        return action.function(self, arguments)
+        return action.function(self, event)
 
 
-def undo(page: Page, event: dict[str, Any]) -> str:
+class Chosen(TypedDict):
+    """The event of an action on one thing."""
+
+    id: str
+
+
+def undo(page: Page, event: Chosen) -> str:
     """Takes back what waits to be removed, from whichever page."""
     removal = removals.waiting().get(event["id"])
     if removal is not None:
@@ -190,7 +197,7 @@ async def signed_in() -> Caller | None:
     return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
 
 
-async def show(name: str, page: type[Page], **initial: Any) -> RedirectResponse | None:
+async def show(name: str, page: type[Page], **initial: str | None) -> RedirectResponse | None:
     """Draws ``page`` for who is signed in, or asks for a key first."""
     caller = await signed_in()
     if caller is None:
@@ -202,15 +209,26 @@ async def show(name: str, page: type[Page], **initial: Any) -> RedirectResponse 
     return None
 
 
-def status_of(service: Service, caller: Caller) -> dict[str, Any] | None:
+class Status(TypedDict):
+    """What the frame shows of the service; ``faults``: what to do, by what is wrong."""
+
+    faults: dict[str, str]
+    jobs: int
+    disk: str
+    local: bool
+
+
+def status_of(service: Service, caller: Caller) -> Status | None:
     """What the frame shows of the service; None where the caller's key is gone."""
     if caller_of(service, {"key_id": caller.key}) is None:
         return None
 
-    def make() -> dict[str, Any]:
+    def make() -> Status:
         checks = readiness(service)
         wrong = {name: check.detail for name, check in checks.items() if not check.ok}
         jobs = service.jobs.active()
-        return {"faults": wrong, "jobs": len(jobs), "disk": checks["disk"].detail.partition(" free")[0] + " free"}
+        disk = checks["disk"].detail.partition(" free")[0] + " free"
+        return {"faults": wrong, "jobs": len(jobs), "disk": disk, "local": False}
 
-    return shared.get("status", STATUS_S / 2, make) | {"local": caller.key == "local"}
+    shown: Status = shared.get("status", STATUS_S / 2, make)
+    return {**shown, "local": caller.key == "local"}

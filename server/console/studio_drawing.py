@@ -5,7 +5,6 @@ live view; one camera now and then is exposed at full size, for its sharpness.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene, view_light
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, expose
+from server.console.live_frame import LiveFrame
 from server.tasks.child import Bench
 from server.tasks.subjects import drawn_subject
 
@@ -27,8 +27,8 @@ QUICK = replace(PRESET, samples=1)  # the pictures are shown at a third of their
 SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 
-def frames(bench: Bench, look: int) -> list[dict[str, Any]]:
-    """One frame a camera: name, jpeg, mean, clipped; now and then one of them has blur_px."""
+def frames(bench: Bench, look: int) -> list[LiveFrame]:
+    """One frame a camera; now and then one of them has blur_px."""
     views = bench.keep("live", _draw)
     rng = bench.keep("noise", np.random.default_rng)
     names = list(views)
@@ -52,14 +52,19 @@ def _draw() -> dict[str, tuple[Sensor, np.ndarray, np.ndarray]]:
 
 def _frame(
     name: str, lit: tuple[Sensor, np.ndarray, np.ndarray], rng: np.random.Generator, *, sharp: bool
-) -> dict[str, Any]:
+) -> LiveFrame:
     sensor, light, small = lit
     picture = expose(small, sensor, rng)
     level = exposure(picture)
-    found: dict[str, Any] = {"name": name, "mean": round(level.mean, 1), "clipped": round(level.clipped_share, 4)}
+    done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    assert done
+    found: LiveFrame = {
+        "name": name,
+        "mean": round(level.mean, 1),
+        "clipped": round(level.clipped_share, 4),
+        "jpeg": data.tobytes(),
+    }
     if sharp:
         blur = blur_px(expose(light.astype(np.float32), sensor, rng))
         found["blur_px"] = None if blur is None else round(blur, 2)
-    done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    assert done
-    return found | {"jpeg": data.tobytes()}
+    return found

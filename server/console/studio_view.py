@@ -1,12 +1,11 @@
 """The live view of the simulated studio, asked of a child process, so that this one need not load what draws it."""
 
-from typing import Any
-
+from server.console.live_frame import LiveFrame
 from server.tasks.child import Bench, Report
 
 
-def frames(bench: Bench, report: Report, *, look: int) -> list[dict[str, Any]]:
-    """One frame a camera: name, jpeg, mean, clipped; now and then one of them has blur_px."""
+def frames(bench: Bench, report: Report, *, look: int) -> list[LiveFrame]:
+    """One frame a camera; now and then one of them has blur_px."""
     from server.console import studio_drawing
 
     return studio_drawing.frames(bench, look)

@@ -26,12 +26,12 @@ class Frame(Element, component="static/frame.js"):
     def __init__(self, current: str) -> None:
         super().__init__()
         links = [{"name": name, "path": path, "title": title} for name, path, title in PAGES]
-        self._props.update(links=links, current=current, status={}, removed=[])
+        self.props.update(links=links, current=current, status={}, removed=[])
 
     def show(self, **changed: Any) -> None:
         """``status`` of the service, or what was ``removed`` and can be taken back."""
-        if any(self._props[name] != value for name, value in changed.items()):
-            self._props.update(changed)
+        if any(self.props[name] != value for name, value in changed.items()):
+            self.props.update(changed)
             self.update()
 
     def say(self, kind: str, text: str, faults: list[str] | None = None) -> None:

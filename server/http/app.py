@@ -5,7 +5,6 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
-from typing import Any
 
 import structlog
 from fastapi import FastAPI
@@ -19,6 +18,7 @@ from server.services.health import check_egl
 from server.services.retention import sweep
 from server.services.service import Service, open_service
 from server.settings import ServiceSettings
+from server.storage.records import JsonObject
 from server.storage.store import new_id
 from server.wire import problems
 
@@ -132,7 +132,7 @@ def _name_problem(app: FastAPI) -> None:
     """Puts the problem document into the OpenAPI description, in place of the framework's own error."""
     original = app.openapi
 
-    def openapi() -> dict[str, Any]:
+    def openapi() -> JsonObject:
         document = original()
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
         schemas["Problem"] = problems.PROBLEM_SCHEMA

@@ -1,10 +1,11 @@
 """Documents on the wire."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from server.services.service import Check
+from server.storage.records import JsonObject
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
 Text = Annotated[str, Field(max_length=500)]
@@ -15,6 +16,12 @@ class Received(BaseModel):
     """A request body: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+class Answer(BaseModel):
+    """A response body, made of a service's record of the same fields."""
+
+    model_config = ConfigDict(from_attributes=True)
 
 
 class NewSession(Received):
@@ -53,14 +60,14 @@ class NewFeatures(Received):
 class NewJob(Received):
     capture_id: Id
     model: str | None = Field(None, max_length=200)
-    settings: dict[str, Any] | None = Field(None, description="see pipeline.settings; unknown keys are refused")
+    settings: JsonObject | None = Field(None, description="see pipeline.settings; unknown keys are refused")
     queue: str | None = Field(None, max_length=32)
     priority: int = Field(100, ge=1, le=1000, description="lower goes first")
 
 
 class NewSessionJobs(Received):
     model: str | None = Field(None, max_length=200)
-    settings: dict[str, Any] | None = None
+    settings: JsonObject | None = None
     priority: int = Field(100, ge=1, le=1000)
 
 
@@ -68,7 +75,7 @@ class Restart(Received):
     """What is not given is as in the old job."""
 
     model: str | None = Field(None, max_length=200)
-    settings: dict[str, Any] | None = None
+    settings: JsonObject | None = None
 
 
 class NewWebhook(Received):
@@ -80,13 +87,13 @@ class NewKey(Received):
     scopes: list[Literal["read", "capture", "submit", "admin"]] = Field(min_length=1, max_length=4)
 
 
-class Size(BaseModel):
+class Size(Answer):
     name: str
     width: int
     height: int
 
 
-class CaptureOut(BaseModel):
+class CaptureOut(Answer):
     id: str
     created: str
     source: Literal["upload", "rig"]
@@ -99,14 +106,14 @@ class CaptureOut(BaseModel):
     board: bool = Field(False, description="pictures of the calibration board, which cannot be reconstructed")
     bytes: int
     inputs: dict[str, str] = Field(description="sha256 of every file, by name")
-    shot: dict[str, Any] | None = Field(None, description="the rig's sync certificate")
+    shot: JsonObject | None = Field(None, description="the rig's sync certificate")
 
 
-class CaptureList(BaseModel):
+class CaptureList(Answer):
     captures: list[CaptureOut]
 
 
-class SessionOut(BaseModel):
+class SessionOut(Answer):
     id: str
     created: str
     label: str
@@ -114,17 +121,17 @@ class SessionOut(BaseModel):
     captures: list[str]
 
 
-class SessionList(BaseModel):
+class SessionList(Answer):
     sessions: list[SessionOut]
 
 
-class JobError(BaseModel):
+class JobError(Answer):
     type: str
     detail: str
     errors: list[str]
 
 
-class FileOut(BaseModel):
+class FileOut(Answer):
     bytes: int
     sha256: str
 
@@ -135,12 +142,12 @@ class ResultFile(FileOut):
     media_type: str
 
 
-class ResultList(BaseModel):
+class ResultList(Answer):
     job_id: str
     files: list[ResultFile]
 
 
-class JobOut(BaseModel):
+class JobOut(Answer):
     id: str
     state: State
     stage: str
@@ -151,7 +158,7 @@ class JobOut(BaseModel):
     capture_id: str | None
     session: str | None
     model: str | None
-    settings: dict[str, Any]
+    settings: JsonObject
     restart_of: str | None
     queue: str | None
     priority: int
@@ -161,22 +168,22 @@ class JobOut(BaseModel):
     files: dict[str, FileOut]
 
 
-class JobList(BaseModel):
+class JobList(Answer):
     jobs: list[JobOut]
 
 
-class ModelOut(BaseModel):
+class ModelOut(Answer):
     id: str
     name: str
     bytes: int
     default: bool
 
 
-class ModelList(BaseModel):
+class ModelList(Answer):
     models: list[ModelOut]
 
 
-class WebhookOut(BaseModel):
+class WebhookOut(Answer):
     id: str
     url: str
 
@@ -185,31 +192,31 @@ class NewWebhookOut(WebhookOut):
     secret: str = Field(description="shown this once; signs the messages (standardwebhooks.com)")
 
 
-class WebhookList(BaseModel):
+class WebhookList(Answer):
     webhooks: list[WebhookOut]
 
 
-class KeyOut(BaseModel):
+class KeyOut(Answer):
     id: str
     name: str
     scopes: list[str]
 
 
-class KeyList(BaseModel):
+class KeyList(Answer):
     keys: list[KeyOut]
 
 
-class NewKeyOut(BaseModel):
+class NewKeyOut(Answer):
     id: str
     key: str = Field(description="shown this once")
 
 
-class Health(BaseModel):
+class Health(Answer):
     status: Literal["ok"]
     version: str
 
 
-class Ready(BaseModel):
+class Ready(Answer):
     ready: bool
     checks: dict[str, Check]
 
@@ -217,7 +224,7 @@ class Ready(BaseModel):
 class NewCalibration(Received):
     """Shots that the rig took of the board."""
 
-    board: dict[str, Any] = Field(description="as board.toml: kind, columns, rows, square_mm, ...")
+    board: JsonObject = Field(description="as board.toml: kind, columns, rows, square_mm, ...")
     captures: list[Id] = Field(min_length=1, max_length=500)
     label: Text = ""
 
@@ -226,7 +233,7 @@ class UseCalibration(Received):
     calibration_id: Id
 
 
-class CalibrationOut(BaseModel):
+class CalibrationOut(Answer):
     id: str
     created: str
     source: Literal["upload", "rig"]
@@ -234,24 +241,24 @@ class CalibrationOut(BaseModel):
     pictures: dict[str, int] = Field(description="number of pictures by camera")
     state: State
     error: JobError | None
-    figures: dict[str, Any]
-    checks: list[dict[str, Any]]
+    figures: JsonObject
+    checks: list[JsonObject]
     warnings: list[str]
     front: str | None
     in_use: bool
 
 
-class CalibrationList(BaseModel):
+class CalibrationList(Answer):
     calibrations: list[CalibrationOut]
 
 
-class CameraOut(BaseModel):
+class CameraOut(Answer):
     name: str
     driver: str
     state: Literal["ready", "open", "closed", "missing"]
 
 
-class RigOut(BaseModel):
+class RigOut(Answer):
     id: str
     kind: Literal["simulated", "real"]
     ready: bool
@@ -260,7 +267,7 @@ class RigOut(BaseModel):
     calibration: str | None
 
 
-class BackgroundOut(BaseModel):
+class BackgroundOut(Answer):
     cameras: list[str]
     plates: int
     note: str

@@ -10,13 +10,14 @@ import anyio
 
 from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
+from server.storage.records import UploadRecord
 from server.wire.multipart import BLOCK_BYTES
 from server.wire.problems import Problem
 
 
 async def append(
     uploads: ResumableUploads,
-    record: dict[str, Any],
+    record: UploadRecord,
     stream: AsyncIterator[bytes],
     checksum: str | None,
     threads: Threads,
@@ -29,8 +30,8 @@ async def append(
     try:
         async for chunk in stream:
             size += len(chunk)
-            if size > record["length"]:
-                raise Problem(413, "upload-too-large", f"More bytes than the announced {record['length']:,}.")
+            if size > record.length:
+                raise Problem(413, "upload-too-large", f"More bytes than the announced {record.length:,}.")
             pending += chunk
             if len(pending) >= BLOCK_BYTES:
                 await threads.disk(_write, target, bytes(pending), digest)

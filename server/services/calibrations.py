@@ -6,19 +6,21 @@
 import hashlib
 import json
 import os
+from collections.abc import Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
 
 from rig.atomic_write import write_atomically
 from server.errors import Conflict, NotFound
 from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES, failure
+from server.services.records import Calibration
+from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord
 from server.storage.store import Store, StoredFile, is_id, move_durably, new_id
 
 WORKFLOW = "calibrate"
-FORMAT = "eigenhead-calibration/1"
 
 
 class Calibrations:
@@ -27,24 +29,18 @@ class Calibrations:
     def __init__(self, store: Store, client: DBOSClient, queue: str) -> None:
         self._store, self._client, self._queue = store, client, queue
 
-    def add(self, folder: Path, source: str, label: str) -> dict[str, Any]:
+    def add(self, folder: Path, source: str, label: str) -> Calibration:
         """Accepts ``folder`` (board.toml and images/) and queues the work."""
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
-        record = {
-            "format": FORMAT,
-            "id": identity,
-            "created": datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
-            "source": source,
-            "label": label,
-            "pictures": cameras,
-        }
+        created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        record = CALIBRATION.document(CalibrationRecord(identity, created, source, label, cameras))
         write_atomically(folder / "record.json", json.dumps(record, indent=1).encode())
         move_durably(folder, self._store.folder("calibrations", identity))
         self._client.enqueue(self._options(identity), identity)
         return self.get(identity)
 
-    def add_shots(self, board: dict[str, Any], captures: list[str], label: str) -> dict[str, Any]:
+    def add_shots(self, board: Mapping[str, object], captures: list[str], label: str) -> Calibration:
         """Queues a calibration from shots that the rig took of the board. Raises NotFound and InputError."""
         with self._store.incoming() as folder:
             target = folder / "calibration"
@@ -52,32 +48,34 @@ class Calibrations:
             link_board_shots(self._store, target, board, captures)
             return self.add(target, "rig", label)
 
-    def get(self, identity: str) -> dict[str, Any]:
+    def get(self, identity: str) -> Calibration:
         """Raises NotFound."""
         if not is_id(identity):
             raise NotFound("calibration", identity)
         folder = self._store.folder("calibrations", identity)
         try:
-            record = json.loads((folder / "record.json").read_bytes())
+            record = CALIBRATION.read(json.loads((folder / "record.json").read_bytes()))
         except (OSError, ValueError) as error:
             raise NotFound("calibration", identity) from error
         row = self._row(identity)
         state = STATES[row.status] if row else "queued"
         if row is None:  # the service was killed between accepting and queueing
             self._client.enqueue(self._options(identity), identity)
-        result = (row.output or {}) if row is not None and state == "succeeded" else {}
-        return {
-            **{key: record[key] for key in ("id", "created", "source", "label", "pictures")},
-            "state": state,
-            "error": failure(row) if row is not None and state == "failed" else None,
-            "figures": result.get("figures", {}),
-            "checks": result.get("checks", []),
-            "warnings": result.get("warnings", []),
-            "front": result.get("front"),
-            "in_use": state == "succeeded" and self.in_use() == result.get("sha256"),
-        }
+        found: CalibrationOutcome | None = row.output if row is not None and state == "succeeded" else None
+        error = failure(row) if row is not None and state == "failed" else None
+        if found is None:
+            return Calibration(**asdict(record), state=state, error=error, in_use=False)
+        return Calibration(
+            **asdict(record),
+            state=state,
+            figures=found["figures"],
+            checks=tuple(found["checks"]),
+            warnings=tuple(found["warnings"]),
+            front=found.get("front"),
+            in_use=self.in_use() == found["sha256"],
+        )
 
-    def find(self) -> list[dict[str, Any]]:
+    def find(self) -> list[Calibration]:
         """Newest first."""
         return [self.get(identity) for identity in self._store.ids("calibrations")]
 
@@ -87,7 +85,7 @@ class Calibrations:
 
     def result(self, identity: str, name: str) -> Path:
         """A file of a calibration that succeeded. Raises NotFound, Conflict."""
-        state = self.get(identity)["state"]
+        state = self.get(identity).state
         if state != "succeeded":
             raise Conflict("no-result", f"The calibration is {state}; it has no result.")
         return self._store.folder("calibrations", identity) / "result" / name
@@ -98,7 +96,7 @@ class Calibrations:
         return StoredFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
     def remove(self, identity: str) -> None:
-        if self.get(identity)["state"] not in FINISHED:
+        if self.get(identity).state not in FINISHED:
             raise Conflict("calibration-active", "The calibration is under way; wait for its end.")
         self._store.remove(self._store.folder("calibrations", identity))
         self._client.delete_workflow(identity)
@@ -126,7 +124,7 @@ class Calibrations:
         }
 
 
-def link_board_shots(store: Store, folder: Path, board: dict[str, Any], captures: list[str]) -> None:
+def link_board_shots(store: Store, folder: Path, board: Mapping[str, object], captures: list[str]) -> None:
     """Makes the pictures of the named captures into ``folder``: one shot each. Raises NotFound and InputError."""
     from calibration.board.board import board_from_document, write_board
 
@@ -134,7 +132,7 @@ def link_board_shots(store: Store, folder: Path, board: dict[str, Any], captures
     for number, identity in enumerate(captures):
         record = store.capture(identity)
         files = store.folder("captures", identity) / "files"
-        for name in record["inputs"]:
+        for name in record.inputs:
             if Path(name).parent.name == "images":
                 target = folder / "images" / Path(name).stem / f"shot{number:03}{Path(name).suffix}"
                 target.parent.mkdir(parents=True, exist_ok=True)

@@ -2,10 +2,9 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
@@ -13,9 +12,10 @@ from server.errors import Conflict, NotFound
 from server.services.jobs import Jobs, refuse_board
 from server.services.rigs import SHOT_BYTES, RigBackend
 from server.settings import ServiceSettings
+from server.storage.records import CaptureContent, CaptureRecord
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.child import Children
-from server.tasks.ingest import check_features, ingest_archive, ingest_board, ingest_folder
+from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
 TEXT_MOST = 500  # characters of a label and the like
 
@@ -41,7 +41,7 @@ class About:
 
 
 class Captures:
-    """The captures of a service. Methods block; records are as ``record.json`` holds them."""
+    """The captures of a service. Methods block."""
 
     def __init__(
         self, store: Store, jobs: Jobs, rig: RigBackend, children: Children, settings: ServiceSettings
@@ -49,7 +49,7 @@ class Captures:
         self._store, self._jobs, self._rig, self._children = store, jobs, rig, children
         self._settings = settings
 
-    def take(self, about: About, *, seed: int | None = None, board: bool = False) -> dict[str, Any]:
+    def take(self, about: About, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
         """Triggers the rig now. ``board``: pictures of the calibration board. Raises Unavailable, and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         if about.session is not None:
@@ -62,7 +62,7 @@ class Captures:
                 content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels)
             return self._add(capture, "rig", content, about, shot)
 
-    def accept(self, archive: Path, folder: Path, about: About) -> dict[str, Any]:
+    def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
         """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
         fault."""
         limits = self.archive_limits(archive)
@@ -82,56 +82,63 @@ class Captures:
         s = self._settings
         return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
 
-    def find(self, *, session: str | None = None, limit: int = 100, before: str | None = None) -> list[dict[str, Any]]:
+    def find(self, *, session: str | None = None, limit: int = 100, before: str | None = None) -> list[CaptureRecord]:
         """Newest first; ``before``: only those older than this id."""
         found = []
         for record in self._store.captures():
-            if (before is None or record["id"] < before) and (session is None or record["session"] == session):
+            if (before is None or record.id < before) and (session is None or record.session == session):
                 found.append(record)
             if len(found) == limit:
                 break
         return found
 
-    def edit(self, identity: str, given: Mapping[str, str | None]) -> dict[str, Any]:
+    def edit(self, identity: str, given: Mapping[str, str | None]) -> CaptureRecord:
         """Another label, expression or session; what is not given stays. Raises NotFound."""
-        changed: dict[str, str | None] = dict(given)
-        if changed.get("session") is not None:
-            self._store.session(str(changed["session"]))
-        changed |= {name: changed[name] or "" for name in ("label", "expression") if name in changed}
-        return self._store.change_capture(identity, lambda record: record.update(changed))
+        if given.get("session") is not None:
+            self._store.session(str(given["session"]))
+
+        def change(record: CaptureRecord) -> CaptureRecord:
+            return replace(
+                record,
+                session=given.get("session", record.session),
+                label=given.get("label", record.label) or "",
+                expression=given.get("expression", record.expression) or "",
+            )
+
+        return self._store.change_capture(identity, change)
 
     def image(self, identity: str, kind: str, camera: str) -> StoredFile:
         """A camera's file of a kind (images, background), found in the record, never by putting a request's text into a
         path. Raises NotFound."""
         record = self._store.capture(identity)
-        for name, digest in record["inputs"].items():
+        for name, digest in record.inputs.items():
             path = Path(name)
             single = path.parent.name == kind and path.stem == camera
             if single or (kind == "background" and path.parent.name == camera and path.parent.parent.name == kind):
                 return StoredFile(self._store.folder("captures", identity) / "files" / name, digest)
         raise NotFound("such file of a camera", camera, "the capture's 'inputs' list what there is")
 
-    def features(self, identity: str) -> dict[str, dict[str, list[float]]]:
+    def features(self, identity: str) -> Points:
         """The stored feature points, by point and camera."""
-        if not self._store.capture(identity)["features"]:
+        if not self._store.capture(identity).features:
             return {}
         path = self._store.folder("captures", identity) / "files" / "features.json"
         return json.loads(path.read_text())["points"]
 
-    def put_features(self, identity: str, document: Mapping[str, Any]) -> dict[str, Any]:
+    def put_features(self, identity: str, points: Points) -> CaptureRecord:
         """Stores feature points. Raises InputError naming every point that the capture cannot have."""
         refuse_board(self._store.capture(identity))
         folder = self._store.folder("captures", identity) / "files"
         with self._children.one() as child:
-            digest = child.remote(check_features)(folder=str(folder), document=dict(document))
+            digest = child.remote(check_features)(folder=str(folder), points=points)
 
-        def change(record: dict[str, Any]) -> None:
-            record["inputs"] = dict(sorted({**record["inputs"], "features.json": digest}.items()))
-            record["features"] = True
+        def change(record: CaptureRecord) -> CaptureRecord:
+            inputs = dict(sorted({**record.inputs, "features.json": digest}.items()))
+            return replace(record, inputs=inputs, features=True)
 
         return self._store.change_capture(identity, change)
 
-    def check_unused(self, identity: str) -> dict[str, Any]:
+    def check_unused(self, identity: str) -> CaptureRecord:
         """The record of a capture that no job needs. Raises Conflict."""
         record = self._store.capture(identity)
         if active := self._jobs.active(capture=identity):
@@ -148,20 +155,26 @@ class Captures:
         self,
         folder: Path,
         source: str,
-        content: dict[str, Any],
+        content: CaptureContent,
         about: About,
-        shot: dict[str, Any] | None = None,
-    ) -> dict[str, Any]:
+        shot: Mapping[str, object] | None = None,
+    ) -> CaptureRecord:
         if about.session is not None:
             self._store.session(about.session)
-        record = {
-            "id": new_id(),
-            "created": datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
-            "source": source,
-            **asdict(about),
-            **content,
-            "features": "features.json" in content["inputs"],
-            "shot": shot,
-        }
+        record = CaptureRecord(
+            id=new_id(),
+            created=datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            source=source,
+            session=about.session,
+            label=about.label,
+            expression=about.expression,
+            cameras=content.cameras,
+            front=content.front,
+            inputs=content.inputs,
+            bytes=content.bytes,
+            board=content.board,
+            features="features.json" in content.inputs,
+            shot=shot,
+        )
         self._store.add_capture(folder, record)
         return record

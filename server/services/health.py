@@ -62,8 +62,8 @@ def _egl(service: Service) -> Check:
 
 def _rig(service: Service) -> Check:
     state = service.rig.describe()
-    faults = "; ".join(state["faults"])
-    return Check(ok=state["ready"], detail=faults or f"{state['kind']}, {len(state['cameras'])} cameras")
+    faults = "; ".join(state.faults)
+    return Check(ok=state.ready, detail=faults or f"{state.kind}, {len(state.cameras)} cameras")
 
 
 def _records(service: Service) -> Check:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import cast
 
 import sqlalchemy as sa
 import structlog
@@ -20,9 +20,11 @@ from sqlalchemy.exc import IntegrityError
 from pipeline.settings import settings_from_document
 from rig.errors import EigenheadError, InputError
 from server.errors import URN, Conflict, NotFound, TooMany
+from server.services.records import Failure, Job
 from server.settings import ServiceSettings
 from server.storage.database import alive_workers, job_index, workers
-from server.storage.events import EventLog
+from server.storage.events import EventLog, JobEvent
+from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest
 from server.storage.store import Store, StoredFile, is_id, new_id
 
 APPLICATION = "eigenhead"
@@ -49,7 +51,7 @@ class Work:
     """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None."""
 
     model: str | None = None
-    settings: dict[str, Any] | None = None
+    settings: Mapping[str, object] | None = None
 
     def check(self) -> None:
         """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""
@@ -119,7 +121,7 @@ class Jobs:
         idempotency_key: str | None = None,
         queue: str | None = None,
         priority: int = 100,
-    ) -> dict[str, Any]:
+    ) -> Job:
         """Queues a reconstruction of a capture and returns the job. A known idempotency key returns the first job.
 
         Raises InputError for work that cannot be done, NotFound, DiskFull, Conflict where the key's first request was
@@ -131,25 +133,28 @@ class Jobs:
         if queue is not None and queue not in self._settings.queues:
             raise InputError("queue", [f"{queue!r:.40} is no queue; there are: {', '.join(self._settings.queues)}"])
         self._store.reserve(0, self._settings.free_bytes)
-        request = {"capture_id": capture_id, "model": wanted.model, "settings": wanted.settings or {}}
-        session = capture["session"]
-        return self._enqueue(request, session, key, queue, priority, idempotency_key)
+        request: JobRequest = {
+            "capture_id": capture_id,
+            "model": wanted.model,
+            "settings": wanted.settings or {},
+        }
+        return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
-    def submit_session(self, session: str, wanted: Work, *, key: str, priority: int) -> list[dict[str, Any]]:
+    def submit_session(self, session: str, wanted: Work, *, key: str, priority: int) -> list[Job]:
         """Queues a reconstruction of every capture of a session. Raises as ``submit`` does."""
         self._store.session(session)
-        heads = [c["id"] for c in self._store.captures() if c["session"] == session and not c.get("board")]
+        heads = [c.id for c in self._store.captures() if c.session == session and not c.board]
         return [self.submit(capture, wanted, key=key, priority=priority) for capture in heads]
 
     def _enqueue(
         self,
-        request: dict[str, Any],
+        request: JobRequest,
         session: str | None,
         key: str,
         queue: str | None,
         priority: int,
         idempotency_key: str | None = None,
-    ) -> dict[str, Any]:
+    ) -> Job:
         job_id = new_id() if idempotency_key is None else _id_of(key, idempotency_key)
         first = None if idempotency_key is None else self._status(job_id)
         if first is None:
@@ -169,11 +174,11 @@ class Jobs:
         if _request(first) != json.loads(json.dumps(request)):
             detail = "This Idempotency-Key was used for another request; use a new key for a new job."
             raise Conflict("idempotency-conflict", detail)
-        return self._document(first)
+        return self._job(first)
 
-    def get(self, job_id: str) -> dict[str, Any]:
+    def get(self, job_id: str) -> Job:
         """Raises NotFound."""
-        return self._document(self._known(job_id))
+        return self._job(self._known(job_id))
 
     def state(self, job_id: str) -> str:
         return STATES[self._known(job_id, load=False).status]
@@ -186,7 +191,7 @@ class Jobs:
         session: str | None = None,
         limit: int = 100,
         offset: int = 0,
-    ) -> list[dict[str, Any]]:
+    ) -> list[Job]:
         """Newest first."""
         ids = self._indexed(capture, session)
         if ids == []:
@@ -196,7 +201,7 @@ class Jobs:
             name=WORKFLOW, workflow_ids=ids, status=status, limit=limit, offset=offset, sort_desc=True
         )
         latest = self.events.latest([row.workflow_id for row in rows])
-        return [self._document(row, latest.get(row.workflow_id)) for row in rows]
+        return [self._job(row, latest.get(row.workflow_id)) for row in rows]
 
     def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
         """Ids of queued and running jobs."""
@@ -206,7 +211,7 @@ class Jobs:
         )
         return [row.workflow_id for row in rows if wanted.items() <= (row.attributes or {}).items()]
 
-    def cancel(self, job_id: str) -> tuple[dict[str, Any], bool]:
+    def cancel(self, job_id: str) -> tuple[Job, bool]:
         """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether it was cancelled
         now. Raises NotFound."""
         before = self.state(job_id)
@@ -214,14 +219,14 @@ class Jobs:
             self.client.cancel_workflow(job_id)
             self.events.append(job_id, {"state": self.state(job_id)})
         job = self.get(job_id)
-        return job, before not in FINISHED and job["state"] == "cancelled"
+        return job, before not in FINISHED and job.state == "cancelled"
 
-    def files(self, job_id: str) -> dict[str, dict[str, Any]]:
+    def files(self, job_id: str) -> dict[str, FileEntry]:
         """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict where there is no result."""
         job = self.get(job_id)
-        if job["state"] != "succeeded":
-            raise Conflict("no-result", f"The job is {job['state']}; it has no result.")
-        return job["files"]
+        if job.state != "succeeded":
+            raise Conflict("no-result", f"The job is {job.state}; it has no result.")
+        return job.files
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
         """A file of a result, found in the job's record. Raises NotFound, Conflict."""
@@ -230,12 +235,15 @@ class Jobs:
             raise NotFound("file", name, f"GET /v1/jobs/{job_id}/result lists what there is")
         return StoredFile(self._store.folder("jobs", job_id) / "result" / name, file["sha256"])
 
-    def restart(self, job_id: str, wanted: Work, *, key: str = "local") -> dict[str, Any]:
+    def restart(self, job_id: str, wanted: Work, *, key: str = "local") -> Job:
         """A new job for the same capture, which names the old one. What is None is as in that. Raises InputError,
         NotFound, TooMany."""
         wanted.check()
         row = self._known(job_id)
-        request = _request(row) | {"restart_of": job_id}
+        request = _request(row)
+        if request is None:
+            raise NotFound("request of the job", job_id)
+        request = cast(JobRequest, {**request, "restart_of": job_id})
         if wanted.settings is not None:
             request["settings"] = wanted.settings
         if wanted.model is not None:
@@ -291,56 +299,53 @@ class Jobs:
             raise NotFound("job", job_id)
         return row
 
-    def _document(self, row: WorkflowStatus, event: Any = None) -> dict[str, Any]:
+    def _job(self, row: WorkflowStatus, event: JobEvent | None = None) -> Job:
         event = event or self.events.latest([row.workflow_id]).get(row.workflow_id)
         state = STATES[row.status]
-        progress = event.document if event is not None and state == "running" else {}
+        progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = _request(row)
         attributes = row.attributes or {}
-        return {
-            "id": row.workflow_id,
-            "state": state,
-            "stage": progress.get("stage") or ("done" if state == "succeeded" else state),
-            "progress": 1.0 if state == "succeeded" else progress.get("progress", 0.0),
-            "eta_s": progress.get("eta_s"),
-            "error": failure(row) if state == "failed" else None,
-            "notice": self._notice(row.queue_name) if state == "queued" else None,
-            "capture_id": request.get("capture_id"),
-            "session": attributes.get("session"),
-            "model": request.get("model"),
-            "settings": request.get("settings") or {},
-            "restart_of": request.get("restart_of"),
-            "queue": row.queue_name,
-            "priority": row.priority or 0,
-            "created": _moment(row.created_at),
-            "started": _moment(row.dequeued_at),
-            "finished": _moment(row.completed_at) if state in FINISHED else None,
-            "files": dict(row.output or {}) if state == "succeeded" else {},
-        }
+        return Job(
+            id=row.workflow_id,
+            state=state,
+            stage=progress.get("stage") or ("done" if state == "succeeded" else state),
+            progress=1.0 if state == "succeeded" else progress.get("progress", 0.0),
+            eta_s=progress.get("eta_s"),
+            error=failure(row) if state == "failed" else None,
+            notice=self._notice(row.queue_name) if state == "queued" else None,
+            capture_id=None if request is None else request["capture_id"],
+            session=attributes.get("session"),
+            model=None if request is None else request.get("model"),
+            settings={} if request is None else request.get("settings") or {},
+            restart_of=None if request is None else request.get("restart_of"),
+            queue=row.queue_name,
+            priority=row.priority or 0,
+            created=_moment(row.created_at),
+            started=_moment(row.dequeued_at),
+            finished=_moment(row.completed_at) if state in FINISHED else None,
+            files=dict(row.output or {}) if state == "succeeded" else {},
+        )
 
 
-def _request(row: WorkflowStatus) -> dict[str, Any]:
-    return dict(row.input["args"][0]) if row.input else {}
+def _request(row: WorkflowStatus) -> JobRequest | None:
+    """A copy of what the job was asked for; None where its input cannot be read."""
+    return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
 
 
-def failure(row: WorkflowStatus) -> dict[str, Any]:
+def failure(row: WorkflowStatus) -> Failure:
     error = row.error
     if isinstance(error, JobFailed):
-        return {"type": URN + error.kind, "detail": error.detail, "errors": list(error.errors)}
+        return Failure(URN + error.kind, error.detail, tuple(error.errors))
     if row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
         detail = "The job took its worker down with it again and again; the worker's log says why."
-        return {"type": URN + "worker-died", "detail": detail, "errors": []}
+        return Failure(URN + "worker-died", detail)
     log.error("job failed in an unforeseen way", job=row.workflow_id, error=str(error))
-    return {
-        "type": URN + "internal-error",
-        "detail": "The job failed in a way that nobody foresaw; the log says more.",
-        "errors": [],
-    }
+    return Failure(URN + "internal-error", "The job failed in a way that nobody foresaw; the log says more.")
 
 
-def refuse_board(record: Mapping[str, Any]) -> None:
+def refuse_board(record: CaptureRecord) -> None:
     """Raises Conflict for pictures of the calibration board, which show no head."""
-    if record.get("board"):
+    if record.board:
         raise Conflict("board-shot", "The capture is of the calibration board; it can only be calibrated from.")
 
 

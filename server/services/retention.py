@@ -5,7 +5,6 @@ import time
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import structlog
 
@@ -39,18 +38,16 @@ def _jobs(service: Service) -> int:
     if s.keep_results_days is None and s.keep_jobs is None and not s.make_room:
         return 0
     finished = [job for state in FINISHED for job in service.jobs.find(state=state, limit=100_000)]
-    finished.sort(key=lambda job: job["created"] or "", reverse=True)
+    finished.sort(key=lambda job: job.created or "", reverse=True)
     for place in range(len(finished) - 1, -1, -1):  # oldest first
         job = finished[place]
-        old = (
-            s.keep_results_days is not None and _age_s(job["finished"] or job["created"]) > s.keep_results_days * DAY_S
-        )
+        old = s.keep_results_days is not None and _age_s(job.finished or job.created) > s.keep_results_days * DAY_S
         many = s.keep_jobs is not None and place >= s.keep_jobs
         full = s.make_room and service.store.free_bytes() < s.free_bytes
         if not (old or many or full):
             break
         with suppress(EigenheadError):
-            service.jobs.delete(job["id"])
+            service.jobs.delete(job.id)
             removed += 1
     return removed
 
@@ -60,8 +57,8 @@ def _captures(service: Service) -> int:
     if days is None:
         return 0
     for record in list(service.store.captures()):
-        if _age_s(record["created"]) > days * DAY_S and not service.jobs.active(capture=record["id"]):
-            service.store.remove_capture(record["id"])
+        if _age_s(record.created) > days * DAY_S and not service.jobs.active(capture=record.id):
+            service.store.remove_capture(record.id)
             removed += 1
     return removed
 
@@ -123,5 +120,5 @@ def _deliveries(service: Service) -> int:
     return len(rows)
 
 
-def _age_s(moment: Any) -> float:
+def _age_s(moment: str | None) -> float:
     return time.time() - datetime.fromisoformat(moment).timestamp() if moment else 0.0

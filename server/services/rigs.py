@@ -8,7 +8,7 @@ import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from rig.acquisition.commands import board_shot
 from rig.acquisition.plates import link_plates
 from rig.acquisition.session import RigSession
-from rig.acquisition.shot import ShotFailed
+from rig.acquisition.shot import ShotDocument, ShotFailed
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras_json import read_rig, write_rig
@@ -26,9 +26,10 @@ from rig.formats.images import write_image
 from rig.formats.rig_toml import RigConfig, read_rig_config
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
+from server.services.records import CleanPlates, RigCamera, RigState
 from server.settings import ServiceSettings
 from server.tasks.child import Child, WorkFailed
-from server.tasks.simulate import look, simulated
+from server.tasks.simulate import SimulatedCertificate, look, simulated
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 PREVIEW_WIDTH = 640
@@ -39,11 +40,9 @@ SHOT_BYTES = 64 << 20
 class RigBackend(Protocol):
     """What the service asks of a rig. Blocks; call it from a thread."""
 
-    def describe(self) -> dict[str, Any]:
-        """id, kind, ready, cameras, faults, calibration."""
-        ...
+    def describe(self) -> RigState: ...
 
-    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument | SimulatedCertificate:
         """Takes a shot into ``folder/files``; returns its certificate. Raises Unavailable naming what is missing.
 
         ``board``: of the calibration board, for which a rig needs no calibration and not every camera."""
@@ -57,7 +56,7 @@ class RigBackend(Protocol):
         """A JPEG of what the camera sees now. Raises NotFound or Unavailable."""
         ...
 
-    def take_background(self) -> dict[str, Any]:
+    def take_background(self) -> CleanPlates:
         """New clean plates of the empty studio. Raises Unavailable."""
         ...
 
@@ -76,13 +75,13 @@ class SimulatedRig:
         self._child = Child(niceness=3)
         self._one_at_a_time = threading.Lock()
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> RigState:
         rig = self._rig()
-        cameras = [{"name": name, "driver": "simulated", "state": "ready"} for name in rig.names]
+        cameras = [RigCamera(name, "simulated", "ready") for name in rig.names]
         calibrated = "own" if self._calibration.is_file() else "studio"
         return _state("simulated", "simulated", cameras, [], calibrated)
 
-    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
         """The studio has no board to show: its pictures are of a person all the same."""
         with self._one_at_a_time:
             try:
@@ -103,13 +102,9 @@ class SimulatedRig:
         with self._one_at_a_time:
             return jpeg(self._child.remote(look)(cameras=[camera])[camera])
 
-    def take_background(self) -> dict[str, Any]:
+    def take_background(self) -> CleanPlates:
         """The studio takes clean plates with every shot; there is nothing to keep."""
-        return {
-            "cameras": list(self._rig().names),
-            "plates": 2,
-            "note": "the simulated studio takes them with each shot",
-        }
+        return CleanPlates(self._rig().names, 2, "the simulated studio takes them with each shot")
 
     def use(self, calibration: Path) -> None:
         _check_names(read_rig(calibration), self._rig().names)
@@ -135,7 +130,7 @@ class RealRig:
         self._session: RigSession | None = None
         self._lock = threading.RLock()
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> RigState:
         with self._lock:
             states = {} if self._session is None else self._session.states()
             error = None if self._session is None else self._session.trigger_error()
@@ -143,7 +138,7 @@ class RealRig:
         for camera in self._config.cameras:
             state = states.get(camera.name)
             known = "closed" if state is None else "open" if state.opened else "missing"
-            cameras.append({"name": camera.name, "driver": camera.driver, "state": known})
+            cameras.append(RigCamera(camera.name, camera.driver, known))
             if state is not None and state.error:
                 faults.append(f"{camera.name}: {state.error}")
         rig = self._calibrated()
@@ -151,7 +146,7 @@ class RealRig:
             faults.append("no calibration: calibrate the rig and put the calibration to use")
         return _state(self._config.name, "real", cameras, faults, None if rig is None else "own")
 
-    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> dict[str, Any]:
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument:
         if seed is not None:
             raise InputError("request", ["seed: only the simulated studio takes one"])
         if board:
@@ -171,7 +166,7 @@ class RealRig:
             link_plates(session.plates, folder / "files" / "background")
         return shot.document()
 
-    def _board_shot(self, folder: Path) -> dict[str, Any]:
+    def _board_shot(self, folder: Path) -> ShotDocument:
         with self._lock:
             try:
                 shot = board_shot(self._opened())
@@ -195,14 +190,14 @@ class RealRig:
             raise Unavailable("camera-missing", f"{camera} delivers no picture; GET /v1/rig says why.", [camera])
         return jpeg(image)
 
-    def take_background(self) -> dict[str, Any]:
+    def take_background(self) -> CleanPlates:
         with self._lock:
             try:
                 plates = self._opened().take_plates()
             except ShotFailed as error:
                 faults = [str(fault) for fault in error.faults]
                 raise Unavailable("plates-failed", str(error), faults) from error
-        return {"cameras": sorted(plates.files), "plates": self._config.shot.plates, "note": ""}
+        return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, "")
 
     def use(self, calibration: Path) -> None:
         rig = read_rig(calibration)
@@ -271,15 +266,6 @@ def _check_names(rig: Rig, names: tuple[str, ...]) -> None:
         raise Conflict("other-rig", detail, [f"{name}: only in one of the two" for name in differing])
 
 
-def _state(
-    identity: str, kind: str, cameras: list[dict[str, Any]], faults: list[str], calibration: str | None
-) -> dict[str, Any]:
-    ready = not faults and all(camera["state"] != "missing" for camera in cameras)
-    return {
-        "id": identity,
-        "kind": kind,
-        "ready": ready,
-        "cameras": cameras,
-        "faults": faults,
-        "calibration": calibration,
-    }
+def _state(identity: str, kind: str, cameras: list[RigCamera], faults: list[str], calibration: str | None) -> RigState:
+    ready = not faults and all(camera.state != "missing" for camera in cameras)
+    return RigState(identity, kind, ready, tuple(cameras), tuple(faults), calibration)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import sqlalchemy as sa
 
@@ -11,6 +10,7 @@ from server.services.calibrations import Calibrations
 from server.services.captures import Captures
 from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
+from server.services.records import Calibration, Job, RigState
 from server.services.rigs import RigBackend, open_rig
 from server.services.sessions import Sessions
 from server.services.threads import Threads
@@ -57,7 +57,7 @@ class Service:
         self.jobs.close()
         self.engine.dispose()
 
-    def accept_board_pictures(self, archive: Path, folder: Path, label: str) -> dict[str, Any]:
+    def accept_board_pictures(self, archive: Path, folder: Path, label: str) -> Calibration:
         """Queues a calibration from an archive of IMAGES/ and board.toml. Raises InputError naming every fault."""
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
@@ -65,13 +65,13 @@ class Service:
             child.remote(ingest_board_pictures)(archive=str(archive), folder=str(target), limits=limits)
         return self.calibrations.add(target, "upload", label)
 
-    def use_calibration(self, identity: str) -> dict[str, Any]:
+    def use_calibration(self, identity: str) -> RigState:
         """Every capture from now on gets this calibration; returns the rig's state. Raises NotFound, Conflict."""
         self.rig.use(self.calibrations.cameras_json(identity))
         self.calibrations.mark_in_use(identity)
         return self.rig.describe()
 
-    def cancel(self, job_id: str) -> dict[str, Any]:
+    def cancel(self, job_id: str) -> Job:
         """Cancels a job and tells the webhooks; a finished one stays as it is."""
         job, did = self.jobs.cancel(job_id)
         if did:

@@ -1,44 +1,48 @@
 """Sessions: one subject's captures, and their erasure."""
 
 import time
-from collections.abc import Mapping
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
-from typing import Any
 
 from server.errors import Unavailable
 from server.services.jobs import FINISHED, Jobs
+from server.services.records import Session
+from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store, new_id
 
 CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
 
 class Sessions:
-    """The sessions of a service. Methods block; records are as the session's file holds them."""
+    """The sessions of a service. Methods block."""
 
     def __init__(self, store: Store, jobs: Jobs) -> None:
         self._store, self._jobs = store, jobs
 
-    def add(self, label: str, consent: str) -> dict[str, Any]:
+    def add(self, label: str, consent: str) -> Session:
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        record = {"id": new_id(), "created": created, "label": label, "consent": consent}
+        record = SessionRecord(new_id(), created, label, consent)
         self._store.save_session(record)
-        return {**record, "captures": []}
+        return _with_captures(record, [])
 
-    def find(self) -> list[dict[str, Any]]:
+    def find(self) -> list[Session]:
         """Newest first, each with the ids of its captures."""
-        of: dict[str, list[str]] = {}
+        of: dict[str | None, list[str]] = {}
         for capture in self._store.captures():
-            of.setdefault(capture["session"], []).append(capture["id"])
-        return [{**record, "captures": of.get(record["id"], [])} for record in self._store.sessions()]
+            of.setdefault(capture.session, []).append(capture.id)
+        return [_with_captures(record, of.get(record.id, [])) for record in self._store.sessions()]
 
-    def get(self, identity: str) -> dict[str, Any]:
+    def get(self, identity: str) -> Session:
         """Raises NotFound."""
         record = self._store.session(identity)
-        return {**record, "captures": [capture["id"] for capture in self._captures(identity)]}
+        return _with_captures(record, [capture.id for capture in self._captures(identity)])
 
-    def edit(self, identity: str, given: Mapping[str, str]) -> dict[str, Any]:
-        """Another label or consent note. Raises NotFound."""
-        self._store.save_session(self._store.session(identity) | dict(given))
+    def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
+        """Another label or consent note; what is None stays. Raises NotFound."""
+        record = self._store.session(identity)
+        new_label = record.label if label is None else label
+        new_consent = record.consent if consent is None else consent
+        self._store.save_session(replace(record, label=new_label, consent=new_consent))
         return self.get(identity)
 
     def erase(self, identity: str) -> None:
@@ -47,9 +51,9 @@ class Sessions:
         Unavailable while a worker still writes."""
         self._store.session(identity)
         captures = self._captures(identity)
-        jobs = {job["id"] for job in self._jobs.find(session=identity, limit=100_000)}
+        jobs = {job.id for job in self._jobs.find(session=identity, limit=100_000)}
         for capture in captures:
-            jobs |= {job["id"] for job in self._jobs.find(capture=capture["id"], limit=100_000)}
+            jobs |= {job.id for job in self._jobs.find(capture=capture.id, limit=100_000)}
         active = [job for job in jobs if self._jobs.state(job) not in FINISHED]
         for job in jobs:
             self._jobs.cancel(job)
@@ -57,7 +61,7 @@ class Sessions:
         for job in jobs:
             self._delete_job(job)
         for capture in captures:
-            self._store.remove_capture(capture["id"])
+            self._store.remove_capture(capture.id)
         self._store.remove(self._store.folder("sessions", identity).with_suffix(".json"))
 
     def _await_workers(self, jobs: list[str]) -> None:
@@ -73,5 +77,9 @@ class Sessions:
         if self._store.folder("jobs", job_id).exists():
             raise Unavailable("still-writing", "A worker still writes; ask for the erasure again.")
 
-    def _captures(self, identity: str) -> list[dict[str, Any]]:
-        return [record for record in self._store.captures() if record["session"] == identity]
+    def _captures(self, identity: str) -> list[CaptureRecord]:
+        return [record for record in self._store.captures() if record.session == identity]
+
+
+def _with_captures(record: SessionRecord, captures: list[str]) -> Session:
+    return Session(**asdict(record), captures=tuple(captures))

@@ -6,14 +6,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from rig.atomic_write import write_atomically
 from server.errors import Conflict, NotFound, Refused, TooLarge
 from server.settings import ServiceSettings
+from server.storage.records import UPLOAD, UploadRecord
 from server.storage.store import Store, is_id, new_id
-
-UPLOAD_FORMAT = "eigenhead-upload/1"
 
 
 def too_large(settings: ServiceSettings) -> TooLarge:
@@ -26,7 +24,7 @@ class ResumableUploads:
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         self._store, self._settings = store, settings
 
-    def create(self, length: int, fields: dict[str, str], key: str) -> dict[str, Any]:
+    def create(self, length: int, fields: dict[str, str], key: str) -> UploadRecord:
         if length > self._settings.body_bytes:
             raise too_large(self._settings)
         self._store.reserve(2 * length + self._promised(), self._settings.free_bytes)
@@ -35,36 +33,36 @@ class ResumableUploads:
         folder.mkdir(parents=True)
         (folder / "data").touch()
         expires = time.time() + self._settings.upload_hours * 3600
-        record = {"format": UPLOAD_FORMAT, "id": identity, "length": length, "fields": fields, "key": key}
-        record |= {"expires": expires, "capture": None}
+        record = UploadRecord(identity, length, fields, key, expires, capture=None)
         self.save(record)
         return record
 
-    def get(self, identity: str) -> dict[str, Any]:
+    def get(self, identity: str) -> UploadRecord:
         """Raises NotFound, also for what expired."""
         if not is_id(identity):
             raise NotFound("upload", identity)
         with suppress(OSError, ValueError):
-            record = json.loads((self._store.folder("uploads", identity) / "upload.json").read_bytes())
-            if record["expires"] > time.time():
+            path = self._store.folder("uploads", identity) / "upload.json"
+            record = UPLOAD.read(json.loads(path.read_bytes()))
+            if record.expires > time.time():
                 return record
         raise NotFound("upload", identity)
 
-    def offset(self, record: dict[str, Any]) -> int:
+    def offset(self, record: UploadRecord) -> int:
         """Bytes that are here; all of them once the capture was made and the data let go."""
-        if record["capture"] is not None:
-            return record["length"]
+        if record.capture is not None:
+            return record.length
         return self.data(record).stat().st_size
 
-    def data(self, record: dict[str, Any]) -> Path:
-        return self._store.folder("uploads", record["id"]) / "data"
+    def data(self, record: UploadRecord) -> Path:
+        return self._store.folder("uploads", record.id) / "data"
 
-    def save(self, record: dict[str, Any]) -> None:
-        path = self._store.folder("uploads", record["id"]) / "upload.json"
-        write_atomically(path, json.dumps(record).encode())
+    def save(self, record: UploadRecord) -> None:
+        path = self._store.folder("uploads", record.id) / "upload.json"
+        write_atomically(path, json.dumps(UPLOAD.document(record)).encode())
 
     @contextmanager
-    def lock(self, record: dict[str, Any]) -> Iterator[None]:
+    def lock(self, record: UploadRecord) -> Iterator[None]:
         """One writer at a time, in this process or another. Raises Conflict."""
         with (self.data(record).parent / "upload.json").open("rb") as stream:
             try:
@@ -95,5 +93,5 @@ class ResumableUploads:
         for identity in self._store.ids("uploads"):
             with suppress(Refused, OSError):
                 record = self.get(identity)
-                total += 0 if record["capture"] else record["length"] - self.offset(record)
+                total += 0 if record.capture else record.length - self.offset(record)
         return total

@@ -12,6 +12,7 @@ import json
 import secrets
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import httpx
@@ -20,7 +21,9 @@ from dbos import EnqueueOptions
 
 from server.errors import NotFound
 from server.services.jobs import APPLICATION_VERSION, DELIVERY
+from server.services.records import NewWebhook, Webhook
 from server.storage.database import now_sql, webhooks
+from server.storage.records import WebhookMessage
 
 WEBHOOKS_QUEUE = "webhooks"
 TIMEOUT_S = 10.0
@@ -32,21 +35,18 @@ class Webhooks:
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
-    def add(self, url: str) -> dict[str, Any]:
+    def add(self, url: str) -> NewWebhook:
         """The new webhook with its secret, which is shown this once."""
-        row = {
-            "id": secrets.token_hex(14),
-            "url": url,
-            "secret": "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode(),
-        }
+        secret = "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode()
+        made = NewWebhook(secrets.token_hex(14), url, secret)
         with self._engine.begin() as connection:
-            connection.execute(sa.insert(webhooks).values(**row, created=now_sql(connection)))
-        return row
+            connection.execute(sa.insert(webhooks).values(**asdict(made), created=now_sql(connection)))
+        return made
 
-    def all(self) -> list[dict[str, Any]]:
+    def all(self) -> list[Webhook]:
         with self._engine.connect() as connection:
             rows = connection.execute(sa.select(webhooks.c.id, webhooks.c.url).order_by(webhooks.c.created))
-            return [{"id": row.id, "url": row.url} for row in rows]
+            return [Webhook(row.id, row.url) for row in rows]
 
     def remove(self, identity: str) -> None:
         """Raises NotFound."""
@@ -57,17 +57,22 @@ class Webhooks:
     def announce(self, job_id: str, state: str, enqueue: Callable[..., Any]) -> None:
         """Queues one delivery a webhook; doing it again for the same job and state changes nothing."""
         for hook in self.all():
-            message = {"webhook": hook["id"], "type": f"job.{state}", "job_id": job_id}
-            identity = f"hook-{hook['id']}-{job_id}-{state}"
+            identity = f"hook-{hook.id}-{job_id}-{state}"
+            message: WebhookMessage = {
+                "webhook": hook.id,
+                "type": f"job.{state}",
+                "job_id": job_id,
+                "id": identity,
+            }
             options: EnqueueOptions = {
                 "workflow_name": DELIVERY,
                 "queue_name": WEBHOOKS_QUEUE,
                 "workflow_id": identity,
                 "app_version": APPLICATION_VERSION,
             }
-            enqueue(options, message | {"id": identity})
+            enqueue(options, message)
 
-    def post(self, message: dict[str, Any]) -> int:
+    def post(self, message: WebhookMessage) -> int:
         """One attempt. Raises httpx.HTTPError where the other side does not take it; a removed webhook is done."""
         with self._engine.connect() as connection:
             hook = connection.execute(sa.select(webhooks).where(webhooks.c.id == message["webhook"])).one_or_none()

@@ -2,21 +2,21 @@
 
 import json
 from dataclasses import dataclass
-from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
 from server.storage.database import events, now_sql
+from server.storage.records import EventDocument
 
 
 @dataclass(frozen=True, slots=True)
 class JobEvent:
-    """``document`` holds ``stage`` and ``progress`` (0 to 1), perhaps ``eta_s``, or a ``state``."""
+    """Numbered within its job."""
 
     seq: int
     at: float
-    document: dict[str, Any]
+    document: EventDocument
 
 
 class EventLog:
@@ -25,7 +25,7 @@ class EventLog:
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
-    def append(self, job_id: str, document: dict[str, Any]) -> None:
+    def append(self, job_id: str, document: EventDocument) -> None:
         for _ in range(20):  # a taken-over job has two writers for a moment
             try:
                 with self._engine.begin() as connection:

@@ -18,7 +18,6 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -93,14 +92,9 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
             mask = np.unpackbits(packed, count=height * width).reshape(height, width).view(bool)
             distance = _from_steps(zlib.decompress(arrays[f"distance{number}"].tobytes()), height, width)
             name = view.pop("name")
-            found[name] = Silhouette(mask, distance, _quality(view))
+            listed = {field: tuple(view[field]) for field in ("cut_off", "warnings")}
+            found[name] = Silhouette(mask, distance, ViewQuality(**view | listed))
     return found
-
-
-def _quality(document: dict[str, Any]) -> ViewQuality:
-    for name in ("cut_off", "warnings"):
-        document[name] = tuple(document[name])
-    return ViewQuality(**document)
 
 
 def _steps(values: Float32[np.ndarray, "h w"]) -> bytes:

@@ -20,22 +20,23 @@ import secrets
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import structlog
 
 from rig.atomic_write import write_atomically
 from server.errors import DiskFull, NotFound
+from server.storage.records import CAPTURE, SESSION, CaptureRecord, RecordFormat, SessionRecord
 
-CAPTURE_FORMAT, SESSION_FORMAT = "eigenhead-capture/1", "eigenhead-session/1"
 ID = re.compile(r"^[0-9a-f]{28}$")
 FOLDERS = ("captures", "sessions", "jobs", "incoming", "uploads", "trash", "set-aside", "calibrations", "cache", "rig")
 
 log = structlog.get_logger()
+T = TypeVar("T")
 
 
 def new_id() -> str:
@@ -96,33 +97,32 @@ class Store:
         if self.free_bytes() - wanted < spare:
             raise DiskFull
 
-    def add_capture(self, folder: Path, record: dict[str, Any]) -> None:
+    def add_capture(self, folder: Path, record: CaptureRecord) -> None:
         """Moves ``folder`` (with ``files/`` in it) to its place, with its record."""
-        write_atomically(folder / "record.json", _encoded({"format": CAPTURE_FORMAT, **record}))
-        move_durably(folder, self.folder("captures", record["id"]))
+        write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
+        move_durably(folder, self.folder("captures", record.id))
 
-    def capture(self, identity: str) -> dict[str, Any]:
+    def capture(self, identity: str) -> CaptureRecord:
         """The record of a capture. Raises NotFound."""
         path = self.folder("captures", identity) / "record.json"
-        record = self._read(path, CAPTURE_FORMAT, path.parent)
+        record = self._read(path, CAPTURE, path.parent)
         if record is None:
             raise NotFound("capture", identity)
         return record
 
-    def captures(self) -> Iterator[dict[str, Any]]:
+    def captures(self) -> Iterator[CaptureRecord]:
         """The records of all captures, newest first."""
         for identity in self.ids("captures"):
             folder = self.data / "captures" / identity
-            record = self._read(folder / "record.json", CAPTURE_FORMAT, folder)
+            record = self._read(folder / "record.json", CAPTURE, folder)
             if record is not None:
                 yield record
 
-    def change_capture(self, identity: str, change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-        """Applies ``change`` to the record of a capture and returns it. Raises NotFound."""
+    def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
+        """Puts what ``change`` makes of a capture's record in its place and returns it. Raises NotFound."""
         with self._changing:
-            record = self.capture(identity)
-            change(record)
-            write_atomically(self.folder("captures", identity) / "record.json", _encoded(record))
+            record = change(self.capture(identity))
+            write_atomically(self.folder("captures", identity) / "record.json", _encoded(CAPTURE.document(record)))
         return record
 
     def remove_capture(self, identity: str) -> None:
@@ -134,20 +134,20 @@ class Store:
         """Where silhouettes, thumbnails and the like of a capture are kept."""
         return self.folder("cache/captures", identity)
 
-    def save_session(self, record: dict[str, Any]) -> None:
-        path = self.folder("sessions", record["id"]).with_suffix(".json")
-        write_atomically(path, _encoded({"format": SESSION_FORMAT, **record}))
+    def save_session(self, record: SessionRecord) -> None:
+        path = self.folder("sessions", record.id).with_suffix(".json")
+        write_atomically(path, _encoded(SESSION.document(record)))
         _sync_folder(path.parent)
 
-    def session(self, identity: str) -> dict[str, Any]:
+    def session(self, identity: str) -> SessionRecord:
         """The record of a session. Raises NotFound."""
         path = self.folder("sessions", identity).with_suffix(".json")
-        record = self._read(path, SESSION_FORMAT, path)
+        record = self._read(path, SESSION, path)
         if record is None:
             raise NotFound("session", identity)
         return record
 
-    def sessions(self) -> Iterator[dict[str, Any]]:
+    def sessions(self) -> Iterator[SessionRecord]:
         for identity in self.ids("sessions"):
             with suppress(NotFound):
                 yield self.session(identity)
@@ -179,14 +179,15 @@ class Store:
         """Names of the damaged records that were moved out of the way."""
         return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
 
-    def _read(self, path: Path, wanted: str, whole: Path) -> dict[str, Any] | None:
+    def _read(self, path: Path, wanted: RecordFormat[T], whole: Path) -> T | None:
         try:
             data = path.read_bytes()
         except (FileNotFoundError, NotADirectoryError):
             return None
         with suppress(ValueError, RecursionError):
-            record = json.loads(data)
-            if isinstance(record, dict) and record.get("format") == wanted and record.get("id") == whole.stem:
+            document = json.loads(data)
+            record = wanted.read(document)
+            if document.get("id") == whole.stem:
                 return record
         name = f"{whole.parent.name}-{whole.name}-{int(time.time())}"
         log.error("damaged record set aside", record=str(path), to=name)
@@ -223,5 +224,5 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def _encoded(document: dict[str, Any]) -> bytes:
+def _encoded(document: Mapping[str, object]) -> bytes:
     return json.dumps(document, indent=1, ensure_ascii=False).encode()

@@ -4,12 +4,12 @@ import hashlib
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.capture_folder import capture_root
+from server.storage.records import CalibrationOutcome
 from server.tasks.child import Bench, Report
 
 
@@ -36,7 +36,7 @@ def ingest_board_pictures(bench: Bench, report: Report, *, archive: str, folder:
 
 def calibrate_folder(
     bench: Bench, report: Report, *, folder: str, result: str, previous: str | None, cache: str, front: str | None
-) -> dict[str, Any]:
+) -> CalibrationOutcome:
     """``calibrate()`` and its files; returns what the record shows."""
     from calibration.board.board import read_board
     from calibration.calibrate import calibrate
@@ -61,4 +61,10 @@ def calibrate_folder(
     write_calibration(found, Path(result) / "cameras.json")
     write_atomically(Path(result) / "calibration.json", json.dumps(document, indent=1).encode())
     digest = hashlib.sha256((Path(result) / "cameras.json").read_bytes()).hexdigest()
-    return {key: document[key] for key in ("figures", "checks", "warnings", "front")} | {"sha256": digest}
+    return {
+        "figures": document["figures"],
+        "checks": [*document["checks"]],
+        "warnings": document["warnings"],
+        "front": document["front"],
+        "sha256": digest,
+    }

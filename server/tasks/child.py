@@ -50,12 +50,12 @@ class Bench:
 
     def __init__(self) -> None:
         self._stack = ExitStack()
-        self._things: dict[str, Any] = {}
+        self._things: dict[str, object] = {}
 
     def keep(self, name: str, make: Callable[[], Any]) -> Any:
         """The thing called ``name``; ``make`` may return a context manager, which is entered."""
         if name not in self._things:
-            thing = make()
+            thing: Any = make()
             self._things[name] = self._stack.enter_context(thing) if hasattr(thing, "__exit__") else thing
         return self._things[name]
 

@@ -7,7 +7,6 @@ import hashlib
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -20,15 +19,18 @@ from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.formats.capture_folder import IMAGE_SUFFIXES, capture_root, read_shot, size_fault, stray_faults
-from rig.formats.features_json import features_from_bytes
+from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_FORMATS
 from rig.plausibility import rig_faults
+from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import Bench, Report
+
+Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
 
 def ingest_archive(
     bench: Bench, report: Report, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
-) -> dict[str, Any]:
+) -> CaptureContent:
     """Unpacks ``archive``, checks the capture in it, and leaves ``folder`` with exactly its files.
 
     Returns what the capture's record says of the content. Raises InputError naming every fault.
@@ -38,19 +40,19 @@ def ingest_archive(
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
     described = check_capture(root, image_pixels, report)
-    for name in described["inputs"]:
+    for name in described.inputs:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).rename(target / name)
     shutil.rmtree(unpacked)
     return described
 
 
-def ingest_folder(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> dict[str, Any]:
+def ingest_folder(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> CaptureContent:
     """The same for a folder of our own making (a shot of the rig)."""
     return check_capture(Path(folder), image_pixels, report)
 
 
-def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> dict[str, Any]:
+def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> CaptureContent:
     """A shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
     root = Path(folder)
     for entry in root.iterdir():
@@ -64,16 +66,16 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
     huge = [f"{name} is {w} x {h} pixels" for name, (w, h) in sizes.items() if w * h > image_pixels]
     if huge:
         raise InputError("capture", [f"{fault}; at most {image_pixels:,} are accepted" for fault in huge])
-    return {
-        "board": True,
-        "cameras": [{"name": name, "width": width, "height": height} for name, (width, height) in sizes.items()],
-        "front": files[0].stem,
-        "inputs": {path.relative_to(root).as_posix(): _sha256(path) for path in files},
-        "bytes": sum(path.stat().st_size for path in files),
-    }
+    return CaptureContent(
+        cameras=tuple(CameraSize(name, width, height) for name, (width, height) in sizes.items()),
+        front=files[0].stem,
+        inputs={path.relative_to(root).as_posix(): _sha256(path) for path in files},
+        bytes=sum(path.stat().st_size for path in files),
+        board=True,
+    )
 
 
-def check_capture(root: Path, image_pixels: int, report: Report) -> dict[str, Any]:
+def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureContent:
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
@@ -101,12 +103,12 @@ def check_capture(root: Path, image_pixels: int, report: Report) -> dict[str, An
         raise InputError("capture", faults)
     for path in _rig_files(rig_file):
         digests[path.relative_to(root).as_posix()] = _sha256(path)
-    return {
-        "cameras": [{"name": c.name, "width": c.intrinsics.width, "height": c.intrinsics.height} for c in rig],
-        "front": rig.front_camera(),
-        "inputs": dict(sorted(digests.items())),
-        "bytes": sum((root / name).stat().st_size for name in digests),
-    }
+    return CaptureContent(
+        cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
+        front=rig.front_camera(),
+        inputs=dict(sorted(digests.items())),
+        bytes=sum((root / name).stat().st_size for name in digests),
+    )
 
 
 def _shows_its_plate(shot: Capture, name: str) -> bool:
@@ -116,12 +118,12 @@ def _shows_its_plate(shot: Capture, name: str) -> bool:
     return image is not None and any(np.array_equal(image, plate) for plate in plates)
 
 
-def check_features(bench: Bench, report: Report, *, folder: str, document: dict[str, Any]) -> str:
+def check_features(bench: Bench, report: Report, *, folder: str, points: Points) -> str:
     """Judges feature points for the capture in ``folder`` and stores them; returns the file's sha256."""
     rig_file = find_rig_file(Path(folder))
     assert rig_file is not None  # it was accepted with one
     faults: list[str] = []
-    data = json.dumps(document, indent=1).encode()
+    data = json.dumps({"format": FEATURES_FORMAT, "points": points}, indent=1).encode()
     # Points come one after the other: whether they suffice is asked when the job starts.
     faults += unknown_landmarks(features_from_bytes(data, read_rig_file(rig_file), faults))
     if faults:

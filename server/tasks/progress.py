@@ -87,5 +87,5 @@ class ProgressMeter:
         if stage == self._last[0] and now - self._last[1] < EVERY_S:
             return
         self._last = (stage, now)
-        document = {"state": "running", "stage": stage, "progress": round(self._course.progress(), 4)}
-        self._log.append(self._job_id, document | {"eta_s": round(self._course.remaining_s(), 1)})
+        progress, eta_s = round(self._course.progress(), 4), round(self._course.remaining_s(), 1)
+        self._log.append(self._job_id, {"state": "running", "stage": stage, "progress": progress, "eta_s": eta_s})

@@ -1,17 +1,42 @@
 """What a job runs in a worker's child process: files in, ``reconstruct()``, files out."""
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 from server.tasks.child import Bench, Report
 
 
+class CaptureWork(Protocol):
+    """What a worker runs for a job: ``reconstruct_capture``, or what the setting ``work`` names in its place."""
+
+    def __call__(
+        self,
+        bench: Bench,
+        report: Report,
+        /,
+        *,
+        capture: str,
+        result: str,
+        cache: str,
+        model: str | None,
+        settings: Mapping[str, object],
+    ) -> object: ...
+
+
 def reconstruct_capture(
-    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
-) -> dict[str, Any]:
-    """Reconstructs the capture folder ``capture`` into the result folder ``result``; returns figures for the job.
-    ``cache`` is where silhouettes of this capture are kept.
+    bench: Bench,
+    report: Report,
+    *,
+    capture: str,
+    result: str,
+    cache: str,
+    model: str | None,
+    settings: Mapping[str, object],
+) -> None:
+    """Reconstructs the capture folder ``capture`` into the result folder ``result``. ``cache`` is where
+    silhouettes of this capture are kept.
 
     Raises InputError for an input that cannot be used, any EigenheadError that the pipeline raises, OSError for a full
     disk, Cancelled out of ``report``.
@@ -33,4 +58,3 @@ def reconstruct_capture(
     done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=report, segment=once)
     report("write", 0.0)
     write_result(Path(result), done, shot)
-    return {"seconds": sum(done.seconds.values()), "warnings": [w.code for w in done.warnings]}

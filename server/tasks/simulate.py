@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -12,7 +12,21 @@ if TYPE_CHECKING:
     from rig.studio.scene.simulate import SimulatedCapture
 
 
-def simulated(bench: Bench, report: Report, *, folder: str, seed: int | None) -> dict[str, Any]:
+class SimulatedSync(TypedDict):
+    status: str
+    skew_ms: float
+
+
+class SimulatedCertificate(TypedDict):
+    """Of a shot of the simulated studio."""
+
+    kind: str
+    subject: str
+    cameras: dict[str, SimulatedSync]
+    faults: list[str]
+
+
+def simulated(bench: Bench, report: Report, *, folder: str, seed: int | None) -> SimulatedCertificate:
     """A capture in ``folder/files``, its truth in ``folder/truth``; returns the shot's certificate.
 
     Without a seed the subject is another one each time. The operator's clicks are left out: they are made later.
@@ -35,9 +49,9 @@ def simulated(bench: Bench, report: Report, *, folder: str, seed: int | None) ->
     return describe(taken)
 
 
-def describe(taken: "SimulatedCapture") -> dict[str, Any]:
+def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
     """The certificate of a simulated shot: every picture is of one moment."""
-    cameras = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
+    cameras: dict[str, SimulatedSync] = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
     faults = [f.kind if f.camera is None else f"{f.kind} in {f.camera}" for f in taken.faults]
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
 

@@ -13,10 +13,12 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from server.services.captures import About
+from server.services.records import Calibration
 from server.services.service import Service
 from server.services.threads import Threads
 from server.services.uploads import too_large
 from server.settings import ServiceSettings
+from server.storage.records import CaptureRecord, JsonObject
 from server.storage.store import Store
 from server.wire.problems import Problem
 
@@ -25,7 +27,7 @@ FIELD_BYTES = 1 << 16  # of a form field that is no file
 ARCHIVE = ".zip, .tar or .tar.gz"
 
 
-def described_form(file: str, fields: Iterable[str], **described: str) -> dict[str, Any]:
+def described_form(file: str, fields: Iterable[str], **described: str) -> JsonObject:
     """OpenAPI's word for a multipart body of one file, text ``fields``, and further ones with a description."""
     texts: dict[str, dict[str, str]] = {name: {"type": "string"} for name in fields}
     texts |= {name: {"type": "string", "description": text} for name, text in described.items()}
@@ -147,7 +149,7 @@ class _Form:
         self.ended = True
 
 
-async def receive_capture(service: Service, request: Request) -> tuple[dict[str, Any], dict[str, str]]:
+async def receive_capture(service: Service, request: Request) -> tuple[CaptureRecord, dict[str, str]]:
     """Receives a multipart archive and makes a capture of it; returns its record and the form's fields."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
@@ -156,8 +158,8 @@ async def receive_capture(service: Service, request: Request) -> tuple[dict[str,
     return record, fields
 
 
-async def receive_board_pictures(service: Service, request: Request) -> dict[str, Any]:
-    """Receives a multipart archive of IMAGES/ and board.toml and queues a calibration; returns its document."""
+async def receive_board_pictures(service: Service, request: Request) -> Calibration:
+    """Receives a multipart archive of IMAGES/ and board.toml and queues a calibration."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.settings, service.threads)

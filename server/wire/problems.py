@@ -3,7 +3,7 @@
 import errno
 from collections.abc import Iterable, Mapping, Sequence
 from http import HTTPStatus
-from typing import Any
+from typing import Any, TypedDict
 
 import structlog
 from fastapi import FastAPI, Request
@@ -48,6 +48,17 @@ PROBLEM_SCHEMA = {
 }
 
 
+Responses = dict[int | str, dict[str, Any]]  # FastAPI's type of a route's ``responses``
+
+
+class ProblemDocument(TypedDict):
+    type: str
+    title: str
+    status: int
+    detail: str
+    errors: list[str]
+
+
 STATUS_OF: dict[type[Refused], int] = {
     Unknown: 401,
     Forbidden: 403,
@@ -77,7 +88,7 @@ class Problem(EigenheadError):
         self.status, self.kind, self.detail = status, kind, detail
         self.errors, self.headers = list(errors), dict(headers or {})
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> ProblemDocument:
         title = self.kind.replace("-", " ").capitalize()
         return {
             "type": URN + self.kind,
@@ -138,7 +149,7 @@ def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
     return sorted({method for route in fitting if route.path == fitting[0].path for method in route.methods or ()})
 
 
-def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+def documented(*statuses: int) -> Responses:
     """The ``responses`` of a route that may refuse with these statuses."""
     body = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     every = {401, 403, 422, 429, 500, 503, *statuses}

@@ -12,6 +12,7 @@ from typing import Any
 from fastapi import Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
+from server.storage.records import FileEntry
 from server.storage.store import StoredFile
 from server.wire.problems import Problem
 
@@ -42,7 +43,7 @@ def send_file(request: Request, file: StoredFile) -> Response:
     return FileResponse(path, headers=headers, media_type=media_type(path.name))
 
 
-def send_archive(request: Request, folder: Path, files: Mapping[str, Mapping[str, Any]]) -> Response:
+def send_archive(request: Request, folder: Path, files: Mapping[str, FileEntry]) -> Response:
     """The named files below ``folder`` as a .zip, stored and without times: the same files are the same bytes."""
     digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
     headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}

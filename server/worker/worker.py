@@ -24,11 +24,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS
+from dbos import DBOS, WorkflowStatus
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -40,10 +39,13 @@ from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
+from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, WebhookMessage
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
 from server.tasks.progress import Course, Expectation, ProgressMeter
+from server.tasks.reconstruct import CaptureWork
+from server.worker.engine import take_over
 from server.worker.heartbeat import dead_workers, process_identity
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
@@ -61,7 +63,7 @@ class Worker:
         self.events = EventLog(self.engine)
         self.id = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"[:64]
         self._children = Children(settings.concurrency, niceness=5)  # a busy machine still answers requests
-        self._work = function_at(settings.work)
+        self._work: CaptureWork = function_at(settings.work)
         self._stop = threading.Event()
         self._webhooks = Webhooks(self.engine)
         self._expectation = Expectation()
@@ -102,19 +104,19 @@ class Worker:
         worker = self
 
         @DBOS.step(name="ingest")
-        def ingest(job_id: str, request: dict[str, Any]) -> None:
+        def ingest(job_id: str, request: JobRequest) -> None:
             worker.ingest(job_id, request)
 
         @DBOS.step(name="fit")
-        def fit(job_id: str, request: dict[str, Any]) -> str:
+        def fit(job_id: str, request: JobRequest) -> str:
             return worker.fit(job_id, request)
 
         @DBOS.step(name="publish")
-        def publish(job_id: str, attempt: str) -> dict[str, Any]:
+        def publish(job_id: str, attempt: str) -> dict[str, FileEntry]:
             return worker.publish(job_id, attempt)
 
         @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=self.settings.attempts)
-        def reconstruct_job(request: dict[str, Any]) -> dict[str, Any]:
+        def reconstruct_job(request: JobRequest) -> dict[str, FileEntry]:
             job_id = DBOS.workflow_id
             assert job_id is not None
             with structlog.contextvars.bound_contextvars(job=job_id):
@@ -133,73 +135,72 @@ class Worker:
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
-        def post(message: dict[str, Any]) -> int:
+        def post(message: WebhookMessage) -> int:
             return worker._webhooks.post(message)
 
         @DBOS.workflow(name=DELIVERY)
-        def deliver(message: dict[str, Any]) -> int:
+        def deliver(message: WebhookMessage) -> int:
             return post(message)
 
         @DBOS.step(name="calibrate")
-        def calibrate(identity: str) -> dict[str, Any]:
+        def calibrate(identity: str) -> CalibrationOutcome:
             return worker.calibrate(identity)
 
         @DBOS.workflow(name=calibrations.WORKFLOW, max_recovery_attempts=self.settings.attempts)
-        def calibrate_rig(identity: str) -> dict[str, Any]:
+        def calibrate_rig(identity: str) -> CalibrationOutcome:
             return calibrate(identity)
 
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
 
-    def ingest(self, job_id: str, request: dict[str, Any]) -> None:
+    def ingest(self, job_id: str, request: JobRequest) -> None:
         """Fails early and clearly on what would make the fit fail late."""
         self.events.append(job_id, {"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None})
         log.info("job started", capture=request["capture_id"])
         try:
             record = self.store.capture(request["capture_id"])
-            self.store.reserve(record["bytes"], self.settings.free_bytes)
+            self.store.reserve(record.bytes, self.settings.free_bytes)
         except Refused as error:
             raise JobFailed(error.kind, error.detail) from error
 
-    def fit(self, job_id: str, request: dict[str, Any]) -> str:
+    def fit(self, job_id: str, request: JobRequest) -> str:
         """Runs the work in a child and returns the name of the attempt's folder."""
         name = f"attempt-{secrets.token_hex(6)}"
         folder = self.store.folder("jobs", job_id) / name
-        arguments = {
-            "capture": str(self.store.folder("captures", request["capture_id"]) / "files"),
-            "result": str(folder),
-            "cache": str(self.store.cache_of(request["capture_id"])),
-            "model": request.get("model"),
-            "settings": request.get("settings") or {},
-        }
+        settings = request.get("settings") or {}
         try:
             folder.mkdir(parents=True)
-            method = arguments["settings"].get("method", "contour")
+            method = str(settings.get("method", "contour"))
             course = Course(self._expectation.of(method))
             meter = ProgressMeter(self.events, job_id, course)
             with self._children.one() as child:
                 cancelled = lambda: not self._states.runs(job_id)  # noqa: E731
-                child.remote(self._work, report=meter.report, cancelled=cancelled)(**arguments)
+                child.remote(self._work, report=meter.report, cancelled=cancelled)(
+                    capture=str(self.store.folder("captures", request["capture_id"]) / "files"),
+                    result=str(folder),
+                    cache=str(self.store.cache_of(request["capture_id"])),
+                    model=request.get("model"),
+                    settings=settings,
+                )
             self._expectation.learn(method, course.finish())
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
             raise self._failure(error) from error
         return name
 
-    def calibrate(self, identity: str) -> dict[str, Any]:
+    def calibrate(self, identity: str) -> CalibrationOutcome:
         """One calibration, written under a temporary name and renamed."""
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
-        arguments = {
-            "folder": str(folder),
-            "result": str(attempt),
-            "previous": str(in_use) if in_use.is_file() else None,
-            "cache": str(self.settings.data / "cache" / "boards"),
-            "front": None,
-        }
         try:
             with self._children.one() as child:
-                result = child.remote(calibrate_folder)(**arguments)
+                result = child.remote(calibrate_folder)(
+                    folder=str(folder),
+                    result=str(attempt),
+                    previous=str(in_use) if in_use.is_file() else None,
+                    cache=str(self.settings.data / "cache" / "boards"),
+                    front=None,
+                )
             shutil.rmtree(folder / "result", ignore_errors=True)
             move_durably(attempt, folder / "result")
         except BaseException as error:
@@ -207,7 +208,7 @@ class Worker:
             raise self._failure(error) from error
         return result
 
-    def publish(self, job_id: str, attempt: str) -> dict[str, Any]:
+    def publish(self, job_id: str, attempt: str) -> dict[str, FileEntry]:
         """Gives the result its name; returns size and sha256 of every file. Another worker may have done so already,
         with the same bytes."""
         folder = self.store.folder("jobs", job_id)
@@ -231,7 +232,7 @@ class Worker:
         if moved:
             log.warning("camera moved", details=moved)
         with suppress(SQLAlchemyError):
-            self.events.append(job_id, {"state": state} | ({"camera_moved": moved} if moved else {}))
+            self.events.append(job_id, {"state": state, "camera_moved": moved} if moved else {"state": state})
         self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options)
 
     def _failure(self, error: BaseException) -> BaseException:
@@ -276,14 +277,11 @@ class Worker:
         dead = dead_workers(self.engine, self.settings.silent_s, own=self.id)
         running = self._running()
         known = self._known_workers()  # asked second: a worker that begins in between is no stray
-        strays = {row.executor_id for row in running if row.executor_id not in known}
-        gone = [*dead, *sorted(strays)]
+        executors = {row.executor_id for row in running if row.executor_id is not None}
+        gone = [*dead, *sorted(executors - known)]
         if gone:
-            # Not the public resume_workflow: that takes a job from whoever has it by now, revives a cancelled one, and
-            # forgets how many workers the job took down with it.
-            handles = DBOS._recover_pending_workflows(gone)
-            for handle in handles:
-                log.warning("job taken over", job=handle.get_workflow_id())
+            for job_id in take_over(gone):
+                log.warning("job taken over", job=job_id)
         with self.engine.begin() as connection:
             old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
             connection.execute(sa.delete(workers).where(old))
@@ -292,7 +290,7 @@ class Worker:
         with self.engine.connect() as connection:
             return set(connection.scalars(sa.select(workers.c.id)))
 
-    def _running(self) -> list[Any]:
+    def _running(self) -> list[WorkflowStatus]:
         names = [WORKFLOW, DELIVERY, calibrations.WORKFLOW]
         return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
 
@@ -326,9 +324,9 @@ class _StateWatch:
         return row is not None and row.status in ("PENDING", "ENQUEUED")
 
 
-def described(folder: Path) -> dict[str, Any]:
+def described(folder: Path) -> dict[str, FileEntry]:
     """Size and sha256 of every file below ``folder``, by relative name."""
-    files = {}
+    files: dict[str, FileEntry] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()

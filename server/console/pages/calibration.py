@@ -1,17 +1,20 @@
 """Calibration: board shots with live coverage, the report, switching, history."""
 
 import threading
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import NotRequired, TypedDict
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
-from server.console.coverage import advice, detect_shot, summary
-from server.console.page import Action, Page, remove_later, shared, show
+from server.console.coverage import Corners, Coverage, advice, detect_shot, summary
+from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.removal import removals
 from server.errors import Conflict, Unusable
 from server.services.captures import About
+from server.services.records import Calibration
 from server.services.service import Service
 
 LABEL = "calibration board"
@@ -24,14 +27,14 @@ class Shots:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.board: dict[str, Any] = {}
-        self.taken: list[tuple[str, dict[str, list[list[float]]]]] = []
+        self.board: Mapping[str, object] = {}
+        self.taken: list[tuple[str, Corners]] = []
 
-    def add(self, board: dict[str, Any], capture: str, found: dict[str, list[list[float]]]) -> None:
+    def add(self, board: Mapping[str, object], capture: str, found: Corners) -> None:
         with self._lock:
             self.board, self.taken = board, [*self.taken, (capture, found)]
 
-    def check(self, board: dict[str, Any]) -> None:
+    def check(self, board: Mapping[str, object]) -> None:
         """Raises Conflict where the shots so far are of another board."""
         with self._lock:
             if self.taken and board != self.board:
@@ -51,32 +54,60 @@ class Shots:
 shots = Shots()
 
 
+class RigLine(TypedDict):
+    """``own``: whether a calibration of the rig's own is in use."""
+
+    kind: str
+    calibration: str | None
+    own: bool
+
+
+class CalibrationState(TypedDict):
+    calibrations: list[Mapping[str, object]]
+    rig: RigLine
+    board: Mapping[str, object]
+    shots: int
+    coverage: list[Coverage]
+    advice: str
+
+
+class BoardForm(TypedDict):
+    board: NotRequired[Mapping[str, object] | None]
+
+
+class CalibrateForm(TypedDict):
+    label: NotRequired[str | None]
+
+
 class CalibrationPage(Page, component="calibration.js"):
-    def look(self) -> dict[str, Any]:
+    def look(self) -> CalibrationState:
         return shared.get("calibration page", 0.4, lambda: calibration_state(self.service))
 
 
-def calibration_state(service: Service) -> dict[str, Any]:
+def known_calibrations(service: Service, age_s: float) -> list[Calibration]:
+    """Newest first; shared by the pages, and at most ``age_s`` old."""
+    return shared.get("calibrations", age_s, service.calibrations.find)
+
+
+def calibration_state(service: Service) -> CalibrationState:
     rig = service.rig.describe()
-    names = [camera["name"] for camera in rig["cameras"]]
+    names = [camera.name for camera in rig.cameras]
     lines = summary(names, [found for _, found in shots.taken])
     return {
-        "calibrations": [
-            c for c in shared.get("calibrations", 1.0, service.calibrations.find) if c["id"] not in removals
-        ],
+        "calibrations": [asdict(found) for found in known_calibrations(service, 1.0) if found.id not in removals],
         "rig": {
-            "kind": rig["kind"],
-            "calibration": rig["calibration"],
+            "kind": rig.kind,
+            "calibration": rig.calibration,
             "own": service.calibrations.in_use() is not None,
         },
         "board": shots.board,
         "shots": len(shots.taken),
         "coverage": lines,
-        "advice": NO_BOARD if rig["kind"] == "simulated" and not shots.taken else advice(lines),
+        "advice": NO_BOARD if rig.kind == "simulated" and not shots.taken else advice(lines),
     }
 
 
-def board_of(event: dict[str, Any]) -> dict[str, Any]:
+def board_of(event: BoardForm) -> Mapping[str, object]:
     """The board's document from the form. Raises InputError."""
     form = event.get("board") or {}
     needed = ("kind", "columns", "rows", "square_mm")
@@ -87,13 +118,13 @@ def board_of(event: dict[str, Any]) -> dict[str, Any]:
     return board
 
 
-def shoot(page: Page, event: dict[str, Any]) -> str:
+def shoot(page: Page, event: BoardForm) -> str:
     from calibration.board.board import board_from_document
 
     board, service = board_of(event), page.service
     board_from_document(board)
     shots.check(board)
-    identity = service.captures.take(About(label=LABEL), board=True)["id"]
+    identity = service.captures.take(About(label=LABEL), board=True).id
     files = service.store.folder("captures", identity) / "files"
     with service.children.one() as child:
         found = child.remote(detect_shot)(files=str(files), board=board)
@@ -107,17 +138,17 @@ def shoot(page: Page, event: dict[str, Any]) -> str:
     return f"Shot {len(shots.taken)}: {seen} of {len(found)} cameras see the board."
 
 
-def take_back(page: Page, event: dict[str, Any]) -> None:
+def take_back(page: Page, event: object) -> None:
     shots.drop_last()
     shared.forget("calibration page")
 
 
-def start_over(page: Page, event: dict[str, Any]) -> None:
+def start_over(page: Page, event: object) -> None:
     shots.clear()
     shared.forget("calibration page")
 
 
-def calibrate(page: Page, event: dict[str, Any]) -> str:
+def calibrate(page: Page, event: CalibrateForm) -> str:
     if len(shots.taken) < SHOTS_LEAST:
         detail = f"{len(shots.taken)} shots; at least {SHOTS_LEAST} are needed, 15 are good."
         raise Unusable("too-few-shots", detail)
@@ -128,16 +159,16 @@ def calibrate(page: Page, event: dict[str, Any]) -> str:
     return "The calibration is queued."
 
 
-def use(page: Page, event: dict[str, Any]) -> str:
+def use(page: Page, event: Chosen) -> str:
     page.service.use_calibration(event["id"])
     _forget()
     return "Every capture from now on gets this calibration."
 
 
-def remove(page: Page, event: dict[str, Any]) -> None:
+def remove(page: Page, event: Chosen) -> None:
     service, identity = page.service, event["id"]
     found = service.calibrations.get(identity)
-    title = f"calibration {found['label'] or identity[-6:]}"
+    title = f"calibration {found.label or identity[-6:]}"
     remove_later(identity, lambda: service.calibrations.remove(identity), title, "capture")
 
 

@@ -1,39 +1,95 @@
 """Captures: what there is, uploads, silhouettes over the images, jobs to start, removal with undo."""
 
-from typing import Any
+from dataclasses import asdict
+from typing import NotRequired, TypedDict
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model import list_models
 from rig.errors import InputError
-from server.console.page import Action, Page, remove_later, shared, show
+from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.removal import removals
 from server.services.captures import TEXT_MOST, About
 from server.services.jobs import Work
 from server.services.service import Service
+from server.storage.records import CaptureRecord
 
 SHOWN = 500
 
 
+class LatestJob(TypedDict):
+    id: str
+    state: str
+    progress: float
+
+
+class CaptureLine(TypedDict):
+    """A capture in the list; ``size`` is that of its first camera's pictures, ``job`` its newest."""
+
+    id: str
+    created: str
+    source: str
+    label: str
+    expression: str
+    front: str
+    features: bool
+    cameras: list[str]
+    bytes: int
+    session: str | None
+    job: LatestJob | None
+    board: bool
+    size: dict[str, str | int]
+
+
+class SessionLine(TypedDict):
+    id: str
+    created: str
+    label: str
+    consent: str
+
+
+class CapturesState(TypedDict):
+    captures: list[CaptureLine]
+    sessions: list[SessionLine]
+    models: list[str]
+
+
+class WorkForm(Chosen):
+    model: NotRequired[str | None]
+    method: NotRequired[str | None]
+
+
+class EditForm(Chosen):
+    label: NotRequired[str]
+    expression: NotRequired[str]
+    session: NotRequired[str | None]
+
+
+class SessionForm(TypedDict):
+    label: NotRequired[str]
+    consent: NotRequired[str]
+
+
+class SessionEditForm(Chosen, SessionForm):
+    pass
+
+
 class CapturesPage(Page, component="captures.js"):
-    def look(self) -> dict[str, Any]:
+    def look(self) -> CapturesState:
         return shared.get("captures", 0.3, lambda: captures_state(self.service))
 
 
-def captures_state(service: Service) -> dict[str, Any]:
+def captures_state(service: Service) -> CapturesState:
     """Captures, newest first, with the newest job of each."""
-    jobs: dict[str, dict[str, Any]] = {}
+    jobs: dict[str | None, LatestJob] = {}
     for job in service.jobs.find(limit=SHOWN):
-        jobs.setdefault(job["capture_id"], {"id": job["id"], "state": job["state"], "progress": job["progress"]})
-    captures = []
+        jobs.setdefault(job.capture_id, {"id": job.id, "state": job.state, "progress": job.progress})
+    captures: list[CaptureLine] = []
     for record in service.store.captures():
-        if record["id"] in removals:
+        if record.id in removals:
             continue
-        about = {key: record[key] for key in ("id", "created", "source", "label", "expression", "front", "features")}
-        about |= {"cameras": [camera["name"] for camera in record["cameras"]], "bytes": record["bytes"]}
-        about |= {"session": record["session"], "job": jobs.get(record["id"]), "board": record.get("board", False)}
-        captures.append(about | {"size": record["cameras"][0]})
+        captures.append(capture_line(record, jobs.get(record.id)))
         if len(captures) == SHOWN:
             break
     return {
@@ -43,59 +99,80 @@ def captures_state(service: Service) -> dict[str, Any]:
     }
 
 
-def sessions_list(service: Service) -> list[dict[str, Any]]:
+def capture_line(record: CaptureRecord, job: LatestJob | None) -> CaptureLine:
+    return {
+        "id": record.id,
+        "created": record.created,
+        "source": record.source,
+        "label": record.label,
+        "expression": record.expression,
+        "front": record.front,
+        "features": record.features,
+        "cameras": [camera.name for camera in record.cameras],
+        "bytes": record.bytes,
+        "session": record.session,
+        "job": job,
+        "board": record.board,
+        "size": asdict(record.cameras[0]),
+    }
+
+
+def sessions_list(service: Service) -> list[SessionLine]:
     """Newest first."""
-    names = ("id", "created", "label", "consent")
-    return [{name: record[name] for name in names} for record in service.store.sessions()]
+    return [
+        {"id": record.id, "created": record.created, "label": record.label, "consent": record.consent}
+        for record in service.store.sessions()
+    ]
 
 
-def reconstruct(page: Page, event: dict[str, Any]) -> str:
+def reconstruct(page: Page, event: WorkForm) -> str:
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
-    return f"Queued job {job['id'][-6:]}. Watch it on the page Jobs."
+    return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
 
 
-def reconstruct_session(page: Page, event: dict[str, Any]) -> str:
+def reconstruct_session(page: Page, event: WorkForm) -> str:
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
     return f"Queued {len(jobs)} {'job' if len(jobs) == 1 else 'jobs'}. Watch them on the page Jobs."
 
 
-def chosen_work(event: dict[str, Any]) -> Work:
+def chosen_work(event: WorkForm) -> Work:
     """Model and solver of the form; what is not chosen is the service's default."""
-    settings = {"method": event["method"]} if event.get("method") else {}
+    method = event.get("method")
+    settings = {"method": method} if method else {}
     return Work(event.get("model") or None, settings)
 
 
-def edit(page: Page, event: dict[str, Any]) -> None:
-    given = {name: event[name] for name in ("label", "expression", "session") if name in event}
+def edit(page: Page, event: EditForm) -> None:
+    given: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     About.of({name: given[name] for name in given if name != "session"})
     page.service.captures.edit(event["id"], given)
     shared.forget("captures")
 
 
-def new_session(page: Page, event: dict[str, Any]) -> str:
+def new_session(page: Page, event: SessionForm) -> str:
     made = page.service.sessions.add(*session_texts(event.get("label", ""), event.get("consent", "")))
     shared.forget("captures")
-    return f"Session {made['label'] or made['id'][-6:]}: what is taken or uploaded now belongs to it."
+    return f"Session {made.label or made.id[-6:]}: what is taken or uploaded now belongs to it."
 
 
-def edit_consent(page: Page, event: dict[str, Any]) -> None:
-    given = {name: str(event[name] or "") for name in ("label", "consent") if name in event}
+def edit_consent(page: Page, event: SessionEditForm) -> None:
+    given = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
     session_texts(*given.values())
-    page.service.sessions.edit(event["id"], given)
+    page.service.sessions.edit(event["id"], label=given.get("label"), consent=given.get("consent"))
     shared.forget("captures")
 
 
-def erase(page: Page, event: dict[str, Any]) -> str:
+def erase(page: Page, event: Chosen) -> str:
     page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
     return "Erased: images, heads, jobs and all that was kept of them."
 
 
-def remove(page: Page, event: dict[str, Any]) -> None:
+def remove(page: Page, event: Chosen) -> None:
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
-    title = f"capture {record['label'] or identity[-6:]}"
+    title = f"capture {record.label or identity[-6:]}"
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 

@@ -2,8 +2,9 @@
 the pipeline finds the alignment by itself."""
 
 import threading
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from nicegui import ui
@@ -12,47 +13,104 @@ from starlette.responses import RedirectResponse
 from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.rig import Rig
-from server.console.guides import helps, mean_landmarks, nearest_views
+from server.console.guides import Helps, helps, mean_landmarks, nearest_views
 from server.console.page import Action, Page, shared, show
 from server.console.removal import removals
+from server.errors import Conflict
 from server.services.jobs import Work
 from server.services.service import Service
+from server.tasks.ingest import Points
 
 VIEWS = 4
-FORMAT = "eigenhead-features/1"
+
+
+class CaptureChoice(TypedDict):
+    id: str
+    label: str
+    created: str
+    features: bool
+
+
+class Size(TypedDict):
+    name: str
+    width: int
+    height: int
+
+
+class Picking(Helps):
+    """One capture's points, and what helps to pick them."""
+
+    id: str
+    cameras: list[Size]
+    views: list[str]
+    names: list[str]
+    points: Points
+    dirty: bool
+
+
+class FeaturesShown(TypedDict):
+    captures: list[CaptureChoice]
+    capture: Picking | None
+    asked: NotRequired[str | None]
+
+
+class Place(TypedDict):
+    """``at``: pixels; None takes the point back."""
+
+    point: str
+    camera: str
+    at: list[float] | None
+
+
+@dataclass(slots=True)
+class Picked:
+    """The points of a capture as they stand on the page, and as they were saved."""
+
+    capture: str
+    points: Points
+    saved: Points
 
 
 class FeaturesPage(Page, component="features.js"):
     """The points are the page's own until they are saved."""
 
-    def look(self) -> dict[str, Any]:
-        captures = [
-            {key: c[key] for key in ("id", "label", "created", "features")}
+    picked: Picked | None = None
+
+    def look(self) -> FeaturesShown:
+        captures: list[CaptureChoice] = [
+            {"id": c.id, "label": c.label, "created": c.created, "features": c.features}
             for c in self.service.store.captures()
-            if not c.get("board") and c["id"] not in removals
+            if not c.board and c.id not in removals
         ]
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         if chosen is None or all(capture["id"] != chosen for capture in captures):
             return {"captures": captures, "capture": None, "asked": self.choice.get("capture")}
         return {"captures": captures, "capture": self._picking(chosen)}
 
-    def _picking(self, capture_id: str) -> dict[str, Any]:
-        if self.choice.get("of") != capture_id:
+    def _picking(self, capture_id: str) -> Picking:
+        picked = self.picked
+        if picked is None or picked.capture != capture_id:
             saved = self.service.captures.features(capture_id)
-            self.choice |= {"of": capture_id, "points": saved, "saved": saved}
+            self.picked = picked = Picked(capture_id, points=saved, saved=saved)
         record = self.service.store.capture(capture_id)
         rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service, capture_id))
-        points = self.choice["points"]
+        points = picked.points
         pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in points.items()}
         return {
             "id": capture_id,
-            "cameras": record["cameras"],
-            "views": nearest_views(rig, record["front"], VIEWS),
+            "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in record.cameras],
+            "views": nearest_views(rig, record.front, VIEWS),
             "names": list(SEVEN_POINTS),
             "points": points,
-            "dirty": points != self.choice["saved"],
+            "dirty": points != picked.saved,
             **helps(rig, pixels, landmarks.of(self.service)),
         }
+
+    def of_capture(self) -> Picked:
+        """What is being picked. Raises Conflict before the page has shown a capture."""
+        if self.picked is None:
+            raise Conflict("no-capture", "No capture is shown: choose one first.")
+        return self.picked
 
 
 def rig_of(service: Service, capture_id: str) -> Rig:
@@ -77,8 +135,7 @@ class Landmarks:
     def _load(self, service: Service) -> None:
         try:
             with service.children.one() as child:
-                arguments = {"model": "default", "names": list(SEVEN_POINTS)}
-                found = child.remote(mean_landmarks)(**arguments)
+                found = child.remote(mean_landmarks)(model="default", names=list(SEVEN_POINTS))
             self.found = {name: np.array(point) for name, point in found.items()}
         finally:
             self._asked.release()
@@ -87,29 +144,32 @@ class Landmarks:
 landmarks = Landmarks()
 
 
-def place(page: Page, event: dict[str, Any]) -> None:
+def place(page: FeaturesPage, event: Place) -> None:
     """Sets one point in one view, or takes it back where ``at`` is null."""
-    points = {name: dict(views) for name, views in page.choice["points"].items()}
+    picked = page.of_capture()
+    points = {name: dict(views) for name, views in picked.points.items()}
     views = points.setdefault(event["point"], {})
     if event["at"] is None:
         views.pop(event["camera"], None)
     else:
         views[event["camera"]] = [round(float(value), 2) for value in event["at"]]
-    page.choice["points"] = {name: views for name, views in points.items() if views}
+    picked.points = {name: views for name, views in points.items() if views}
 
 
-def save(page: Page, event: dict[str, Any]) -> str:
-    points = page.choice["points"]
-    page.service.captures.put_features(page.choice["of"], {"format": FORMAT, "points": points})
-    page.choice["saved"] = points
+def save(page: FeaturesPage, event: object) -> str:
+    picked = page.of_capture()
+    points = picked.points
+    page.service.captures.put_features(picked.capture, points)
+    picked.saved = points
     return "Saved. Jobs from now on use these points."
 
 
-def reconstruct(page: Page, event: dict[str, Any]) -> str:
-    if page.choice["points"] != page.choice["saved"]:
+def reconstruct(page: FeaturesPage, event: object) -> str:
+    picked = page.of_capture()
+    if picked.points != picked.saved:
         save(page, event)
-    job = page.service.jobs.submit(page.choice["of"], Work(), key=page.caller.key)
-    return f"Queued job {job['id'][-6:]}. Watch it on the page Jobs."
+    job = page.service.jobs.submit(picked.capture, Work(), key=page.caller.key)
+    return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
 
 
 FeaturesPage.actions = {

@@ -1,57 +1,109 @@
 """The rig: eleven live tiles with exposure, sharpness, sync and calibration, clean plates, the trigger."""
 
 import json
-from typing import Any
+from collections.abc import Mapping
+from typing import TypedDict, cast
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
+from pipeline.results.report import Report
+from rig.acquisition.shot import CameraSyncDocument, SyncDocument
 from server.console.media import live_view
 from server.console.page import Action, Page, shared, show
-from server.console.pages.captures import sessions_list
+from server.console.pages.captures import SessionLine, sessions_list
 from server.services.captures import About
+from server.services.records import Calibration
 from server.services.service import Service
+from server.tasks.simulate import SimulatedCertificate, SimulatedSync
+
+
+class Tile(TypedDict):
+    """A camera: what its driver says, its line in the last shot's certificate, and whether it has moved."""
+
+    name: str
+    driver: str
+    state: str
+    sync: CameraSyncDocument | SimulatedSync | None
+    moved: bool
+
+
+class InUse(TypedDict):
+    """The calibration that every capture gets."""
+
+    label: str
+    created: str
+    rms_px: float | None
+
+
+class LastCapture(TypedDict):
+    id: str
+    created: str
+    source: str
+
+
+class RigShown(TypedDict):
+    kind: str
+    ready: bool
+    cameras: list[Tile]
+    faults: list[str]
+    calibration: str | None
+    in_use: InUse | None
+    sessions: list[SessionLine]
+    last: LastCapture | None
 
 
 class RigPage(Page, component="rig.js"):
-    def look(self) -> dict[str, Any]:
+    def look(self) -> RigShown:
         return shared.get("rig", 0.4, lambda: rig_state(self.service))
 
 
-def rig_state(service: Service) -> dict[str, Any]:
+def rig_state(service: Service) -> RigShown:
     """What the tiles say beside the live pictures: the driver's state, the last shot's sync, the calibration."""
     rig = service.rig.describe()
     last = next(service.store.captures(), None)
-    shot = (last or {}).get("shot") or {}
-    sync = sync_of(shot)
+    sync = {} if last is None or last.shot is None else sync_of(last.shot)
     moved = moved_cameras(service)
-    cameras = [
-        {**camera, "sync": sync.get(camera["name"]), "moved": camera["name"] in moved} for camera in rig["cameras"]
+    cameras: list[Tile] = [
+        {
+            "name": camera.name,
+            "driver": camera.driver,
+            "state": camera.state,
+            "sync": sync.get(camera.name),
+            "moved": camera.name in moved,
+        }
+        for camera in rig.cameras
     ]
     return {
-        "kind": rig["kind"],
-        "ready": rig["ready"],
+        "kind": rig.kind,
+        "ready": rig.ready,
         "cameras": cameras,
-        "faults": rig["faults"] + [fault for fault in [live_view(service).fault] if fault],
-        "calibration": rig["calibration"],
+        "faults": [*rig.faults, *(fault for fault in [live_view(service).fault] if fault)],
+        "calibration": rig.calibration,
         "in_use": calibration_in_use(service),
         "sessions": sessions_list(service),
-        "last": None if last is None else {"id": last["id"], "created": last["created"], "source": last["source"]},
+        "last": None if last is None else {"id": last.id, "created": last.created, "source": last.source},
     }
 
 
-def sync_of(shot: dict[str, Any]) -> dict[str, Any]:
+def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
     """Status and skew of each camera in a capture's certificate, of a real rig or of the simulated studio."""
-    return shot.get("sync", shot).get("cameras", {})
+    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
+    return certificate.get("cameras", {})
 
 
-def calibration_in_use(service: Service) -> dict[str, Any] | None:
+def calibration_in_use(service: Service) -> InUse | None:
     """Label, time and residual of the calibration that every capture gets; None for the rig's own."""
     if service.calibrations.in_use() is None:
         return None
-    for found in shared.get("calibrations", 2.0, service.calibrations.find):
-        if found["in_use"]:
-            return {"label": found["label"], "created": found["created"], "rms_px": found["figures"].get("rms_px")}
+    known: list[Calibration] = shared.get("calibrations", 2.0, service.calibrations.find)
+    for found in known:
+        if found.in_use:
+            return {
+                "label": found.label,
+                "created": found.created,
+                "rms_px": cast(float | None, found.figures.get("rms_px")),
+            }
     return None
 
 
@@ -60,31 +112,33 @@ def moved_cameras(service: Service) -> set[str]:
     done = service.jobs.find(state="succeeded", limit=1)
     if not done:
         return set()
-    report = read_report(service, done[0]["id"])
+    report = read_report(service, done[0].id)
+    if report is None:
+        return set()
     told = " ".join(w["message"] for w in report.get("warnings", []) if "moved" in w["code"])
     return {name for name in report.get("cameras", {}) if name in told}
 
 
-def read_report(service: Service, job_id: str) -> dict[str, Any]:
-    """report.json of a finished job; empty where it has none. Results do not change, so that it is read once."""
+def read_report(service: Service, job_id: str) -> Report | None:
+    """report.json of a finished job; None where it has none. Results do not change, so that it is read once."""
     path = service.store.folder("jobs", job_id) / "result" / "report.json"
 
-    def read() -> dict[str, Any]:
-        return json.loads(path.read_text()) if path.is_file() else {}
+    def read() -> Report | None:
+        return cast(Report, json.loads(path.read_text())) if path.is_file() else None
 
     return shared.get(("report", job_id), 3600.0, read)
 
 
-def capture(page: Page, event: dict[str, Any]) -> str:
+def capture(page: Page, event: Mapping[str, str | None]) -> str:
     record = page.service.captures.take(About.of(event))
-    return f"Captured {len(record['cameras'])} pictures. They are on the page Captures."
+    return f"Captured {len(record.cameras)} pictures. They are on the page Captures."
 
 
-def plates(page: Page, event: dict[str, Any]) -> str:
+def plates(page: Page, event: object) -> str:
     page.service.store.reserve(0, page.service.settings.free_bytes)
     taken = page.service.rig.take_background()
-    note = f" Note: {taken['note']}." if taken["note"] else ""
-    return f"{taken['plates']} clean plates of {len(taken['cameras'])} cameras.{note}"
+    note = f" Note: {taken.note}." if taken.note else ""
+    return f"{taken.plates} clean plates of {len(taken.cameras)} cameras.{note}"
 
 
 RigPage.actions = {"capture": Action("capture", capture), "plates": Action("capture", plates)}

@@ -1,7 +1,7 @@
 """Calibrations: from an archive of board pictures or from shots that the rig took; looked at, fetched, removed."""
 
 import json
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -12,7 +12,7 @@ from server.http.auth import ServiceOf, require
 from server.http.schemas import CalibrationList, CalibrationOut, NewCalibration
 from server.services.keys import Caller
 from server.wire.multipart import check_length, described_form, receive_board_pictures
-from server.wire.problems import Problem, documented
+from server.wire.problems import Problem, Responses, documented
 from server.wire.send_file import send_file
 
 router = APIRouter(prefix="/v1/calibrations", tags=["calibrations"])
@@ -33,14 +33,14 @@ async def make_calibration(service: ServiceOf, caller: Taker, request: Request, 
         made = await service.threads.check(service.calibrations.add_shots, wanted.board, wanted.captures, wanted.label)
     else:
         made = await receive_board_pictures(service, request)
-    response.headers["Location"] = f"/v1/calibrations/{made['id']}"
+    response.headers["Location"] = f"/v1/calibrations/{made.id}"
     return CalibrationOut.model_validate(made)
 
 
 @router.get("", responses=documented())
 def list_calibrations(service: ServiceOf, caller: Reader) -> CalibrationList:
     """Newest first."""
-    return CalibrationList.model_validate({"calibrations": service.calibrations.find()})
+    return CalibrationList(calibrations=[CalibrationOut.model_validate(found) for found in service.calibrations.find()])
 
 
 @router.get("/{calibration_id}", responses=documented(404))
@@ -48,7 +48,7 @@ def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> 
     return CalibrationOut.model_validate(service.calibrations.get(calibration_id))
 
 
-FILE: dict[int | str, dict[str, Any]] = {
+FILE: Responses = {
     200: {"content": {"application/json": {}}},
     206: {"description": "Partial Content"},
     304: {"description": "Not Modified"},

@@ -2,7 +2,7 @@
 
 import json
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse
@@ -13,8 +13,9 @@ from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, Ne
 from server.services.captures import About
 from server.services.jobs import Work
 from server.services.keys import Caller
+from server.storage.records import CaptureRecord
 from server.wire.multipart import ARCHIVE, described_form, receive_capture
-from server.wire.problems import documented
+from server.wire.problems import Responses, documented
 from server.wire.send_file import send_file
 
 router = APIRouter(prefix="/v1", tags=["captures"])
@@ -55,7 +56,7 @@ def list_captures(
 ) -> CaptureList:
     """Newest first."""
     found = service.captures.find(session=session, limit=limit, before=before)
-    return CaptureList.model_validate({"captures": found})
+    return CaptureList(captures=[CaptureOut.model_validate(record) for record in found])
 
 
 @router.get("/captures/{capture_id}", responses=documented(404))
@@ -70,7 +71,7 @@ def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: Cap
     return CaptureOut.model_validate(changed)
 
 
-IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
+IMAGE_RESPONSES: Responses = {
     200: {"content": {f"image/{kind}": {} for kind in ("png", "jpeg", "tiff", "webp")}},
     206: {
         "description": "Partial Content",
@@ -97,7 +98,7 @@ def get_background(service: ServiceOf, caller: Reader, request: Request, capture
 @router.put("/captures/{capture_id}/features", responses=documented(400, 404, 409, 413, 415, 507))
 def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: NewFeatures) -> CaptureOut:
     """Stores feature points; 422 names every point that the capture cannot have. Jobs made from now on use them."""
-    return CaptureOut.model_validate(service.captures.put_features(capture_id, features.model_dump()))
+    return CaptureOut.model_validate(service.captures.put_features(capture_id, features.points))
 
 
 @router.get("/captures/{capture_id}/features", responses=documented(404))
@@ -129,18 +130,18 @@ async def reconstruct_upload(
     try:
         wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")))
         key = request.headers.get("idempotency-key")
-        submit = partial(service.jobs.submit, record["id"], wanted, key=caller.key, idempotency_key=key)
+        submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=key)
         job = await service.threads.disk(submit)
     except BaseException:
-        service.store.remove_capture(record["id"])
+        service.store.remove_capture(record.id)
         raise
-    if job["capture_id"] != record["id"]:  # the key's first call made the job; this upload is not needed
-        service.store.remove_capture(record["id"])
-    response.headers["Location"] = f"/v1/jobs/{job['id']}"
+    if job.capture_id != record.id:  # the key's first call made the job; this upload is not needed
+        service.store.remove_capture(record.id)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
     return JobOut.model_validate(job)
 
 
-def _settings_of(text: str | None) -> dict[str, Any] | None:
+def _settings_of(text: str | None) -> dict[str, object] | None:
     if not text:
         return None
     try:
@@ -152,6 +153,6 @@ def _settings_of(text: str | None) -> dict[str, Any] | None:
     return document
 
 
-def _created(record: dict[str, Any], response: Response) -> CaptureOut:
-    response.headers["Location"] = f"/v1/captures/{record['id']}"
+def _created(record: CaptureRecord, response: Response) -> CaptureOut:
+    response.headers["Location"] = f"/v1/captures/{record.id}"
     return CaptureOut.model_validate(record)

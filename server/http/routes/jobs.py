@@ -1,7 +1,8 @@
 """Jobs: submitted, watched, cancelled, restarted; and the files that they made."""
 
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from dataclasses import asdict
+from typing import Annotated
 from urllib.parse import quote
 
 import anyio
@@ -13,7 +14,8 @@ from server.http.auth import ServiceOf, require
 from server.http.schemas import JobList, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.jobs import FINISHED, Work
 from server.services.keys import Caller
-from server.wire.problems import documented
+from server.services.records import Job
+from server.wire.problems import Responses, documented
 from server.wire.send_file import media_type, send_archive, send_file
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
@@ -43,7 +45,7 @@ def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wante
     """Queues a reconstruction of every capture of a session."""
     work = Work(wanted.model, wanted.settings)
     jobs = service.jobs.submit_session(session_id, work, key=caller.key, priority=wanted.priority)
-    return JobList.model_validate({"jobs": jobs})
+    return JobList(jobs=[JobOut.model_validate(job) for job in jobs])
 
 
 @router.get("/jobs", responses=documented(400))
@@ -58,7 +60,7 @@ def list_jobs(
 ) -> JobList:
     """Newest first."""
     jobs = service.jobs.find(state=state, capture=capture, session=session, limit=limit, offset=offset)
-    return JobList.model_validate({"jobs": jobs})
+    return JobList(jobs=[JobOut.model_validate(job) for job in jobs])
 
 
 @router.get("/jobs/{job_id}", responses=documented(404))
@@ -89,7 +91,8 @@ async def job_events(
             seq = event.seq
             yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
         if state in FINISHED:
-            yield ServerSentEvent(event="end", id=str(seq), data=await service.threads.disk(service.jobs.get, job))
+            ended = await service.threads.disk(service.jobs.get, job)
+            yield ServerSentEvent(event="end", id=str(seq), data=asdict(ended))
             return
         await anyio.sleep(service.settings.poll_s)
 
@@ -115,7 +118,7 @@ def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
     service.jobs.delete(job_id)
 
 
-ARCHIVE: dict[int | str, dict[str, Any]] = {
+ARCHIVE: Responses = {
     200: {"content": {"application/zip": {}}},
     304: {"description": "Not Modified"},
     **documented(404, 409),
@@ -155,6 +158,6 @@ def get_result(service: ServiceOf, caller: Reader, request: Request, job_id: str
     return send_file(request, service.jobs.result_file(job_id, name))
 
 
-def _accepted(job: dict[str, Any], response: Response) -> JobOut:
-    response.headers["Location"] = f"/v1/jobs/{job['id']}"
+def _accepted(job: Job, response: Response) -> JobOut:
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
     return JobOut.model_validate(job)

@@ -17,6 +17,7 @@ from server.http.schemas import (
     NewWebhookOut,
     Ready,
     WebhookList,
+    WebhookOut,
 )
 from server.metrics import MEDIA_TYPE
 from server.services.health import exposition, readiness
@@ -93,7 +94,7 @@ def add_webhook(service: ServiceOf, caller: Admin, wanted: NewWebhook) -> NewWeb
 
 @router.get("/v1/webhooks", tags=["webhooks"], responses=documented())
 def list_webhooks(service: ServiceOf, caller: Admin) -> WebhookList:
-    return WebhookList.model_validate({"webhooks": service.webhooks.all()})
+    return WebhookList(webhooks=[WebhookOut.model_validate(hook) for hook in service.webhooks.all()])
 
 
 @router.delete("/v1/webhooks/{webhook_id}", status_code=204, tags=["webhooks"], responses=documented(404))

@@ -17,14 +17,14 @@ Taker = Annotated[Caller, Depends(require("capture"))]
 @router.post("/sessions", status_code=201, responses=documented(400, 413, 415, 507))
 def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response: Response) -> SessionOut:
     made = service.sessions.add(wanted.label, wanted.consent)
-    response.headers["Location"] = f"/v1/sessions/{made['id']}"
+    response.headers["Location"] = f"/v1/sessions/{made.id}"
     return SessionOut.model_validate(made)
 
 
 @router.get("/sessions", responses=documented())
 def list_sessions(service: ServiceOf, caller: Reader) -> SessionList:
     """Newest first."""
-    return SessionList.model_validate({"sessions": service.sessions.find()})
+    return SessionList(sessions=[SessionOut.model_validate(found) for found in service.sessions.find()])
 
 
 @router.get("/sessions/{session_id}", responses=documented(404))
@@ -35,8 +35,8 @@ def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionO
 @router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
     """Another label or consent note."""
-    given = {name: text for name, text in wanted.model_dump(exclude_unset=True).items() if text is not None}
-    return SessionOut.model_validate(service.sessions.edit(session_id, given))
+    changed = service.sessions.edit(session_id, label=wanted.label, consent=wanted.consent)
+    return SessionOut.model_validate(changed)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))

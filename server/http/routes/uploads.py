@@ -6,8 +6,9 @@ The PATCH that brings the last byte answers with the capture's ``Location``, or 
 import base64
 import binascii
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from email.utils import formatdate
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Request, Response
 
@@ -18,6 +19,7 @@ from server.http.tus import append
 from server.services.captures import About
 from server.services.keys import Caller
 from server.services.service import Service
+from server.storage.records import UploadRecord
 from server.wire.problems import Problem, documented
 
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
@@ -56,7 +58,7 @@ def tus_create(
     if about.session is not None:
         service.store.session(about.session)
     record = service.uploads.create(int(upload_length), fields, caller.key)
-    return Response(status_code=201, headers=COMMON | {"Location": f"/v1/uploads/{record['id']}"} | _expires(record))
+    return Response(status_code=201, headers=COMMON | {"Location": f"/v1/uploads/{record.id}"} | _expires(record))
 
 
 @router.head("/{upload_id}", responses=documented(404, 412))
@@ -64,7 +66,7 @@ def tus_head(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: R
     """How many bytes are here; with the capture's ``Location`` once it was made."""
     _check_version(tus_resumable)
     record = _own(service, caller, upload_id)
-    headers = {"Upload-Offset": str(service.uploads.offset(record)), "Upload-Length": str(record["length"])}
+    headers = {"Upload-Offset": str(service.uploads.offset(record)), "Upload-Length": str(record.length)}
     return Response(status_code=200, headers=COMMON | headers | _expires(record) | _location(record))
 
 
@@ -97,14 +99,14 @@ async def tus_patch(
 
 
 async def _append(
-    service: Service, record: dict[str, Any], offset: str | None, stream: AsyncIterator[bytes], checksum: str | None
+    service: Service, record: UploadRecord, offset: str | None, stream: AsyncIterator[bytes], checksum: str | None
 ) -> Response:
     here = await service.threads.disk(service.uploads.offset, record)
     if offset != str(here):
         raise Problem(409, "wrong-offset", f"The upload stands at byte {here}; ask with HEAD and go on from there.")
-    if record["capture"] is None:
+    if record.capture is None:
         here = await append(service.uploads, record, stream, checksum, service.threads)
-    if here == record["length"] and record["capture"] is None:
+    if here == record.length and record.capture is None:
         record = await service.threads.check(_finish, service, record)
     headers = {"Upload-Offset": str(here)}
     return Response(status_code=204, headers=COMMON | headers | _expires(record) | _location(record))
@@ -119,26 +121,26 @@ def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable:
     return Response(status_code=204, headers=COMMON)
 
 
-def _finish(service: Service, record: dict[str, Any]) -> dict[str, Any]:
+def _finish(service: Service, record: UploadRecord) -> UploadRecord:
     """Makes the capture; an archive that cannot be used is let go with its upload."""
     try:
         with service.store.incoming() as folder:
             data = service.uploads.data(record)
-            capture = service.captures.accept(data, folder, About.of(record["fields"]))
+            capture = service.captures.accept(data, folder, About.of(record.fields))
     except (Unavailable, DiskFull):  # these may go well another time
         raise
     except (InputError, Refused):
-        service.uploads.remove(record["id"])
+        service.uploads.remove(record.id)
         raise
-    record = record | {"capture": capture["id"]}
+    record = replace(record, capture=capture.id)
     service.uploads.save(record)
     service.uploads.data(record).unlink(missing_ok=True)
     return record
 
 
-def _own(service: Service, caller: Caller, upload_id: str) -> dict[str, Any]:
+def _own(service: Service, caller: Caller, upload_id: str) -> UploadRecord:
     record = service.uploads.get(upload_id)
-    if record["key"] != caller.key and not caller.may("admin"):
+    if record.key != caller.key and not caller.may("admin"):
         raise NotFound("upload", upload_id)
     return record
 
@@ -164,9 +166,9 @@ def _metadata(text: str | None) -> dict[str, str]:
     return fields
 
 
-def _expires(record: dict[str, Any]) -> dict[str, str]:
-    return {"Upload-Expires": formatdate(record["expires"], usegmt=True)}
+def _expires(record: UploadRecord) -> dict[str, str]:
+    return {"Upload-Expires": formatdate(record.expires, usegmt=True)}
 
 
-def _location(record: dict[str, Any]) -> dict[str, str]:
-    return {} if record["capture"] is None else {"Location": f"/v1/captures/{record['capture']}"}
+def _location(record: UploadRecord) -> dict[str, str]:
+    return {} if record.capture is None else {"Location": f"/v1/captures/{record.capture}"}

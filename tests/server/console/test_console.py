@@ -21,7 +21,9 @@ from rig.rig import Rig
 from server.console import comparison, coverage, guides
 from server.console.identity import cookie_secret, is_foreign, is_rebound
 from server.console.live import message_of
-from server.console.pages.jobs import chosen_settings, log_lines
+from server.console.live_frame import LiveFrame
+from server.console.mount import path_below
+from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
 from server.errors import Conflict, Forbidden, NotFound, Unknown
 from server.services.keys import Keys
@@ -73,6 +75,20 @@ def test_behind_a_proxy_the_public_address_is_our_own() -> None:
     assert not is_foreign(scope("127.0.0.1:8600", "https://heads.example:8443"), settings)  # the proxy names itself
     assert is_rebound(scope("evil.example"), settings)
     assert is_foreign(scope("heads.example:8443", "https://evil.example"), settings)
+
+
+@pytest.mark.parametrize(
+    ("path", "root", "below"),
+    [
+        ("/captures", "", "/captures"),
+        ("/heads/captures", "/heads", "/captures"),
+        ("/heads", "/heads", ""),
+        ("/headsets", "/heads", "/headsets"),
+        ("/captures", "/heads", "/captures"),
+    ],
+)
+def test_a_page_is_found_below_where_the_service_is_mounted(path: str, root: str, below: str) -> None:
+    assert path_below({"type": "http", "path": path, "root_path": root}) == below
 
 
 def test_the_cookie_secret_stays_and_is_the_owners_alone(tmp_path: Path) -> None:
@@ -230,7 +246,7 @@ def test_a_jobs_log_has_one_line_a_stage() -> None:
 
 
 def test_the_restart_form_becomes_settings() -> None:
-    event = {"method": "simplex", "detail": "", "front": "cam03", "more": '{"fitting": {"modes": 80}}'}
+    event: SettingsForm = {"method": "simplex", "detail": "", "front": "cam03", "more": '{"fitting": {"modes": 80}}'}
     assert chosen_settings(event) == {"method": "simplex", "front": "cam03", "fitting": {"modes": 80}}
     assert chosen_settings({}) == {}
     for wrong in ("{", "[1]"):
@@ -239,7 +255,10 @@ def test_the_restart_form_becomes_settings() -> None:
 
 
 def test_a_look_on_the_wire_holds_every_picture() -> None:
-    frames = [{"name": "a", "jpeg": b"abc", "mean": 1.0}, {"name": "b", "jpeg": None, "fault": "unplugged"}]
+    frames: list[LiveFrame] = [
+        {"name": "a", "jpeg": b"abc", "mean": 1.0},
+        {"name": "b", "jpeg": None, "fault": "unplugged"},
+    ]
     message = message_of(frames, "")
     header, body = struct.unpack(">II", message[:8])
     told = json.loads(message[8 : 8 + header])

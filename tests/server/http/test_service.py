@@ -269,6 +269,7 @@ def test_a_failed_job_says_why_and_the_next_one_works(
     with pytest.raises(JobEnded) as caught:
         client.wait(client.submit(capture, settings={"front": mode})["id"])
     error = caught.value.job["error"]
+    assert error is not None
     assert error["type"].endswith(kind)
     assert word in error["detail"]
     assert client.wait(client.submit(capture)["id"])["state"] == "succeeded"

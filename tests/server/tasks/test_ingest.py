@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from rig.errors import InputError
+from server.storage.records import CaptureContent
 from server.tasks.ingest import check_capture
 from tests.server.http.test_hostile import SPOILT
 from tests.support.services import small_capture
@@ -12,7 +13,7 @@ from tests.support.services import small_capture
 PIXELS_MOST = 100_000_000
 
 
-def checked(folder: Path) -> dict:
+def checked(folder: Path) -> CaptureContent:
     return check_capture(folder, PIXELS_MOST, lambda stage, share: None)
 
 
@@ -40,4 +41,4 @@ def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "capture")
     path = folder / "cameras.json"
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert [camera["name"] for camera in checked(folder)["cameras"]] == ["cam00", "cam01", "cam02"]
+    assert [camera.name for camera in checked(folder).cameras] == ["cam00", "cam01", "cam02"]

@@ -138,4 +138,5 @@ def test_info_has_the_keys_of_the_contract() -> None:
     assert info["faces"] > info["vertices"]
     assert info["licence"].startswith("CC0")
     assert len(info["sha256"]) == 64
+    assert info["generalisation_mm"] is not None
     assert 0.5 < info["generalisation_mm"] < 2.0

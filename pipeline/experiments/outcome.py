@@ -1,0 +1,20 @@
+"""What an experiment gives."""
+
+from typing import Any, NotRequired, TypedDict
+
+import numpy as np
+
+Row = dict[str, Any]  # of one subject: each experiment has its own quantities
+
+
+class Outcome(TypedDict):
+    """``figures`` is flat: every number that README and docs quote. ``markdown`` and ``pictures`` go to files, the
+    rest is printed."""
+
+    figures: dict[str, float]
+    rows: list[Row] | dict[str, list[Row]]
+    markdown: NotRequired[str]
+    pictures: NotRequired[dict[str, np.ndarray]]
+    machine: NotRequired[str]
+    planned_directions_deg: NotRequired[list[tuple[int, int]]]
+    wrong: NotRequired[list[int]]

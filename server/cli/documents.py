@@ -1,0 +1,57 @@
+"""Documents of the service as the command line's client gets them."""
+
+from typing import NotRequired, TypedDict
+
+
+class SizeDocument(TypedDict):
+    name: str
+    width: int
+    height: int
+
+
+class CaptureDocument(TypedDict):
+    id: str
+    created: str
+    source: str
+    session: str | None
+    label: str
+    expression: str
+    cameras: list[SizeDocument]
+    front: str
+    features: bool
+    board: bool
+    bytes: int
+    inputs: dict[str, str]
+    shot: dict[str, object] | None
+
+
+class ErrorDocument(TypedDict):
+    type: str
+    detail: str
+    errors: list[str]
+
+
+class FileDocument(TypedDict):
+    bytes: int
+    sha256: str
+
+
+class JobDocument(TypedDict):
+    id: str
+    state: str
+    stage: str
+    progress: float
+    eta_s: float | None
+    error: ErrorDocument | None
+    notice: NotRequired[str | None]
+    capture_id: str | None
+    session: str | None
+    model: str | None
+    settings: dict[str, object]
+    restart_of: str | None
+    queue: str | None
+    priority: int
+    created: str | None
+    started: str | None
+    finished: str | None
+    files: dict[str, FileDocument]

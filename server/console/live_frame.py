@@ -1,0 +1,14 @@
+"""What the live view holds of one camera."""
+
+from typing import NotRequired, TypedDict
+
+
+class LiveFrame(TypedDict):
+    """A camera's picture (None: it shows nothing) and what was measured on it."""
+
+    name: str
+    jpeg: bytes | None
+    mean: NotRequired[float]
+    clipped: NotRequired[float]
+    blur_px: NotRequired[float | None]
+    fault: NotRequired[str]

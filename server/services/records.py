@@ -1,0 +1,109 @@
+"""What the services give to routes, pages and the command line."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from server.storage.records import FileEntry
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Why a job failed: a stable ``type``, what to do, and every fault."""
+
+    type: str
+    detail: str
+    errors: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A job at this moment. ``notice`` says why a queued one cannot begin; ``files`` are those of a result, by name."""
+
+    id: str
+    state: str
+    stage: str
+    progress: float
+    eta_s: float | None
+    error: Failure | None
+    notice: str | None
+    capture_id: str | None
+    session: str | None
+    model: str | None
+    settings: Mapping[str, object]
+    restart_of: str | None
+    queue: str | None
+    priority: int
+    created: str | None
+    started: str | None
+    finished: str | None
+    files: dict[str, FileEntry]
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One subject's session with the ids of its captures."""
+
+    id: str
+    created: str
+    label: str
+    consent: str
+    captures: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera."""
+
+    id: str
+    created: str
+    source: str
+    label: str
+    pictures: dict[str, int]
+    state: str
+    error: Failure | None = None
+    figures: Mapping[str, object] = field(default_factory=dict)
+    checks: tuple[Mapping[str, object], ...] = ()
+    warnings: tuple[str, ...] = ()
+    front: str | None = None
+    in_use: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RigCamera:
+    name: str
+    driver: str
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class RigState:
+    """The rig at this moment; ``calibration`` is whose it is: "own", "studio", or None where there is none."""
+
+    id: str
+    kind: str
+    ready: bool
+    cameras: tuple[RigCamera, ...]
+    faults: tuple[str, ...]
+    calibration: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class CleanPlates:
+    """The cameras of which clean plates were taken, and how many of each."""
+
+    cameras: tuple[str, ...]
+    plates: int
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Webhook:
+    id: str
+    url: str
+
+
+@dataclass(frozen=True, slots=True)
+class NewWebhook(Webhook):
+    """``secret`` signs the messages."""
+
+    secret: str

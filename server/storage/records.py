@@ -1,0 +1,152 @@
+"""Records of the data folder and the job database, and the one name for JSON whose shape nobody here decides.
+
+What lies on disk is read once, where it comes in, into a frozen record; a record that lacks a field is damaged. The
+job engine keeps the requests and results of jobs as they are, across upgrades of this program: those stay mappings.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Generic, NotRequired, TypedDict, TypeVar
+
+from pydantic import TypeAdapter
+
+JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSize:
+    """A camera of a capture and the size of its pictures."""
+
+    name: str
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureContent:
+    """What is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the calibration
+    board, which show no head."""
+
+    cameras: tuple[CameraSize, ...]
+    front: str
+    inputs: dict[str, str]
+    bytes: int
+    board: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureRecord:
+    """A capture: where it came from, what people say of it, what is in it, and the certificate of the rig's shot."""
+
+    id: str
+    created: str
+    source: str
+    session: str | None
+    label: str
+    expression: str
+    cameras: tuple[CameraSize, ...]
+    front: str
+    inputs: dict[str, str]
+    bytes: int
+    features: bool
+    shot: Mapping[str, object] | None = None
+    board: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRecord:
+    id: str
+    created: str
+    label: str
+    consent: str
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationRecord:
+    """``pictures``: their number by camera."""
+
+    id: str
+    created: str
+    source: str
+    label: str
+    pictures: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class UploadRecord:
+    """A resumable upload: ``fields`` say of the capture what a form would, ``capture`` is its id once it was made."""
+
+    id: str
+    length: int
+    fields: dict[str, str]
+    key: str
+    expires: float
+    capture: str | None
+
+
+class RecordFormat(Generic[T]):
+    """How records of one kind are written: an object that names its format."""
+
+    def __init__(self, kind: type[T], name: str) -> None:
+        self._adapter, self.name = TypeAdapter(kind), name
+
+    def document(self, record: T) -> dict[str, object]:
+        return {"format": self.name, **asdict(record)}  # pyright: ignore[reportArgumentType]
+
+    def read(self, document: object) -> T:
+        """Raises ValueError for what is no such record."""
+        if not isinstance(document, dict) or document.get("format") != self.name:
+            raise ValueError(f"no {self.name}")
+        return self._adapter.validate_python(document)
+
+
+CAPTURE = RecordFormat(CaptureRecord, "eigenhead-capture/1")
+SESSION = RecordFormat(SessionRecord, "eigenhead-session/1")
+CALIBRATION = RecordFormat(CalibrationRecord, "eigenhead-calibration/1")
+UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
+
+
+class JobRequest(TypedDict):
+    """What a job is asked for, as the job engine keeps it."""
+
+    capture_id: str
+    model: str | None
+    settings: Mapping[str, object]
+    restart_of: NotRequired[str]
+
+
+class FileEntry(TypedDict):
+    """A file of a result, as the job engine keeps it."""
+
+    bytes: int
+    sha256: str
+
+
+class CalibrationOutcome(TypedDict):
+    """What a calibration found, as the job engine keeps it; ``sha256`` is of its cameras.json."""
+
+    figures: Mapping[str, object]
+    checks: list[Mapping[str, object]]
+    warnings: list[str]
+    front: str | None
+    sha256: str
+
+
+class WebhookMessage(TypedDict):
+    """One delivery, as the job engine keeps it."""
+
+    webhook: str
+    type: str
+    job_id: str
+    id: str
+
+
+class EventDocument(TypedDict, total=False):
+    """What happened to a job: a stage with its progress (0 to 1) and remaining time, or a new state."""
+
+    state: str
+    stage: str
+    progress: float
+    eta_s: float | None
+    camera_moved: list[str]
