@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.eigenheads.data_folder import models_folder
-from pipeline.eigenheads.model import HeadModel, assemble, load_model, model_path
+from pipeline.eigenheads.model import HeadModel, assemble, load_model
+from pipeline.eigenheads.model_names import model_path
 from pipeline.eigenheads.sources.imports import import_model
 from pipeline.experiments import markdown
 from rig.atomic_write import write_atomically

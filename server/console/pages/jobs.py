@@ -6,7 +6,7 @@ from typing import Any
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from pipeline.eigenheads.model import list_models
+from pipeline.eigenheads.model_names import list_models
 from rig.errors import InputError
 from server.console.page import Action, Page, remove_later, shared, show
 from server.console.pages.rig import read_report
