@@ -33,6 +33,7 @@ def kept(folder: Path) -> set[str]:
     return {path.name.partition("-")[0] for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_compiled_once_and_counted_aloud(folder: Path) -> None:
     told: list[tuple[str, float]] = []
     assert prepare_kernels(lambda stage, share: told.append((stage, share))) == (2, 2)
@@ -45,6 +46,7 @@ def test_what_is_missing_is_compiled_once_and_counted_aloud(folder: Path) -> Non
     assert prepare_kernels(lambda stage, share: None) == (1, 2)
 
 
+@pytest.mark.slow
 def test_two_at_once_and_one_that_is_stopped_do_no_harm(folder: Path) -> None:
     def stop(stage: str, share: float) -> None:
         if share:
