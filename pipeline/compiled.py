@@ -78,7 +78,7 @@ class KeptFunction:
         """Where the function compiled for these argument types is or would be."""
         if not self._digest:  # late: a function may call one that its module defines further down
             self._digest = function_digest(self._dispatcher)
-        told = f"{self._digest} {signature!r} {_machine()}"
+        told = f"{self._digest} {signature!r} {machine()}"
         function = self._dispatcher.py_func
         name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(told.encode()).hexdigest()}"
@@ -126,7 +126,7 @@ def say_not_kept(what: str, error: OSError) -> None:
 
 
 @cache
-def _machine() -> str:
+def machine() -> str:
     """What a compiled function follows from besides its source: versions and the processor's features."""
     options: Any = config
     target: Any = cpu_target.target_context
@@ -141,6 +141,11 @@ def function_digest(dispatcher: Dispatcher) -> str:
         digest.update(part)
         digest.update(b"\0")
     return digest.hexdigest()
+
+
+def code_size(dispatcher: Dispatcher) -> int:
+    """Bytes of all that the compiled function follows from: twice as many take about twice as long."""
+    return sum(map(len, _function_parts(dispatcher, set())))
 
 
 def _function_parts(dispatcher: Dispatcher, seen: set[int]) -> Iterator[bytes]:

@@ -28,6 +28,7 @@ from pipeline.fitting.posterior import vertex_deviation_mm, with_estimated_prior
 from pipeline.fitting.simplex.hierarchy import fit_simplex
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.kept_arrays import kept_arrays
 from pipeline.multiview.camera_drift import find_drift
 from pipeline.results.bust import Bust, make_bust
 from pipeline.results.camera_metrics import camera_figures, start_masks
@@ -43,7 +44,7 @@ from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
@@ -232,7 +233,16 @@ def basis(model: HeadModel, settings: Settings) -> HeadModel:
 
 @lru_cache(maxsize=2)  # models are few, jobs are many, and others keep what they make of the same model
 def _basis(model: HeadModel, modes: int, *, kernel: bool) -> HeadModel:
-    return with_kernel(model, modes) if kernel else with_modes(model, modes)
+    if not kernel:
+        return with_modes(model, modes)
+    given = (model.mean, model.modes[:modes], model.sigma[:modes], model.levels["cage"].faces)
+
+    def make() -> dict[str, np.ndarray]:
+        wider = with_kernel(model, modes)
+        return {"modes": wider.modes, "sigma": wider.sigma}
+
+    kept = kept_arrays("kernel-modes", given, make, made_by=(with_kernel, vertex_normals, HeadModel))
+    return replace(with_modes(model, modes), modes=kept["modes"], sigma=kept["sigma"], _bases={})
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:

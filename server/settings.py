@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import sqlalchemy as sa
 from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
@@ -111,6 +110,8 @@ class ServiceSettings(BaseSettings):
         """Where keys and jobs are kept, as a person may read it: the data folder, or the database without password."""
         if self.database_url is None:
             return str(self.data.resolve())
+        import sqlalchemy as sa  # half a second that a service on SQLite, and `eigenhead doctor`, need not wait
+
         return sa.make_url(self.url).render_as_string(hide_password=True).partition("?")[0]
 
     def environment(self) -> dict[str, str]:

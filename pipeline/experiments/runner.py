@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.eigenheads.data_folder import models_folder
-from pipeline.eigenheads.model import HeadModel, assemble, load_model, model_path
+from pipeline.eigenheads.model import HeadModel, assemble, load_model
+from pipeline.eigenheads.model_names import model_path
 from pipeline.eigenheads.sources.imports import import_model
 from pipeline.experiments import detail, markdown, span, tables
 from pipeline.experiments.alignment import alignment

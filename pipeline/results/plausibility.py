@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from pipeline.diagnostics import ReportWarning
 from pipeline.fitting.fit import Fit
@@ -62,7 +62,7 @@ def _shape(coefficients: Float[np.ndarray, " m"]) -> list[ReportWarning]:
         return []
     largest = float(np.abs(coefficients).max())
     total = float(coefficients @ coefficients)
-    if largest <= COEFFICIENT_MOST and float(chi2.sf(total, len(coefficients))) >= CHANCE_LEAST:
+    if largest <= COEFFICIENT_MOST and float(chdtrc(len(coefficients), total)) >= CHANCE_LEAST:
         return []
     told = (
         f"the head is farther from the model's mean than heads are: {largest:.1f} standard deviations in one mode, "

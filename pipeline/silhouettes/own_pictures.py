@@ -13,7 +13,6 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
-from scipy.optimize import linear_sum_assignment
 
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
@@ -99,6 +98,8 @@ def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
     share = np.array([[_common_share(pictures[name], plates[other]) for other in asked] for name in asked])
     if len(asked) < 2:
         return {}
+    from scipy.optimize import linear_sum_assignment  # loads all of scipy.optimize, and plates are rarely exchanged
+
     best = linear_sum_assignment(-share)[1]
     moved = np.flatnonzero(best != np.arange(len(asked)))
     clear = share[moved, best[moved]] > PLATE_GAIN * share[moved, moved]

@@ -22,6 +22,7 @@ from server.cli.client import Client, Unreachable
 from server.processes import python_command, python_environment
 from server.services.truth import error_mm
 from server.settings import ServiceSettings
+from server.tasks.prepare import prepare_kernels
 
 START_S = 60.0
 STRIP = 60  # height of the headings, pixels
@@ -70,6 +71,7 @@ def run_demo(out: Path, *, seed: int, compare: bool, report: Report) -> DemoDocu
         What ``demo --json`` prints.
     """
     began = time.monotonic()
+    prepare_kernels(_part(report, "", 0.0, 0.0))
     with tempfile.TemporaryDirectory(prefix="eigenhead-demo-") as scratch:
         data = Path(scratch) / "data"
         report("service", 0.0)

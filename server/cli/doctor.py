@@ -4,23 +4,32 @@ import difflib
 import os
 import shutil
 import socket
+import sqlite3
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import TypedDict
 from urllib.parse import quote
 
-import sqlalchemy as sa
-
 from pipeline.eigenheads.data_folder import MODELS, models_folder
+from pipeline.eigenheads.model_names import model_path
 from rig.errors import EigenheadError
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
-from server.storage.database import alive_workers, api_keys, workers
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_egl
 
 OTHER_VARIABLES = frozenset({MODELS, PREFIX + "DEBUG", PREFIX + "CACHE"})  # read elsewhere than in ServiceSettings
+# The tables of server.storage.database in words of the databases' own: SQLAlchemy takes longer to load than all checks.
+TABLES = {
+    "sqlite": "SELECT name FROM sqlite_master WHERE name = 'eigenhead_workers'",
+    "postgresql": "SELECT tablename FROM pg_tables WHERE tablename = 'eigenhead_workers'",
+}
+NOW = {
+    "sqlite": "((julianday('now') - 2440587.5) * 86400.0)",
+    "postgresql": "extract(epoch from clock_timestamp())",
+}
 MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
@@ -70,10 +79,10 @@ def _egl(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _model(settings: ServiceSettings) -> tuple[bool, str]:
-    from pipeline.eigenheads.model import load_model
+    from pipeline.eigenheads.model_file import read_parts
 
-    model = load_model()
-    return True, f"{model.name}, {len(model.modes)} modes, sha256 {model.sha256[:12]}"
+    parts, sha256 = read_parts(model_path("default"))
+    return True, f"{parts.name}, {len(parts.modes)} modes, sha256 {sha256[:12]}"
 
 
 def _cores(settings: ServiceSettings) -> tuple[bool, str]:
@@ -108,27 +117,35 @@ def _models(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _database(settings: ServiceSettings) -> tuple[bool, str]:
     """Reads it where there is one."""
-    url = sa.make_url(settings.url)
-    kind = url.get_backend_name()
-    if kind == "sqlite":
-        path = Path(str(url.database))
+    scheme, _, rest = settings.url.partition("://")
+    connection: Any
+    if scheme == "sqlite":
+        path = Path(rest.removeprefix("/"))
         if not path.is_file():
             return True, f"{path}, `eigenhead serve` will make it; no API key"
-        closed = not path.with_name(path.name + "-wal").exists()  # then a reader need not make one
-        url = sa.make_url(f"sqlite:///file:{quote(str(path))}?mode=ro&immutable={int(closed)}&uri=true")
-    engine = sa.create_engine(url, connect_args={"timeout" if kind == "sqlite" else "connect_timeout": 10})
-    try:
-        with engine.connect() as connection:
-            if kind == "sqlite" and connection.scalar(sa.text("PRAGMA quick_check(1)")) != "ok":
-                return False, f"{settings.place} is damaged: stop the service, keep the file, and restore a copy of it"
-            if not sa.inspect(connection).has_table(workers.name):
-                return True, f"{settings.place}, empty: `eigenhead serve` will make its tables"
-            alive = alive_workers(connection, settings.silent_s)
-            count = connection.scalar(sa.select(sa.func.count()).where(alive))
-            keys = connection.scalar(sa.select(sa.func.count()).select_from(api_keys))
-    finally:
-        engine.dispose()
+        connection = _read_only(path)
+    else:
+        import psycopg
+
+        connection = psycopg.connect(f"postgresql://{rest}", connect_timeout=10)
+    with closing(connection):
+        ask = connection.cursor()
+        if scheme == "sqlite" and ask.execute("PRAGMA quick_check(1)").fetchone() != ("ok",):
+            return False, f"{settings.place} is damaged: stop the service, keep the file, and restore a copy of it"
+        kind = "sqlite" if scheme == "sqlite" else "postgresql"
+        if not ask.execute(TABLES[kind]).fetchone():
+            return True, f"{settings.place}, empty: `eigenhead serve` will make its tables"
+        alive = (
+            f"SELECT count(*) FROM eigenhead_workers WHERE stopped IS NULL AND seen > {NOW[kind]} - {settings.silent_s}"
+        )
+        ((count,),) = ask.execute(alive).fetchall()
+        ((keys,),) = ask.execute("SELECT count(*) FROM eigenhead_api_keys").fetchall()
     return True, f"{settings.place}, {count} workers alive, {keys} API keys"
+
+
+def _read_only(path: Path) -> sqlite3.Connection:
+    closed = not path.with_name(path.name + "-wal").exists()  # then a reader need not make one
+    return sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable={int(closed)}", uri=True, timeout=10)
 
 
 def _variables(settings: ServiceSettings) -> tuple[bool, str]:

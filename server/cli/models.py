@@ -13,7 +13,7 @@ model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_m
 @model_app.command("list", epilog="Example: eigenhead model list")
 def model_list(data: Data = None, json_out: Json = False) -> None:
     """List the head models at hand."""
-    from pipeline.eigenheads.model import list_models
+    from pipeline.eigenheads.model_names import list_models
 
     found = {name: str(path) for name, path in list_models().items()}
     answer({"models": found}, json_out, [f"{name}  {path}" for name, path in found.items()])
@@ -42,7 +42,7 @@ def model_import(
 ) -> None:
     """Make a foreign head model one of ours."""
     from pipeline.eigenheads.data_folder import models_folder
-    from pipeline.eigenheads.model import save_model
+    from pipeline.eigenheads.model_file import save_model
     from pipeline.eigenheads.sources.imports import import_model
 
     with progress_bar() as report:

@@ -12,6 +12,7 @@ from rig.errors import InputError
 from rig.formats.archive import extract_archive
 from server.cli.answers import CannotWrite
 from server.storage.result_folder import fresh_folder
+from server.tasks.prepare import prepare_kernels
 from server.tasks.progress import Course, Expectation
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "
     from rig.formats.capture_folder import read_capture
 
     shot, rig = read_capture(folder)
+    prepare_kernels(report)
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result

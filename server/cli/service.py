@@ -1,15 +1,16 @@
-"""Commands that run the service and look after it: serve, worker, doctor, keys."""
+"""Commands that run the service and look after it: serve, worker, prepare, doctor, keys."""
 
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from time import monotonic
 from typing import Annotated, Any
 
 import typer
 
-from server.cli.answers import Data, Json, answer, service_settings
+from server.cli.answers import Data, Json, answer, progress_bar, service_settings
 
 app = typer.Typer(rich_markup_mode=None)
 keys_app = typer.Typer(help="API keys of the service.", no_args_is_help=True, rich_markup_mode=None)
@@ -47,6 +48,21 @@ def worker(
     settings = service_settings(data=data, queue=queue, concurrency=concurrency)
     set_up(settings.log_json)
     run_worker(settings, until_eof=until_eof)
+
+
+@app.command(epilog="Example: eigenhead prepare")
+def prepare(json_out: Json = False) -> None:
+    """Compile the loops of a job ahead, and keep them for every later process; the first job does it otherwise."""
+    from pipeline.compiled import cache_folder
+    from server.tasks.prepare import prepare_kernels
+
+    began = monotonic()
+    with progress_bar() as report:
+        compiled, known = prepare_kernels(report)
+    seconds = round(monotonic() - began, 3)
+    told = f"{compiled} of {known} loops compiled in {seconds:.1f} s" if compiled else f"none of {known} loops compiled"
+    document = {"compiled": compiled, "known": known, "seconds": seconds, "folder": str(cache_folder())}
+    answer(document, json_out, [f"{cache_folder()}  {told}"])
 
 
 @app.command(epilog="Example: eigenhead doctor")

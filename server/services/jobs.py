@@ -55,7 +55,7 @@ class Work:
 
     def check(self) -> None:
         """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""
-        from pipeline.eigenheads.model import list_models
+        from pipeline.eigenheads.model_names import list_models
 
         known, settings_fault = list_models(), None
         try:

@@ -5,7 +5,10 @@ from server.tasks.child import Bench, Report
 
 def try_egl(bench: Bench, report: Report) -> str:
     """The name of the GL device. Raises the renderer's own error."""
-    from rig.render.renderer import Renderer
+    from rig.render.context import GlContext  # without the renderer's NumPy: half the time
 
-    with Renderer.create() as renderer:
-        return renderer.context.description
+    context = GlContext()
+    try:
+        return context.description
+    finally:
+        context.close()

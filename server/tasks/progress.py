@@ -5,8 +5,10 @@ before, by method; the first job goes by the shares measured on two cores.
 """
 
 import time
+from typing import TYPE_CHECKING
 
-from server.storage.events import EventLog
+if TYPE_CHECKING:
+    from server.storage.events import EventLog
 
 FIRST_S = {
     method: {"read": 0.4, "segmentation": 1.2, "alignment": 0.6, "fit": fit, "texture": 1.0, "depth": 4.0, "bust": 3.0}
@@ -77,7 +79,7 @@ class Course:
 class ProgressMeter:
     """Turns the reports of a job into events: at most one in ``EVERY_S`` within a stage, with the remaining time."""
 
-    def __init__(self, log: EventLog, job_id: str, course: Course) -> None:
+    def __init__(self, log: "EventLog", job_id: str, course: Course) -> None:
         self._log, self._job_id, self._course = log, job_id, course
         self._last = ("", 0.0)
 

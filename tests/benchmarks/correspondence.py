@@ -19,7 +19,9 @@ import numpy as np
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.correspondence.correspondence import Correspondence, Matching, correspond
 from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
-from pipeline.eigenheads.model import HeadModel, assemble, load_model, model_path, read_parts
+from pipeline.eigenheads.model import HeadModel, assemble, load_model
+from pipeline.eigenheads.model_file import read_parts
+from pipeline.eigenheads.model_names import model_path
 from pipeline.eigenheads.pca import principal_components
 
 

@@ -23,7 +23,9 @@ from jaxtyping import Float
 
 from pipeline.eigenheads.correspondence.scans import Scan, write_landmarks
 from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
-from pipeline.eigenheads.model import HeadModel, load_model, model_path, read_parts
+from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.eigenheads.model_file import read_parts
+from pipeline.eigenheads.model_names import model_path
 from pipeline.eigenheads.training.build import build_model, corresponded_cages
 from pipeline.eigenheads.training.training import Training, train
 from tests.benchmarks.correspondence import without

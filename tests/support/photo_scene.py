@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 
 from pipeline.eigenheads.gaussian_process import with_kernel
-from pipeline.eigenheads.model import HeadModel, ModelParts, assemble
+from pipeline.eigenheads.model import HeadModel, assemble
+from pipeline.eigenheads.model_file import ModelParts
 from pipeline.fitting.contour import Solved
 from pipeline.fitting.problem import Stage, State, first_evidence, make_problem
 from pipeline.imaging.cpu_raster import camera_depths

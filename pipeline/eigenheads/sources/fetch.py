@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO
 
 from pipeline.eigenheads.data_folder import models_folder
-from pipeline.eigenheads.model import ModelParts, save_model
+from pipeline.eigenheads.model_file import ModelParts, save_model
 from pipeline.eigenheads.sources.imports import import_model
 from rig.errors import EigenheadError
 

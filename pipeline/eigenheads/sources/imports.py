@@ -20,7 +20,8 @@ from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.correspondence.surface_fit import fit_surface
 from pipeline.eigenheads.correspondence.warp import landmark_warp
 from pipeline.eigenheads.landmarks import MIDLINE, NAMES, mirrored
-from pipeline.eigenheads.model import HeadModel, ModelParts, load_model, read_parts, rounded
+from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.eigenheads.model_file import ModelParts, read_parts, rounded
 from pipeline.eigenheads.pca import Components, orthogonalised, rigid_fit
 from pipeline.eigenheads.subdivision import boundary_loops, close_loop, vertex_areas
 from pipeline.eigenheads.training.training import Training, above_neck, face_region, finish

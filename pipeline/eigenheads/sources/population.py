@@ -18,7 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.eigenheads.landmarks import NAMES
-from pipeline.eigenheads.model import DEFAULT, PACKS, ModelParts, load_model, save_model
+from pipeline.eigenheads.model import load_model
+from pipeline.eigenheads.model_file import ModelParts, save_model
+from pipeline.eigenheads.model_names import DEFAULT, PACKS
 from pipeline.eigenheads.sources import makehuman
 from pipeline.eigenheads.sources.makehuman import Base, HeadCut, Source
 from pipeline.eigenheads.training.training import Report, Training, train

@@ -13,7 +13,9 @@ from pipeline.eigenheads.correspondence.correspondence import Matching, correspo
 from pipeline.eigenheads.correspondence.parallel import workers
 from pipeline.eigenheads.correspondence.scan_checks import Checked, check
 from pipeline.eigenheads.correspondence.scans import Scan, find_scans, read_scan
-from pipeline.eigenheads.model import HeadModel, ModelParts, assemble, model_path, read_parts, save_model
+from pipeline.eigenheads.model import HeadModel, assemble
+from pipeline.eigenheads.model_file import ModelParts, read_parts, save_model
+from pipeline.eigenheads.model_names import model_path
 from pipeline.eigenheads.training.training import Training, train
 from rig.errors import InputError
 

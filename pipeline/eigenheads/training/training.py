@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.eigenheads.decimation import decimate
-from pipeline.eigenheads.model import ModelParts
+from pipeline.eigenheads.model_file import ModelParts
 from pipeline.eigenheads.pca import Components, align, principal_components
 from pipeline.eigenheads.subdivision import check_manifold, refine, row_count
 from pipeline.eigenheads.training import model_metrics

@@ -5,7 +5,7 @@ the head while it is fitted, so that all views of a patch are warped by the surf
 are shared by the patches that overlap, so that every image is read once per sample, whatever the size of the patches.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import scipy.sparse as sparse
@@ -64,6 +64,11 @@ def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius
     square = ((points[member] - vertices[centre][owner]) ** 2).sum(axis=1)
     agreement = np.clip(np.einsum("ec,ec->e", facing[member], normals[centre][owner]), 0.0, 1.0)
     return Patches(corners, shares, centre, np.r_[0, np.cumsum(counts)], member, square, agreement)
+
+
+def arrays_of(patches: Patches) -> dict[str, np.ndarray]:
+    """By the names of the fields."""
+    return {field.name: getattr(patches, field.name) for field in fields(patches)}
 
 
 def spread_samples(

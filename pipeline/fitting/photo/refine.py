@@ -10,6 +10,7 @@ the kernels carry on smoothly.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -23,10 +24,12 @@ from pipeline.fitting.contour import Solved, run_stage
 from pipeline.fitting.photo.depth_search import Round, look, observe
 from pipeline.fitting.photo.hair_mask import HairProbability, under_hair
 from pipeline.fitting.photo.images import load_photographs
-from pipeline.fitting.photo.patches import Patches, make_patches
+from pipeline.fitting.photo.patches import Patches, arrays_of, make_patches
 from pipeline.fitting.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
 from pipeline.fitting.surface_term import surface_residual
+from pipeline.kept_arrays import kept_arrays
 from pipeline.settings import PhotoSettings
+from rig.mesh import vertex_normals
 
 ROUNDS = (Round(3.0, 0.8, 4.0, 17), Round(2.5, 0.55, 2.0, 13), Round(2.0, 0.45, 1.0, 9))
 RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
@@ -89,11 +92,32 @@ def refine_with_photographs(
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
-    """The model with the fine kernel, its patches, and its modes at their centres."""
-    fine = with_fine_kernel(model, length_mm=settings.fine_length_mm, amplitude_mm=settings.fine_amplitude_mm)
-    radius = RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS)
-    patches = make_patches(model, sample_mm=settings.sample_mm, centre_mm=settings.centre_mm, radius_mm=radius)
-    return fine, patches, fine.basis("full", len(fine.modes), patches.centre)
+    """The model with the fine kernel, its patches, and its modes at their centres: what the model alone decides."""
+    length, amplitude = settings.fine_length_mm, settings.fine_amplitude_mm
+    sizes = {
+        "sample_mm": settings.sample_mm,
+        "centre_mm": settings.centre_mm,
+        "radius_mm": RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS),
+    }
+
+    def make() -> dict[str, np.ndarray]:
+        fine = with_fine_kernel(model, length_mm=length, amplitude_mm=amplitude)
+        patches = make_patches(model, **sizes)
+        basis = fine.basis("full", len(fine.modes), patches.centre)
+        return {"modes": fine.modes, "sigma": fine.sigma, "basis": basis, **arrays_of(patches)}
+
+    full, cage = model.levels["full"], model.levels["cage"]
+    operator = (full.operator.data, full.operator.indices, full.operator.indptr)
+    faces = (full.faces, full.face_region, cage.faces, cage.face_region)
+    kept = kept_arrays(
+        "fine-modes",
+        (model.mean, model.modes, model.sigma, *operator, *faces, length, amplitude, sizes),
+        make,
+        made_by=(with_fine_kernel, make_patches, vertex_normals, HeadModel),
+    )
+    fine = replace(model, modes=kept.pop("modes"), sigma=kept.pop("sigma"), _bases={})
+    basis = kept.pop("basis")
+    return fine, Patches(**kept), basis
 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:

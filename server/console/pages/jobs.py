@@ -8,7 +8,7 @@ from typing import NotRequired, TypedDict, cast
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from pipeline.eigenheads.model import list_models
+from pipeline.eigenheads.model_names import list_models
 from pipeline.results.report import CameraReport, WarningReport
 from rig.errors import InputError
 from server.console.page import Action, Chosen, Page, remove_later, shared, show

@@ -57,7 +57,7 @@ def metrics(service: ServiceOf, caller: Reader) -> Response:
 
 @router.get("/v1/models", tags=["models"], responses=documented())
 def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
-    from pipeline.eigenheads.model import list_models, model_path
+    from pipeline.eigenheads.model_names import list_models, model_path
 
     default = model_path("default").resolve()
     models = [

@@ -7,17 +7,9 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads import landmarks
-from pipeline.eigenheads.model import (
-    BadModel,
-    HeadModel,
-    UnknownModel,
-    list_models,
-    load_model,
-    model_path,
-    read_parts,
-    save_model,
-    with_modes,
-)
+from pipeline.eigenheads.model import HeadModel, load_model, with_modes
+from pipeline.eigenheads.model_file import BadModel, read_parts, save_model
+from pipeline.eigenheads.model_names import UnknownModel, list_models, model_path
 from pipeline.eigenheads.subdivision import boundary_loops, check_manifold
 from rig.mesh import face_normals, vertex_normals
 

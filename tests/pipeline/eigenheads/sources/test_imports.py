@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads import landmarks
-from pipeline.eigenheads.model import HeadModel, load_model, save_model
+from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.eigenheads.model_file import save_model
 from pipeline.eigenheads.sources.imports import (
     ICT_LANDMARKS_68,
     ICT_VERTICES,

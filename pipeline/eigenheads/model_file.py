@@ -1,0 +1,123 @@
+"""Head models as files: what one holds, written and read. What it becomes in memory: ``pipeline.eigenheads.model``."""
+
+import hashlib
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from rig.errors import EigenheadError
+
+FORMAT = "eigenhead-model/1"
+
+
+class BadModel(EigenheadError):
+    """A file that is not a head model of this project, or a damaged one."""
+
+    def __init__(self, path: Path | str, why: str) -> None:
+        super().__init__(
+            f"{path} cannot be used as a head model: {why}. A foreign model is read by `eigenhead model import`"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelParts:
+    """What a model file holds; ``assemble`` makes the HeadModel of it."""
+
+    name: str
+    licence: str
+    source: str
+    notice: str
+    subjects: Mapping[str, int]
+    mean: Float[np.ndarray, "V0 3"]
+    modes: Float[np.ndarray, "M V0 3"]
+    sigma: Float[np.ndarray, " M"]
+    landmarks: Mapping[str, int]
+    faces: Int[np.ndarray, "F 3"]  # of the cage
+    face_region: Bool[np.ndarray, " V0"]
+    subdivisions: int
+    decimated: Mapping[str, tuple[Int[np.ndarray, " K"], Int[np.ndarray, "G 3"]]]  # rows of full, faces
+    figures: Mapping[str, float] = field(default_factory=dict)
+    scores: Float[np.ndarray, "N C"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+
+
+def save_model(path: Path, parts: ModelParts) -> None:
+    """Write a model file (npz, compressed; float32, rounded to 2^-12 mm so that it packs small)."""
+    meta = {
+        "format": FORMAT,
+        "name": parts.name,
+        "licence": parts.licence,
+        "source": parts.source,
+        "notice": parts.notice,
+        "subjects": dict(parts.subjects),
+        "landmarks": {k: int(v) for k, v in parts.landmarks.items()},
+        "subdivisions": parts.subdivisions,
+        "figures": {k: round(float(v), 6) for k, v in parts.figures.items()},
+    }
+    arrays = {
+        "meta": np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8),
+        "mean": rounded(parts.mean),
+        "modes": rounded(parts.modes),
+        "sigma": np.asarray(parts.sigma, np.float32),
+        "faces": np.asarray(parts.faces, np.int32),
+        "face_region": np.packbits(parts.face_region),
+        "scores": np.asarray(parts.scores, np.float32),
+    }
+    for name, (rows, faces) in parts.decimated.items():
+        arrays[f"{name}_rows"], arrays[f"{name}_faces"] = np.asarray(rows, np.int32), np.asarray(faces, np.int32)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    part.replace(path)
+
+
+def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
+    """As a model file keeps lengths."""
+    return (np.round(np.asarray(values, float) * 4096) / 4096).astype(np.float32)
+
+
+def read_parts(path: Path) -> tuple[ModelParts, str]:
+    """The content of a model file and its SHA-256. Raises BadModel."""
+    try:
+        raw = path.read_bytes()
+    except OSError as fault:
+        raise BadModel(path, fault.strerror or "cannot be read") from None
+    try:
+        with np.load(BytesIO(raw), allow_pickle=False) as file:
+            if "meta" not in file:
+                raise BadModel(path, "it does not carry this project's model format")
+            meta = json.loads(file["meta"].tobytes())
+            if meta.get("format") != FORMAT:
+                raise BadModel(path, f"format {meta.get('format')!r}, wanted {FORMAT!r}")
+            parts = _parts(meta, file)
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
+        raise BadModel(path, f"damaged or incomplete ({fault})") from None
+    return parts, hashlib.sha256(raw).hexdigest()
+
+
+def _parts(meta: dict, file: Mapping[str, np.ndarray]) -> ModelParts:
+    mean = file["mean"]
+    return ModelParts(
+        name=meta["name"],
+        licence=meta["licence"],
+        source=meta["source"],
+        notice=meta["notice"],
+        subjects=meta["subjects"],
+        mean=mean,
+        modes=file["modes"],
+        sigma=file["sigma"],
+        landmarks=meta["landmarks"],
+        faces=file["faces"],
+        face_region=np.unpackbits(file["face_region"], count=len(mean)).astype(bool),
+        subdivisions=meta["subdivisions"],
+        decimated={name: (file[f"{name}_rows"], file[f"{name}_faces"]) for name in ("p95", "p99")},
+        figures=meta["figures"],
+        scores=file["scores"],
+    )

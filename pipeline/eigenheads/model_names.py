@@ -1,0 +1,44 @@
+"""Which head models are at hand, and the files behind their names. Loads nothing: the command line asks it."""
+
+from pathlib import Path
+
+from pipeline.eigenheads.data_folder import models_folder
+from rig.errors import EigenheadError
+
+PACKS = Path(__file__).parent / "packs"
+DEFAULT = "makehuman-138"
+_PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman": "makehuman.npz"}
+
+
+class UnknownModel(EigenheadError):
+    """A model name that is neither shipped nor in the user's folder, nor a file."""
+
+    def __init__(self, name: str) -> None:
+        known = ", ".join(sorted(list_models()))
+        super().__init__(
+            f"no head model {name!r}: known are {known}. Give a file path, or put one into {models_folder()} "
+            "with `eigenhead model import` or `eigenhead model fetch ict-facekit`"
+        )
+
+
+def list_models() -> dict[str, Path]:
+    """Models at hand by name: the shipped default and the files of the user's folder."""
+    found = {DEFAULT: PACKS / _PACK_FILES[DEFAULT]}
+    folder = models_folder()
+    if folder.is_dir():
+        found |= {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    return found
+
+
+def model_path(name_or_path: str | Path) -> Path:
+    """The file behind a name or path. Raises UnknownModel."""
+    name = str(name_or_path)
+    if name in _PACK_FILES:
+        return PACKS / _PACK_FILES[name]
+    named = list_models().get(name)
+    if named is not None:
+        return named
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    raise UnknownModel(name)

@@ -1,0 +1,101 @@
+"""What a first job would wait for, made ahead: the compiled loops of ``pipeline.kernel_list``, in processes over all
+cores. Set-up does it (``eigenhead prepare``), and a command that finds something missing does it before its work."""
+
+import os
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+from server.tasks.child import Bench, Child
+
+if TYPE_CHECKING:
+    from pipeline.kernel_list import Kernel
+
+Report = Callable[[str, float], None]
+PROCESSES_MOST = 8  # each takes 250 MB and half a second to load what it compiles
+
+
+def compile_kernel(bench: Bench, report: Report, *, line: str) -> bool:
+    """In a child: compiles a line of the list. False where it could not be kept, which the log has said."""
+    from pipeline.kernel_list import Kernel
+
+    kernel = Kernel.from_line(line)
+    kernel.compile()
+    return kernel.is_kept()
+
+
+def prepare_kernels(report: Report) -> tuple[int, int]:
+    """Compiles what the list has and the cache folder lacks.
+
+    Where nothing can be kept it says so in a line and compiles nothing: each process will have to, for itself.
+
+    Args:
+        report: told "compiling 12 of 49 loops" and the share that is done, from several threads, one at a time. What
+            it raises ends the work; what was compiled until then is kept.
+
+    Returns:
+        How many loops were compiled, and how many the list has.
+    """
+    from pipeline.kernel_list import by_module, listed_kernels
+
+    kernels = listed_kernels()
+    missing = [kernel for kernel in kernels if not kernel.is_kept()]
+    if not missing or not _can_keep():
+        return 0, len(kernels)
+    groups = sorted(by_module(missing), key=lambda group: sum(kernel.size() for kernel in group), reverse=True)
+    work = _Work(groups, len(missing), report)
+    work.told(0)
+    count = min(len(os.sched_getaffinity(0)), len(groups), PROCESSES_MOST)
+    with ThreadPoolExecutor(count, thread_name_prefix="compile") as pool:
+        for done in [pool.submit(work.compile_groups) for _ in range(count)]:
+            done.result()
+    return work.done, len(kernels)
+
+
+class _Work:
+    """Groups of kernels that several threads, each with a child, take one after another."""
+
+    def __init__(self, groups: "list[list[Kernel]]", total: int, report: Report) -> None:
+        self._groups, self._total, self._report = deque(groups), total, report
+        self._lock = threading.Lock()
+        self.done = 0
+
+    def compile_groups(self) -> None:
+        try:
+            with closing(Child()) as child:
+                while self._groups:
+                    try:
+                        group = self._groups.popleft()
+                    except IndexError:  # another was quicker
+                        return
+                    for kernel in group:
+                        if not child.remote(compile_kernel)(line=kernel.line):
+                            self._groups.clear()  # a full disk: going on would make what nobody finds again
+                            return
+                        self.told(1)
+        except BaseException:
+            self._groups.clear()
+            raise
+
+    def told(self, more: int) -> None:
+        with self._lock:
+            self.done += more
+            self._report(f"compiling {self.done} of {self._total} loops", self.done / self._total)
+
+
+def _can_keep() -> bool:
+    """Whether the cache folder can be written; where not, a line in the log says so."""
+    from pipeline.compiled import cache_folder, say_not_kept
+
+    try:
+        folder = cache_folder() / "kernels"
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError as error:
+        say_not_kept("compiled kernels", error)
+        return False

@@ -1,0 +1,57 @@
+"""Which compiled loops jobs call, and with which types.
+
+python -m tests.support.kernel_recorder pipeline/kernels.txt CAPTURE... writes the list from default jobs on captures.
+"""
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pipeline.compiled import KeptFunction
+from pipeline.kernel_list import Kernel, text_from_type
+
+
+@contextmanager
+def recorded() -> Iterator[set[Kernel]]:
+    """The kernels that Python calls for the first time inside the block; not the loops that those call themselves."""
+    found: set[Kernel] = set()
+    load, save = KeptFunction.load_overload, KeptFunction.save_overload
+    compiling = 0  # a loop that is being compiled asks for those that it calls
+
+    def load_recorded(kept: KeptFunction, signature: tuple, target_context: object) -> object:
+        nonlocal compiling
+        if not compiling:
+            function = kept._dispatcher.py_func
+            place = f"{function.__module__.partition('.')[2]}:{function.__name__}"
+            found.add(Kernel(place, tuple(text_from_type(kind) for kind in signature)))
+        loaded = load(kept, signature, target_context)
+        compiling += loaded is None
+        return loaded
+
+    def save_recorded(kept: KeptFunction, signature: tuple, result: object) -> None:
+        nonlocal compiling
+        compiling -= 1
+        save(kept, signature, result)
+
+    KeptFunction.load_overload, KeptFunction.save_overload = load_recorded, save_recorded  # type: ignore[method-assign]
+    try:
+        yield found
+    finally:
+        KeptFunction.load_overload, KeptFunction.save_overload = load, save
+
+
+def kernels_of(capture: Path) -> set[Kernel]:
+    """Of a default job on a capture folder, in a process that has run none before."""
+    from server.cli.reconstruct_local import reconstruct_locally
+
+    with recorded() as found, tempfile.TemporaryDirectory() as scratch:
+        reconstruct_locally(capture, Path(scratch) / "out", model=None, settings={}, report=lambda stage, share: None)
+    return found
+
+
+if __name__ == "__main__":
+    target, *captures = map(Path, sys.argv[1:])
+    lines = sorted({kernel.line for capture in captures for kernel in kernels_of(capture)})
+    target.write_text("\n".join(lines) + "\n", encoding="utf-8")
