@@ -118,7 +118,7 @@ def _models(settings: ServiceSettings) -> tuple[bool, str]:
 def _database(settings: ServiceSettings) -> tuple[bool, str]:
     """Reads it where there is one."""
     scheme, _, rest = settings.url.partition("://")
-    connection: Any
+    connection: object
     if scheme == "sqlite":
         path = Path(rest.removeprefix("/"))
         if not path.is_file():
