@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from calibration.adjustment.intrinsics import Lens, board_poses_of, estimate_lens
-from calibration.adjustment.state import BundleState, values_of
+from calibration.adjustment.state import BundleState
 from calibration.board.board import Board
 from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
@@ -77,7 +77,7 @@ class Graph:
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
         return BundleState(
-            np.stack([values_of(lenses[name].intrinsics) for name in self.names]),
+            np.stack([lenses[name].intrinsics.values() for name in self.names]),
             np.stack([self.cameras[name].rotation for name in self.names]),
             np.stack([self.cameras[name].translation for name in self.names]),
             np.stack([self.boards[shot].rotation for shot in self.shots]),

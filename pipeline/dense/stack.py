@@ -69,7 +69,7 @@ def stack_crops(crops: Sequence[Crop], level: int) -> Stack:
         pairs=np.concatenate([pack_pairs(each.grey).ravel() for each in levels]),
         distance_px=np.concatenate([each.distance_px.ravel() for each in levels]),
         noise=SHADES * np.array([each.noise for each in levels]),
-        lens=np.array([(k.fx, k.fy, k.cx, k.cy) for k in intrinsics]),
+        lens=np.stack([k.values()[:4] for k in intrinsics]),
         turn=turn,
         shift=shift,
     )

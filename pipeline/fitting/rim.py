@@ -49,6 +49,10 @@ class Views:
     distance: Float32[np.ndarray, " pixels"]  # all views, one after the other, row by row
     offset: Int[np.ndarray, " k"]
 
+    def packed(self) -> Float[np.ndarray, "k 22"]:
+        """The cameras as ``packed_camera`` has them."""
+        return np.concatenate([self.rotation.reshape(-1, 9), self.translation, self.lens], axis=1)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim:
@@ -145,21 +149,21 @@ def _outlines(
 
     Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.
     """
-    rotation, translation = views.rotation[some], views.translation[some]
-    centres = -np.einsum("kji,kj->ki", rotation, translation)
+    cameras = views.packed()[some]
+    centres = -np.einsum("kji,kj->ki", views.rotation[some], views.translation[some])
     by_bits = swept(vertices, normals, planes, topology.faces, topology.edges, speaking, centres)
-    counts = np.zeros(len(rotation), np.int64)
-    corners = np.empty((len(rotation), SAMPLES_MOST, 2), np.int32)
-    floats = np.empty((len(rotation), SAMPLES_MOST, 14))
+    counts = np.zeros(len(cameras), np.int64)
+    corners = np.empty((len(cameras), SAMPLES_MOST, 2), np.int32)
+    floats = np.empty((len(cameras), SAMPLES_MOST, 14))
 
     def look(first: int, last: int) -> None:
         see(
-            first, last, vertices, normals, topology.faces, topology.edges, *by_bits, rotation, translation,
-            views.lens[some], views.size[some], views.distance, views.offset[some], np.array(STEPS_OUT_PX),
+            first, last, vertices, normals, topology.faces, topology.edges, *by_bits, cameras, centres,
+            views.size[some], views.distance, views.offset[some], np.array(STEPS_OUT_PX),
             averaged, counts, corners, floats,
         )  # fmt: skip
 
-    in_threads(len(rotation), look)
+    in_threads(len(cameras), look)
     return [(corners[k, :count], floats[k, :count, :13]) for k, count in enumerate(counts.tolist())]
 
 
@@ -167,4 +171,4 @@ def project_with_slopes(
     points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
     """Pixel of every point in the view named beside it, and d(pixel) / d(point)."""
-    return projected_with_slopes(points_world, view, views.rotation, views.translation, views.lens)
+    return projected_with_slopes(points_world, view, views.packed())

@@ -6,19 +6,21 @@ Plain loops over arrays; the views are shared out to threads. ``rim`` says what 
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.imaging.projection_kernels import NOWHERE, distorted
+from pipeline.imaging.projection_kernels import project, projection_slopes
+from pipeline.imaging.sampling_kernels import cell, sample_row
 
 BLOCK = 1024  # faces whose planes stay in the cache while all views look at them
 LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by more than 60 degrees, they are no curve
 
 
 @njit(cache=True, fastmath=True)
-def projected_with_slopes(points, view, rotation, translation, lens):
+def projected_with_slopes(points, view, cameras):
     pixels, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
     for n in range(len(points)):
-        k = view[n]
-        pixels[n] = _project(points[n], rotation[k], translation[k], lens[k])
-        slopes[n] = _projection_jacobian(points[n], rotation[k], translation[k], lens[k])
+        camera = cameras[view[n]]
+        x, y, z = points[n]
+        pixels[n] = project(camera, x, y, z)
+        slopes[n, 0], slopes[n, 1] = projection_slopes(camera, x, y, z)
     return pixels, slopes
 
 
@@ -42,53 +44,6 @@ def normals_and_planes(vertices, faces):
         length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2) + 1e-30
         normals[v] /= length
     return normals, planes
-
-
-@njit(cache=True, fastmath=True)
-def _project(point, rotation, translation, lens):
-    """Pixel of a world point; not finite behind the camera or past the lens's turning radius."""
-    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
-    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
-    z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
-    if z <= 1.0:
-        return NOWHERE, NOWHERE
-    return distorted(x / z, y / z, lens)
-
-
-@njit(cache=True, fastmath=True)
-def _slopes(point, rotation, translation, lens):
-    """P = d(pixel) / d(world point): the two rows, x and y, as six numbers."""
-    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
-    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
-    iz = 1.0 / (rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2])
-    x, y = x * iz, y * iz
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
-    slope = 2.0 * (lens[4] + r2 * (2.0 * lens[5] + 3.0 * r2 * lens[8]))
-    xy = slope * x * y + 2.0 * lens[6] * x + 2.0 * lens[7] * y
-    xx = lens[0] * iz * (radial + slope * x * x + 2.0 * lens[6] * y + 6.0 * lens[7] * x)
-    yy = lens[1] * iz * (radial + slope * y * y + 6.0 * lens[6] * y + 2.0 * lens[7] * x)
-    xy, yx = lens[0] * iz * xy, lens[1] * iz * xy
-    dx0, dx1, dx2 = (
-        rotation[0, 0] - x * rotation[2, 0],
-        rotation[0, 1] - x * rotation[2, 1],
-        rotation[0, 2] - x * rotation[2, 2],
-    )
-    dy0, dy1, dy2 = (
-        rotation[1, 0] - y * rotation[2, 0],
-        rotation[1, 1] - y * rotation[2, 1],
-        rotation[1, 2] - y * rotation[2, 2],
-    )
-    return (
-        (xx * dx0 + xy * dy0, xx * dx1 + xy * dy1, xx * dx2 + xy * dy2),
-        (yx * dx0 + yy * dy0, yx * dx1 + yy * dy1, yx * dx2 + yy * dy2),
-    )
-
-
-@njit(cache=True, fastmath=True)
-def _projection_jacobian(point, rotation, translation, lens):
-    """P = d(pixel) / d(world point), 2 x 3."""
-    return np.array(_slopes(point, rotation, translation, lens))
 
 
 @njit(cache=True, fastmath=True)
@@ -161,7 +116,7 @@ def _crossed(faces, speaking, turned):
 
 
 @njit(cache=True, fastmath=True)
-def _chain(vertices, edges, folds, words, bit, facing, rotation, translation, lens):
+def _chain(vertices, edges, folds, words, bit, facing, camera):
     """Image of one view's folds: x0 y0 x1 y1, directed as in the face that looks to the camera (against the direction
     in one that looks away), and by how many layers."""
     total = 0
@@ -175,8 +130,8 @@ def _chain(vertices, edges, folds, words, bit, facing, rotation, translation, le
         a, b, one, two = edges[folds[j]]
         if not facing[one] & bit:
             a, b = b, a
-        chain[i, 0], chain[i, 1] = _project(vertices[a], rotation, translation, lens)
-        chain[i, 2], chain[i, 3] = _project(vertices[b], rotation, translation, lens)
+        chain[i, 0], chain[i, 1] = project(camera, vertices[a, 0], vertices[a, 1], vertices[a, 2])
+        chain[i, 2], chain[i, 3] = project(camera, vertices[b, 0], vertices[b, 1], vertices[b, 2])
         chain[i, 4] = 1.0 if two < 0 else 2.0
         i += 1
     return chain
@@ -225,13 +180,11 @@ def _layers(x, y, start, entries):
 
 
 @njit(cache=True, fastmath=True)
-def _bilinear(distance, offset, width, height, x, y):
-    x0, y0 = min(max(int(np.floor(x)), 0), width - 2), min(max(int(np.floor(y)), 0), height - 2)
-    fx, fy = x - x0, y - y0
-    i = offset + y0 * width + x0
-    top = distance[i] * (1.0 - fx) + distance[i + 1] * fx
-    bottom = distance[i + width] * (1.0 - fx) + distance[i + width + 1] * fx
-    return top * (1.0 - fy) + bottom * fy
+def _read(distance, offset, width, height, x, y):
+    """The signed distance of one view at a pixel."""
+    column, right = cell(x, width)
+    row, down = cell(y, height)
+    return sample_row(distance, offset + row * width + column, width, right, down)
 
 
 @njit(cache=True, fastmath=True)
@@ -290,17 +243,16 @@ def _crossings(vertices, normals, turned, faces, crossed, words, bit, centre, co
 
 
 @njit(cache=True, fastmath=True)
-def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words, bit, rotation,
-          translation, lens, width, height, distance, offset, steps, averaged, corners, floats):  # fmt: skip
+def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words, bit, camera,
+          centre, width, height, distance, offset, steps, averaged, corners, floats):  # fmt: skip
     """One view: fills ``corners`` and ``floats`` with the samples on the outer outline; returns their number."""
-    centre = -(rotation.T @ translation)
-    chain = _chain(vertices, edges, folds, fold_words, bit, facing, rotation, translation, lens)
+    chain = _chain(vertices, edges, folds, fold_words, bit, facing, camera)
     start, entries = _rows(chain, height)
     count, joined, segments = _crossings(
         vertices, normals, turned, faces, crossed, crossed_words, bit, centre, corners, floats
     )
     for s in range(count):
-        floats[s, 7], floats[s, 8] = _project(floats[s, 1:4], rotation, translation, lens)
+        floats[s, 7], floats[s, 8] = project(camera, floats[s, 1], floats[s, 2], floats[s, 3])
     for j in range(joined):
         a, b = segments[j]
         half = 0.5 * np.sqrt((floats[a, 7] - floats[b, 7]) ** 2 + (floats[a, 8] - floats[b, 8]) ** 2)
@@ -311,7 +263,7 @@ def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, cr
         u, v = floats[s, 7], floats[s, 8]
         if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
             continue
-        to_x, to_y = _slopes(floats[s, 1:4], rotation, translation, lens)
+        to_x, to_y = projection_slopes(camera, floats[s, 1], floats[s, 2], floats[s, 3])
         # l = N^T P^+ through the 2 x 2 normal matrix of P's rows.
         n0, n1, n2 = floats[s, 4], floats[s, 5], floats[s, 6]
         g00 = to_x[0] ** 2 + to_x[1] ** 2 + to_x[2] ** 2
@@ -337,7 +289,7 @@ def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, cr
             floats[kept, 4 + c] = nx * to_x[c] + ny * to_y[c]
         floats[kept, 7], floats[kept, 8], floats[kept, 9], floats[kept, 10] = u, v, nx, ny
         floats[kept, 11] = floats[s, 11]
-        floats[kept, 12] = _bilinear(distance, offset, width, height, u, v)
+        floats[kept, 12] = _read(distance, offset, width, height, u, v)
         place[s] = kept
         kept += 1
     if averaged:
@@ -370,7 +322,7 @@ def _average(segments, place, kept, distance, offset, width, height, floats):
             lift = 0.5 * t * (1.0 - t) * bend
             x = floats[a, 7] + t * dx + lift * floats[end, 9]
             y = floats[a, 8] + t * dy + lift * floats[end, 10]
-            total[end] += half / reads * _bilinear(distance, offset, width, height, x, y)
+            total[end] += half / reads * _read(distance, offset, width, height, x, y)
         read[a] += half
         read[b] += half
     for s in range(kept):
@@ -390,10 +342,10 @@ def swept(vertices, normals, planes, faces, edges, speaking, centres):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def see(first, last, vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
-         rotation, translation, lens, size, distance, offset, steps, averaged, counts, corners, floats):  # fmt: skip
+         cameras, centres, size, distance, offset, steps, averaged, counts, corners, floats):  # fmt: skip
     for k in range(first, last):
         counts[k] = _view(
             vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
-            np.uint64(1) << np.uint64(k), rotation[k], translation[k], lens[k], size[k, 0], size[k, 1], distance,
+            np.uint64(1) << np.uint64(k), cameras[k], centres[k], size[k, 0], size[k, 1], distance,
             offset[k], steps, averaged, corners[k], floats[k],
         )  # fmt: skip

@@ -118,12 +118,12 @@ def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> F
     # One type for every level, or the loop is compiled once for each.
     start, member = operator.indptr.astype(np.int64), operator.indices.astype(np.int64)
     blend, point, gradient = (np.ascontiguousarray(part) for part in (rim.blend, rim.point, rim.gradient))
-    turn = pose.scale * pose.rotation
+    turn, cameras = pose.scale * pose.rotation, views.packed()
 
     def fill(first: int, last: int) -> None:
         fill_rows(
-            first, last, start, member, operator.data, basis.modes, stage.modes, turn, pose.translation, views.rotation,
-            views.translation, rim.view, rim.corner, blend, point, gradient, rows,
+            first, last, start, member, operator.data, basis.modes, stage.modes, turn, pose.translation, cameras,
+            rim.view, rim.corner, blend, point, gradient, rows,
         )  # fmt: skip
 
     in_threads(len(rows), fill)

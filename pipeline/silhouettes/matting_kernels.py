@@ -3,6 +3,7 @@
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.imaging.sampling_kernels import bilinear
 
 OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
 FAINT = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
@@ -18,9 +19,7 @@ def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
 
 @njit(cache=True, nogil=True, inline="always")
 def interpolated_colour(a: np.ndarray, y: int, x: int, c: int, fy: float, fx: float) -> float:
-    top = a[y, x, c] + fx * (a[y, x + 1, c] - a[y, x, c])
-    low = a[y + 1, x, c] + fx * (a[y + 1, x + 1, c] - a[y + 1, x, c])
-    return top + fy * (low - top)
+    return bilinear(a[y, x, c], a[y, x + 1, c], a[y + 1, x, c], a[y + 1, x + 1, c], fx, fy)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -68,7 +67,7 @@ def solve_alpha(
             lx, flx = corner_of(x, width, cw)
             p00, p01 = probability[ly, lx], probability[ly, lx + 1]
             p10, p11 = probability[ly + 1, lx], probability[ly + 1, lx + 1]
-            prior = (1 - fly) * (p00 + flx * (p01 - p00)) + fly * (p10 + flx * (p11 - p10))
+            prior = bilinear(p00, p01, p10, p11, flx, fly)
             if first and kind == 3:
                 alpha[y, x] = prior
                 continue

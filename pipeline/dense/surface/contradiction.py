@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from pipeline.compiled import njit
 from pipeline.dense.surface.view_stack import ViewStack
-from pipeline.dense.surface.vote_kernels import nearest_pixel, project
+from pipeline.dense.surface.vote_kernels import nearest_pixel, seen_at
+from pipeline.imaging.projection_kernels import NEAREST_MM
 from pipeline.parallel_for import in_threads
 
 BLOCK = 4  # pixels along the side of what is decided at once
@@ -67,8 +68,8 @@ def _mark(
                 x, y = (column - p[14]) / p[12] * depth, (row - p[15]) / p[13] * depth
                 for axis in range(3):  # the rotation's inverse, from the camera's centre
                     place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[16 + axis]
-                ahead, at_column, at_row = project(cameras[target], place)
-                if ahead <= 1.0:
+                ahead, at_column, at_row = seen_at(cameras[target], place)
+                if ahead <= NEAREST_MM:
                     continue
                 near, beyond = nearest_pixel(at_column, at_row, sizes[target])
                 there = starts[target] + near

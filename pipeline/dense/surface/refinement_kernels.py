@@ -3,7 +3,9 @@
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.dense.surface.vote_kernels import FLATTEST, UNKNOWN_MM, VIEWS_MOST, agreed, cosine, nearest_pixel, project
+from pipeline.dense.surface.vote_kernels import FLATTEST, UNKNOWN_MM, VIEWS_MOST, agreed, cosine, nearest_pixel, seen_at
+from pipeline.imaging.projection_kernels import NEAREST_MM
+from pipeline.imaging.sampling_kernels import bilinear
 
 TURNED = 0.4  # cosine between the normals of a vertex and of a pixel below which the pixel shows another surface
 STEP_MM = 4.0  # four pixels that differ by more in depth show two surfaces
@@ -35,8 +37,8 @@ def measure(
     for n in range(first, last):
         place, count = vertices[n], 0
         for v in range(len(cameras)):
-            depth, column, row = project(cameras[v], place)
-            if depth <= 1.0:
+            depth, column, row = seen_at(cameras[v], place)
+            if depth <= NEAREST_MM:
                 continue
             near, beyond = nearest_pixel(column, row, sizes[v])
             near += starts[v]
@@ -77,8 +79,7 @@ def depth_between(pixels: np.ndarray, start: int, size: np.ndarray, column: floa
     high = max(max(pixels[a, 0], pixels[b, 0]), max(pixels[d, 0], pixels[e, 0]))
     if not sigma < UNKNOWN_MM or high - low > STEP_MM:
         return pixels[near, 0]
-    x, y = column - c, row - r
-    return (1 - y) * ((1 - x) * pixels[a, 0] + x * pixels[b, 0]) + y * ((1 - x) * pixels[d, 0] + x * pixels[e, 0])
+    return bilinear(pixels[a, 0], pixels[b, 0], pixels[d, 0], pixels[e, 0], column - c, row - r)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

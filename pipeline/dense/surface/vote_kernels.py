@@ -3,6 +3,7 @@
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.imaging.projection_kernels import LENS, NEAREST_MM, pinhole, placed
 
 VIEWS_MOST = 64
 PLANE_SHARE = 0.3  # of the way along the ray that a place before a surface is off at least, however flat that is seen
@@ -48,12 +49,12 @@ def vote(
         hidden = 1e9  # smallest depth behind a surface that is seen
         framed, framed_next = 1e9, 1e9  # smallest and second smallest distance outside a photograph
         for v in range(len(cameras)):
-            depth, column, row = project(cameras[v], place)
-            if depth <= 1.0:
+            depth, column, row = seen_at(cameras[v], place)
+            if depth <= NEAREST_MM:
                 continue
             at, beyond = nearest_pixel(column, row, sizes[v])
             at += starts[v]
-            scale = depth / cameras[v, 12]
+            scale = depth / cameras[v, LENS]
             edge, off = (pixels[at, 6] + beyond) * scale, pixels[at, 5] * scale
             framed, framed_next = min(framed, edge), min(framed_next, max(framed, edge))
             guess = max(guess, off)
@@ -87,12 +88,11 @@ def vote(
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def project(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
+def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
     """Depth (mm), column and row of a place in the world frame; see ``view_stack.ViewStack.cameras``."""
-    depth = camera[6] * place[0] + camera[7] * place[1] + camera[8] * place[2] + camera[11]
-    x = camera[0] * place[0] + camera[1] * place[1] + camera[2] * place[2] + camera[9]
-    y = camera[3] * place[0] + camera[4] * place[1] + camera[5] * place[2] + camera[10]
-    return depth, camera[12] * x / depth + camera[14], camera[13] * y / depth + camera[15]
+    x, y, depth = placed(camera, place[0], place[1], place[2])
+    column, row = pinhole(x / depth, y / depth, camera[LENS:])
+    return depth, column, row
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.compiled import njit
 from pipeline.fitting.photo.patches import Patches
+from pipeline.imaging.sampling_kernels import held, sample_row
 from pipeline.parallel_for import in_threads
 
 LEAST_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
@@ -67,13 +68,9 @@ def correlate(
 @njit(cache=True, nogil=True, fastmath=True)
 def read(image, start, width, height, x, y):
     """The image that begins at ``start`` of the row of images, bilinear, held inside."""
-    x, y = min(max(x, 0.0), width - 1.001), min(max(y, 0.0), height - 1.001)
+    x, y = held(x, width), held(y, height)
     column, row = int(x), int(y)
-    fx, fy = np.float32(x - column), np.float32(y - row)
-    i = start + row * width + column
-    top = image[i] + fx * (image[i + 1] - image[i])
-    bottom = image[i + width] + fx * (image[i + width + 1] - image[i + width])
-    return top + fy * (bottom - top)
+    return sample_row(image, start + row * width + column, width, np.float32(x - column), np.float32(y - row))
 
 
 @njit(cache=True, nogil=True, fastmath=True)
