@@ -17,7 +17,7 @@ from pipeline.silhouettes.cross_view_kernels import LEAST_WITNESSES, least_disse
 from rig.rig import Rig
 
 
-def ask_the_others(
+def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
     """How many of the other cameras deny the subject at each doubtful pixel of camera ``name`` (at most ``MOST``); -1

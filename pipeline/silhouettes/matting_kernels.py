@@ -6,7 +6,7 @@ from pipeline.compiled import njit
 from pipeline.imaging.sampling_kernels import bilinear
 
 OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
-FAINT = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
+ALPHA_INFORMATION_MOST = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -39,7 +39,7 @@ def solve_alpha(
     zone: np.ndarray,
     probability: np.ndarray,
     subject: np.ndarray,
-    lean: float,
+    coarse_sigma: float,
     shade: float,
     first: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -53,7 +53,7 @@ def solve_alpha(
     columns = np.minimum(np.arange(width) * cw // width, cw - 1)
     alpha = np.empty((height, width), np.float32)
     contrast = np.full((height, width), -1.0, np.float32)
-    trust = np.full((height, width), FAINT, np.float32)
+    trust = np.full((height, width), ALPHA_INFORMATION_MOST, np.float32)
     for y in range(height):
         zy = min(y * ch // height, ch - 1)
         ly, fly = corner_of(y, height, ch)
@@ -93,9 +93,9 @@ def solve_alpha(
                 df += (i - b) * f
                 db += (i - b) * b
                 dd += (i - b) * (i - b)
-            # Normal equations of I - B = q F - alpha B, with q = alpha (within shade) and alpha = prior (within LEAN).
-            m11, m12, m22 = ff + 1 / shade**2, -fb - 1 / shade**2, bb + 1 / shade**2 + 1 / lean**2
-            r1, r2 = df, -db + prior / lean**2
+            # Normal equations of I - B = q F - alpha B, q = alpha (within shade), alpha = prior (within coarse_sigma).
+            m11, m12, m22 = ff + 1 / shade**2, -fb - 1 / shade**2, bb + 1 / shade**2 + 1 / coarse_sigma**2
+            r1, r2 = df, -db + prior / coarse_sigma**2
             determinant = m11 * m22 - m12 * m12
             value = (m11 * r2 - m12 * r1) / determinant
             square = ff - 2 * fb + bb
@@ -109,7 +109,7 @@ def solve_alpha(
                 left += along * along * bb - 2 * along * (db - a * (fb - bb))
                 value += max(0.0, 1.0 - value) / (1.0 + np.exp(OTHER - 0.5 * left))
             alpha[y, x] = value
-            known = max(determinant / m11 - 1 / lean**2, 1e-6)
+            known = max(determinant / m11 - 1 / coarse_sigma**2, 1e-6)
             contrast[y, x] = np.sqrt(known)
-            trust[y, x] = min(FAINT, known)
+            trust[y, x] = min(ALPHA_INFORMATION_MOST, known)
     return alpha, contrast, trust

@@ -43,7 +43,7 @@ from server.storage.events import EventLog
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
-from server.tasks.progress import Course, Expectation, ProgressMeter
+from server.tasks.progress import JobProgress, ProgressMeter, StageDurations
 from server.worker.heartbeat import dead_workers, process_identity
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
@@ -64,7 +64,7 @@ class Worker:
         self._work = function_at(settings.work)
         self._stop = threading.Event()
         self._webhooks = Webhooks(self.engine)
-        self._expectation = Expectation()
+        self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
 
     def start(self) -> None:
@@ -174,12 +174,12 @@ class Worker:
         try:
             folder.mkdir(parents=True)
             method = arguments["settings"].get("method", "contour")
-            course = Course(self._expectation.of(method))
-            meter = ProgressMeter(self.events, job_id, course)
+            progress = JobProgress(self._durations.of(method))
+            meter = ProgressMeter(self.events, job_id, progress)
             with self._children.one() as child:
                 cancelled = lambda: not self._states.runs(job_id)  # noqa: E731
                 child.remote(self._work, report=meter.report, cancelled=cancelled)(**arguments)
-            self._expectation.learn(method, course.finish())
+            self._durations.learn(method, progress.finish())
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
             raise self._failure(error) from error

@@ -7,7 +7,7 @@ texture exactly, and sliding along the surface with it). Linear in the image shi
     H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
 
 g_k the images' slopes. A displacement u along the normal and camera corrections c_k make ``delta_k = p_k u + C_k c_k``.
-Eliminating u leaves how the place that the patch reports leans on the cameras, and a quadratic form in the cameras
+Eliminating u leaves the derivative of patch depth with respect to camera pose, and a quadratic form in the cameras
 alone: shifts that no surface explains. A camera of 0.2 px error shows in thousands of patches.
 """
 
@@ -24,8 +24,8 @@ from rig.camera import Camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Leaning:
-    """Of n patches: how the place that each reports leans on the cameras, and what they say of the cameras alone."""
+class CameraSensitivity:
+    """Of n patches: the derivative of depth with respect to camera pose, and what they say of the cameras alone."""
 
     by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
     stiff: Float[np.ndarray, "n a a"]  # of the image shifts of its views, by the patch's own information
@@ -39,14 +39,14 @@ class Leaning:
         return slides.T @ pulled.reshape(slides.shape), -(self.slope * information[:, None]).ravel() @ slides
 
 
-def lean(
+def camera_sensitivity(
     view: Int[np.ndarray, "n v"],
     value: Float[np.ndarray, "n v"],
     grams: tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]],
     places: Float[np.ndarray, "n 3"],
     axes: Float[np.ndarray, "n 3"],
     cameras: tuple[Camera, ...],
-) -> Leaning:
+) -> CameraSensitivity:
     """Of patches whose surface lies at ``places`` and moves along ``axes``; ``grams``: of ``gram_matrices``."""
     slopes, mixed = grams
     axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes
@@ -62,7 +62,7 @@ def lean(
     own = np.einsum("na,na->n", ahead, across)
     own = np.where(own > 1e-12, own, np.inf)[:, None]
     down = np.einsum("na,na->n", ahead, gradient)[:, None]
-    return Leaning(
+    return CameraSensitivity(
         by_camera=np.einsum("na,nac->nc", -across / own, slides),
         stiff=(matrix - across[:, :, None] * across[:, None, :] / own[:, :, None]) / own[:, :, None],
         slope=(gradient - across * down / own) / own,

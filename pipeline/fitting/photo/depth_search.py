@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.fitting.photo.camera_term import gram_matrices, lean
+from pipeline.fitting.photo.camera_term import camera_sensitivity, gram_matrices
 from pipeline.fitting.photo.correlation import choose_views, correlate, sweep
 from pipeline.fitting.photo.hair_mask import Sight, under_hair
 from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
@@ -45,7 +45,7 @@ class Round:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looks:
+class SampleVisibility:
     """The head as it stands, and who sees what of it."""
 
     cameras: tuple[Camera, ...]  # where the state has them
@@ -58,9 +58,9 @@ class Looks:
     covered: tuple[Bool[np.ndarray, "_ _"], ...]  # where each camera sees the head
 
 
-def look(
+def sample_visibility(
     problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
-) -> Looks:
+) -> SampleVisibility:
     """Draws the depth of the head in every view, and asks for every sample."""
     model, pose = problem.model, state.world_from_head
     cage = model.cage(state.coefficients)
@@ -86,7 +86,9 @@ def look(
 
     with ThreadPoolExecutor() as pool:
         facing, pixel, along, covered = zip(*pool.map(one, range(len(cameras))), strict=True)
-    return Looks(cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along), covered)
+    return SampleVisibility(
+        cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along), covered
+    )
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
@@ -129,18 +131,18 @@ def facing_of(
 
 
 def hair_patches(
-    problem: ContourProblem, state: State, patches: Patches, photographs: Photographs, looks: Looks
+    problem: ContourProblem, state: State, patches: Patches, photographs: Photographs, visibility: SampleVisibility
 ) -> Bool[np.ndarray, " c"]:
     """The patches that lie under hair, by its colour."""
-    chin = looks.vertices[problem.model.landmarks["gnathion"]]
+    chin = visibility.vertices[problem.model.landmarks["gnathion"]]
     ends = np.stack([chin, chin + 10.0 * state.world_from_head.rotation[:, 1]])
     sights = []
     for k in np.flatnonzero(photographs.speaks).tolist():
-        low, high = looks.cameras[k].project(ends)
+        low, high = visibility.cameras[k].project(ends)
         sights.append(
             Sight(
-                photographs.colour[k], looks.covered[k], distance_of(problem.views, k), looks.pixel[k],
-                looks.facing[k] > 0, low, high - low,
+                photographs.colour[k], visibility.covered[k], distance_of(problem.views, k), visibility.pixel[k],
+                visibility.facing[k] > 0, low, high - low,
             )
         )  # fmt: skip
     return under_hair(problem.model, patches, sights)
@@ -151,7 +153,7 @@ def observe(
     state: State,
     photographs: Photographs,
     patches: Patches,
-    looks: Looks,
+    visibility: SampleVisibility,
     hair: Bool[np.ndarray, " c"],
     basis: Float32[np.ndarray, "m c 3"],
     each: Round,
@@ -162,11 +164,11 @@ def observe(
     the model's modes at the centres."""
     views = problem.views
     steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
-    scale = pixels_per_mm(looks.cameras, state.world_from_head.translation)
+    scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
     image, noise = blurred(photographs, each.blur_mm * scale)
-    weights, seen = patches.weights(each.window_mm), looks.facing > 0
-    grey = sweep(looks.pixel, looks.along, seen, views.size, views.offset, image, steps)
-    view, value = choose_views(patches, weights, looks.facing, settings.least_seen, settings.views_most)
+    weights, seen = patches.weights(each.window_mm), visibility.facing > 0
+    grey = sweep(visibility.pixel, visibility.along, seen, views.size, views.offset, image, steps)
+    view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
     found = find_peaks(correlate(patches, weights, view, value, seen, grey, noise), steps)
     blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
     variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - found.height) / found.curvature
@@ -177,13 +179,15 @@ def observe(
     information = 1.0 / (overlap * variance[kept])
     rows, place = patches.centre[kept], found.place[kept]
     grams = gram_matrices(
-        patches, kept, weights, view[kept], place, looks.pixel, looks.along, seen, views.size, views.offset, image,
-        noise,
+        patches, kept, weights, view[kept], place, visibility.pixel, visibility.along, seen, views.size, views.offset,
+        image, noise,
     )  # fmt: skip
-    stood, normal = looks.vertices[rows], looks.normals[rows]
-    leaning = lean(view[kept], value[kept], grams, stood + place[:, None] * normal, normal, looks.cameras)
-    camera_matrix, camera_gradient = leaning.cameras(information)
-    metric = metric_rig(looks.cameras, state.world_from_head.translation, settings.rig_scale_spread)
+    stood, normal = visibility.vertices[rows], visibility.normals[rows]
+    sensitivity = camera_sensitivity(
+        view[kept], value[kept], grams, stood + place[:, None] * normal, normal, visibility.cameras
+    )
+    camera_matrix, camera_gradient = sensitivity.cameras(information)
+    metric = metric_rig(visibility.cameras, state.world_from_head.translation, settings.rig_scale_spread)
     observations = SurfaceObservations(
         vertex=rows,
         basis=basis.take(kept, axis=1),  # basis[:, kept] is laid out by vertex, and copied whenever it is used
@@ -192,7 +196,7 @@ def observe(
         seen_at=stood,
         displacement=place,
         information=information,
-        by_camera=leaning.by_camera,
+        by_camera=sensitivity.by_camera,
         camera_shift=state.camera_shift,
         camera_matrix=camera_matrix + metric,
         camera_gradient=camera_gradient - metric @ state.camera_shift.ravel(),

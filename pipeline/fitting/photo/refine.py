@@ -20,7 +20,7 @@ from pipeline.diagnostics import Detail
 from pipeline.eigenheads.gaussian_process import with_fine_kernel
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.contour import Solved, run_stage
-from pipeline.fitting.photo.depth_search import Round, hair_patches, look, observe
+from pipeline.fitting.photo.depth_search import Round, hair_patches, observe, sample_visibility
 from pipeline.fitting.photo.images import load_photographs
 from pipeline.fitting.photo.patches import Patches, make_patches
 from pipeline.fitting.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
@@ -58,9 +58,9 @@ def refine_with_photographs(
     evidence, misfit = solved.evidence, solved.misfit_mm
     lost = np.zeros(0, int)
     for each in ROUNDS:
-        looks = look(problem, state, patches, photographs.speaks, settings)
-        hair = hair_patches(problem, state, patches, photographs, looks)
-        surface, lost = observe(problem, state, photographs, patches, looks, hair, basis, each, settings)
+        visibility = sample_visibility(problem, state, patches, photographs.speaks, settings)
+        hair = hair_patches(problem, state, patches, photographs, visibility)
+        surface, lost = observe(problem, state, photographs, patches, visibility, hair, basis, each, settings)
         share = len(surface.vertex) / max(len(patches.centre), 1)
         if share < settings.least_share:
             why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"
