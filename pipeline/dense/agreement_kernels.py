@@ -8,9 +8,7 @@ from pipeline.imaging.projection_kernels import NEAREST_MM, placed
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def count_agreeing(
-    start, ways, lenses, deviation, depth, slopes, tolerance_mm, deviations, agreeing, before, apart
-):  # fmt: skip
+def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreeing, before, apart):
     """Fills, for every pixel of one view, how many others have the surface at the same place (``agreeing``), how many
     see past it (``before``: the place lies in their free space), and the mean square distance between the views that
     agree (``apart``, mm^2).
@@ -18,8 +16,9 @@ def count_agreeing(
     Two views agree where the distance from the other's plane is below ``tolerance_mm``, or below ``deviations`` of
     their joint standard deviation, half a ``tolerance_mm`` at least. A view in which something nearer stands before the
     place says nothing. ``depth``, ``slopes`` and ``deviation`` are those of all views in one row, ``ways`` as
-    ``Stack.ways`` has them, ``lenses`` fx and fy of the others.
+    ``Stack.ways`` has them, ``lenses`` fx and fy of the others, ``limits`` ``tolerance_mm`` and ``deviations``.
     """
+    tolerance_mm, deviations = limits
     height, width = agreeing.shape
     for row in range(height):
         for column in range(width):

@@ -7,6 +7,8 @@ A view that is compared with is a row of 16 numbers (``Stack.ways``): how a poin
 pixels lie. Few and small arguments: a call that hands over twenty arrays takes longer than a window.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import njit
@@ -24,16 +26,39 @@ LOW = np.uint32(0xFFFF)
 HIGH = np.uint32(16)
 
 
+class Sight(NamedTuple):
+    """A view that is matched, and all that it is matched with."""
+
+    start: int  # of its first pixel
+    noise: float  # shades
+    ways: np.ndarray  # to the views that it is compared with, as ``Stack.ways`` has them
+    pairs: np.ndarray  # all views' pixels, as ``Stack`` has them
+    distance_px: np.ndarray
+    pattern: np.ndarray  # samples of a window, across and down from its middle, px
+    contrast: float  # shades at which a sample counts half
+
+
+class Loaded(NamedTuple):
+    """The window about one pixel, by ``load_window``."""
+
+    column: int
+    row: int
+    window: np.ndarray  # zero-mean shades, weights
+    total: float  # of the weights
+    energy: float  # of the weighted squares
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def load_window(pairs, distance_px, start, width, height, column, row, pattern, contrast, window):
-    """Fills ``window`` (zero-mean shades, weights) with the samples that ``pattern`` (across, down) has about a pixel;
+def load_window(sight, width, height, column, row, window):
+    """Fills ``window`` (zero-mean shades, weights) with the samples that the pattern has about a pixel;
     returns the sums of the weights and of the weighted squares.
 
-    Pixels beside the subject weigh nothing, those of another brightness little: half at a difference of ``contrast``.
+    Pixels beside the subject weigh nothing, those of another brightness little: half at the sight's ``contrast``.
     So a window at an outline or a crease holds one surface.
     """
+    pairs, pattern, start = sight.pairs, sight.pattern, sight.start
     centre = np.float32(np.int32(pairs[start + row * width + column] & LOW))
-    falloff = np.float32(1.0 / (contrast * contrast))
+    falloff = np.float32(1.0 / (sight.contrast * sight.contrast))
     total, mean = np.float32(0.0), np.float32(0.0)
     for i in range(pattern.shape[1]):
         x = min(max(column + int(pattern[0, i]), 0), width - 1)
@@ -41,7 +66,7 @@ def load_window(pairs, distance_px, start, width, height, column, row, pattern, 
         at = start + y * width + x
         value = np.float32(np.int32(pairs[at] & LOW))
         w = np.float32(0.0)
-        if distance_px[at] < WINDOW_PX:
+        if sight.distance_px[at] < WINDOW_PX:
             off = value - centre
             w = np.float32(1.0) / (np.float32(1.0) + off * off * falloff)
         window[0, i] = value
@@ -88,8 +113,10 @@ def distance_there(way, place, distance_px):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
-def correlate(way, place, pairs, pattern, window, total, energy, noise):
-    """Correlation of the loaded window with another view at ``place``; ``noise`` is this view's."""
+def correlate(way, place, sight, loaded):
+    """Correlation of the loaded window with another view at ``place``."""
+    pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
+    window, total, energy = loaded.window, loaded.total, loaded.energy
     x, y = np.float32(place[0]), np.float32(place[1])
     x_x, x_y, y_x, y_y = np.float32(place[2]), np.float32(place[3]), np.float32(place[4]), np.float32(place[5])
     base, stride, narrow = np.uint64(np.int64(way[START])), np.uint64(np.int64(way[WIDTH])), np.int32(way[WIDTH])
@@ -112,27 +139,29 @@ def correlate(way, place, pairs, pattern, window, total, energy, noise):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
-def match(way, z, z_x, z_y, column, row, reach, pairs, distance_px, pattern, window, total, energy, noise, place):
+def match(way, sight, loaded, z, z_x, z_y, reach, place):
     """Correlation of the loaded window with another view, if the surface is that plane; NO_SAY or AGAINST where there
     is nothing to compare."""
-    if not place_window(way, z, z_x, z_y, column, row, reach, place):
+    if not place_window(way, z, z_x, z_y, loaded.column, loaded.row, reach, place):
         return NO_SAY
-    beside = distance_there(way, place, distance_px)
+    beside = distance_there(way, place, sight.distance_px)
     if beside < UNSEEN_PX:
         return NO_SAY
     if beside > BESIDE_PX:
         return AGAINST
-    return correlate(way, place, pairs, pattern, window, total, energy, noise)
+    return correlate(way, place, sight, loaded)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def correlate_and_slide(way, place, pairs, pattern, window, total, energy, noise, found):
+def correlate_and_slide(way, place, sight, loaded, found):
     """``correlate``, and how the window would slide along the ray: fills ``found`` with the correlation, and with
     gradient (1 / mm) and information (1 / mm^2) of the depth.
 
     Least squares of ``shade = gain (other + slope step) + offset`` by gain, offset and step: gain and offset are
     projected out. The variance of a sample is what the best gain leaves, and noise.
     """
+    pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
+    window, total, energy = loaded.window, loaded.total, loaded.energy
     x, y = np.float32(place[0]), np.float32(place[1])
     x_x, x_y, y_x, y_y = np.float32(place[2]), np.float32(place[3]), np.float32(place[4]), np.float32(place[5])
     x_z, y_z = np.float32(place[6]), np.float32(place[7])

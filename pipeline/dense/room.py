@@ -79,8 +79,8 @@ def _bounds(
     others = np.delete(np.arange(len(least)), view)
     near, far = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     find_room(
-        int(least.offset[view]), int(width), int(height), least.ways(view, others), least.distance_px, SLACK_PX,
-        max(middle - half, 1.0), middle + half, step, near.ravel(), far.ravel(),
+        int(least.offset[view]), least.ways(view, others), least.distance_px, SLACK_PX, max(middle - half, 1.0),
+        middle + half, step, near, far,
     )  # fmt: skip
     room = near > 0.0
     near[room] -= step

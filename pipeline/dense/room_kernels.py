@@ -15,18 +15,18 @@ def _distance_at(distance_px, way, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_room(start, width, height, ways, distance_px, slack_px, low, high, step, near, far):
-    """Fills ``near`` and ``far`` (mm of depth, for the view's pixels row by row; 0 where no room is).
+def find_room(start, ways, distance_px, slack_px, low, high, step, near, far):
+    """Fills ``near`` and ``far`` (mm of depth, for the view's pixels; 0 where no room is).
 
     A place is inside where no view that sees it shows it beside the subject by more than ``slack_px``, and at least one
     other sees it. The range goes from the first such place to the last: what lies between may be empty.
     """
+    height, width = near.shape
     for row in range(height):
         for column in range(width):
-            p = row * width + column
-            near[p] = 0.0
-            far[p] = 0.0
-            here = distance_px[start + p]
+            near[row, column] = 0.0
+            far[row, column] = 0.0
+            here = distance_px[start + row * width + column]
             if here > slack_px or here < UNSEEN_PX:
                 continue
             z = low
@@ -43,7 +43,7 @@ def find_room(start, width, height, ways, distance_px, slack_px, low, high, step
                     if distance > UNSEEN_PX:
                         seen += 1
                 if seen > 0:
-                    if near[p] == 0.0:
-                        near[p] = z
-                    far[p] = z
+                    if near[row, column] == 0.0:
+                        near[row, column] = z
+                    far[row, column] = z
                 z += step
