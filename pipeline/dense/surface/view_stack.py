@@ -8,6 +8,7 @@ from jaxtyping import Float, Float32, Int64
 
 from pipeline.compiled import njit
 from pipeline.dense.depth_map import DepthMap
+from pipeline.dense.surface.vote_kernels import DEPTH, FRAME, NORMAL, OUTLINE, SIGMA, Pixels
 from pipeline.imaging.projection import packed_lens
 from pipeline.imaging.projection_kernels import distorted
 from pipeline.imaging.sampling_kernels import held, sample
@@ -34,6 +35,10 @@ class ViewStack:
     starts: Int64[np.ndarray, " k"]
     pixels: Float32[np.ndarray, "p 8"]
 
+    def packed(self) -> Pixels:
+        """For compiled loops."""
+        return Pixels(self.cameras, self.sizes, self.starts, self.pixels)
+
 
 def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhouette], rig: Rig) -> ViewStack:
     """The views of the depth maps, in their order."""
@@ -42,10 +47,10 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
     pixels = np.zeros((starts[-1], 8), np.float32)
     for depth_map, first, last in zip(depth_maps, starts[:-1], starts[1:], strict=True):
         camera, own = rig[depth_map.camera.name], pixels[first:last]
-        own[:, 0] = depth_map.depth_mm.ravel()
-        own[:, 1:4] = depth_map.normal.reshape(-1, 3)
+        own[:, DEPTH] = depth_map.depth_mm.ravel()
+        own[:, NORMAL : NORMAL + 3] = depth_map.normal.reshape(-1, 3)
         alone = depth_map.views.ravel() < VIEWS_SURE
-        own[:, 4] = depth_map.deviation_mm.ravel() * np.where(alone, np.float32(ALONE_FACTOR), np.float32(1))
+        own[:, SIGMA] = depth_map.deviation_mm.ravel() * np.where(alone, np.float32(ALONE_FACTOR), np.float32(1))
         crop = depth_map.camera.intrinsics.values()[:4]
         _outline(crop, packed_lens(camera), depth_map.depth_mm.shape[1], silhouettes[camera.name].distance, own)
     return ViewStack(np.stack([_packed(depth_map.camera) for depth_map in depth_maps]), sizes, starts[:-1], pixels)
@@ -67,5 +72,5 @@ def _outline(crop: np.ndarray, lens: np.ndarray, width: int, distance: np.ndarra
     rows, columns = distance.shape
     for at in range(len(pixels)):
         u, v = distorted((at % width - crop[2]) / crop[0], (at // width - crop[3]) / crop[1], lens)
-        pixels[at, 6] = max(max(-u, u - (columns - 1)), max(-v, v - (rows - 1)))
-        pixels[at, 5] = sample(distance, held(u, columns), held(v, rows))
+        pixels[at, FRAME] = max(max(-u, u - (columns - 1)), max(-v, v - (rows - 1)))
+        pixels[at, OUTLINE] = sample(distance, held(u, columns), held(v, rows))
