@@ -1,5 +1,7 @@
 """The compiled inner loop of the rim's Jacobian: a row a sample, written in place."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import njit
@@ -8,10 +10,31 @@ from pipeline.imaging.projection_kernels import placed, turned
 POSE = 7  # rotation, translation, log scale
 
 
+class Level(NamedTuple):
+    """A mesh level's operator from the cage (compressed sparse rows), and the modes of the cage."""
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    data: np.ndarray
+    modes: np.ndarray
+
+
+class RimSamples(NamedTuple):
+    """The columns of ``rim.Rim`` that its rows follow from."""
+
+    view: np.ndarray
+    corner: np.ndarray
+    blend: np.ndarray
+    point: np.ndarray
+    gradient: np.ndarray
+
+
 @njit(cache=True, nogil=True, fastmath=True)
-def fill_rows(first, last, indptr, indices, data, modes, count, turn, place, cameras, view, corner,
-               blend, point, gradient, out):  # fmt: skip
-    """Modes: the sum over the cage of (gradient . mode), through the level's operator and the edge's blend."""
+def fill_rows(first, last, level, count, turn, place, cameras, rim, out):
+    """``turn`` and ``place``: of the head in the world. Modes: the sum over the cage of (gradient . mode),
+    through the level's operator and the edge's blend."""
+    indptr, indices, data, modes = level
+    view, corner, blend, point, gradient = rim
     for s in range(first, last):
         gx, gy, gz = gradient[s]
         hx = gx * turn[0, 0] + gy * turn[1, 0] + gz * turn[2, 0]

@@ -14,10 +14,10 @@ alone: shifts that no surface explains. A camera of 0.2 px error shows in thousa
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Int
 
 from pipeline.compiled import njit
-from pipeline.fitting.photo.correlation import read
+from pipeline.fitting.photo.correlation import Members, Pictures, Samples, read
 from pipeline.fitting.photo.patches import Patches
 from pipeline.parallel_for import in_threads
 from rig.camera import Camera
@@ -97,32 +97,23 @@ def gram_matrices(
     weights: Float[np.ndarray, " e"],
     view: Int[np.ndarray, "n v"],
     shifts: Float[np.ndarray, " n"],
-    pixel: Float[np.ndarray, "k s 2"],
-    along: Float[np.ndarray, "k s 2"],
-    seen: Bool[np.ndarray, "k s"],
-    size: Int[np.ndarray, "k 2"],
-    offset: Int[np.ndarray, " k"],
-    image: Float32[np.ndarray, " i"],
-    noise: Float[np.ndarray, " k"],
+    samples: Samples,
+    pictures: Pictures,
 ) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
     """<g, g> of the slopes of a patch's views, two axes each, and <g, f> of slopes and grey values, with the surface
     moved by ``shifts`` (mm along the normals)."""
     count, views = view.shape
     slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))
-    start, member = patches.start, patches.member
-    in_threads(
-        count,
-        lambda a, b: _grams(
-            a, b, chosen, start, member, weights, view, shifts, pixel, along, seen, size, offset, image, noise,
-            slopes, mixed,
-        ),
-    )  # fmt: skip
+    members = Members(patches.start, patches.member, weights)
+    in_threads(count, lambda a, b: _grams(a, b, chosen, members, view, shifts, samples, pictures, slopes, mixed))
     return slopes, mixed
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _grams(first, last, chosen, start, member, weight, view, shifts, pixel, along, seen, size, offset, image, noise,
-           slopes, mixed):  # fmt: skip
+def _grams(first, last, chosen, members, view, shifts, samples, pictures, slopes, mixed):
+    start, member, weight = members
+    pixel, along, seen = samples
+    size, offset, image, noise = pictures
     for q in range(first, last):
         begin, count, views = start[chosen[q]], start[chosen[q] + 1] - start[chosen[q]], 0
         while views < view.shape[1] and view[q, views] >= 0:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.fitting.photo.camera_term import camera_sensitivity, gram_matrices
-from pipeline.fitting.photo.correlation import choose_views, correlate, sweep
+from pipeline.fitting.photo.correlation import Pictures, Samples, choose_views, correlate, sweep
 from pipeline.fitting.photo.hair_mask import Sight, under_hair
 from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.fitting.photo.patches import Patches
@@ -167,7 +167,9 @@ def observe(
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
     image, noise = blurred(photographs, each.blur_mm * scale)
     weights, seen = patches.weights(each.window_mm), visibility.facing > 0
-    grey = sweep(visibility.pixel, visibility.along, seen, views.size, views.offset, image, steps)
+    samples = Samples(visibility.pixel, visibility.along, seen)
+    pictures = Pictures(views.size, views.offset, image, noise)
+    grey = sweep(samples, pictures, steps)
     view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
     found = find_peaks(correlate(patches, weights, view, value, seen, grey, noise), steps)
     blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
@@ -178,10 +180,7 @@ def observe(
     overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / settings.centre_mm**2)
     information = 1.0 / (overlap * variance[kept])
     rows, place = patches.centre[kept], found.place[kept]
-    grams = gram_matrices(
-        patches, kept, weights, view[kept], place, visibility.pixel, visibility.along, seen, views.size, views.offset,
-        image, noise,
-    )  # fmt: skip
+    grams = gram_matrices(patches, kept, weights, view[kept], place, samples, pictures)
     stood, normal = visibility.vertices[rows], visibility.normals[rows]
     sensitivity = camera_sensitivity(
         view[kept], value[kept], grams, stood + place[:, None] * normal, normal, visibility.cameras
