@@ -72,9 +72,9 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     sigma = background.noise[cells] @ np.full(3, 1 / 3, np.float32)
     own, paint = image[box], decision.paint[cells]
     args = (LINEAR, own, background.plates[:, *box], light, sigma, zone[cells], probability[cells].astype(np.float32))
-    alpha, _, _ = solve_alpha(*args, paint, COARSE_ALPHA_SIGMA, SHADE, True)
+    alpha, _, _ = solve_alpha(*args, paint, (COARSE_ALPHA_SIGMA, SHADE), True)
     alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)
-    alpha, contrast, trust = solve_alpha(*args, _subject_inside(own, alpha, paint), COARSE_ALPHA_SIGMA, SHADE, False)
+    alpha, contrast, trust = solve_alpha(*args, _subject_inside(own, alpha, paint), (COARSE_ALPHA_SIGMA, SHADE), False)
     alpha = _smooth(alpha, trust, settings.alpha_blur_px)
     unasked = dilated(contrast < 0, 1)
     return Matte(alpha, box, np.where(unasked, np.float32(0), contrast)[np.abs(alpha - 0.5) < 0.25])

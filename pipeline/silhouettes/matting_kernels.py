@@ -39,15 +39,16 @@ def solve_alpha(
     zone: np.ndarray,
     probability: np.ndarray,
     subject: np.ndarray,
-    coarse_sigma: float,
-    shade: float,
+    sigmas: tuple[float, float],
     first: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Alpha (-0.5 to 1.5) of every pixel, and in the band |F - B| in standard deviations of the image's noise (-1
     elsewhere) and 1 / variance of alpha (1 elsewhere).
 
     ``zone``: 0 outside, 1 band, 2 inside, 3 band in which the first guess of the subject's colour is no help.
+    ``sigmas``: standard deviations of alpha about the coarse mask, and of the subject's brightness at the rim.
     """
+    coarse_sigma, shade = sigmas
     height, width = image.shape[:2]
     ch, cw = zone.shape
     columns = np.minimum(np.arange(width) * cw // width, cw - 1)

@@ -22,6 +22,7 @@ from pipeline.fitting.photo.patches import Patches
 from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import rasterise
+from pipeline.parallel_for import thread_count
 from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.geometry import RigidTransform
@@ -84,7 +85,7 @@ def sample_visibility(
         ends[:, seen] = here, further - here
         return facing, ends[0], ends[1], np.isfinite(depth)
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         facing, pixel, along, covered = zip(*pool.map(one, range(len(cameras))), strict=True)
     return SampleVisibility(
         cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along), covered
