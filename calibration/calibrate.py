@@ -21,7 +21,6 @@ from calibration.adjustment.state import (
     observations,
     orthonormal,
     residuals,
-    values_of,
 )
 from calibration.adjustment.timing import TimeOffsets, board_velocities, estimate_offsets
 from calibration.adjustment.world import in_world_frame
@@ -209,7 +208,7 @@ def _prior(
     to each other, and would bend the lenses to explain the rest. What each lens was found to be by itself then counts
     as knowledge, by the share of the noise that is not the corners' own."""
     share = 1.0 - noise**2 / sigma**2
-    mean = np.stack([values_of(lenses[name].intrinsics) for name in names])
+    mean = np.stack([lenses[name].intrinsics.values() for name in names])
     information = np.stack([np.linalg.inv(lenses[name].covariance) for name in names])
     return weak.combine(mean, information * share[:, None, None])
 

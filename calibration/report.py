@@ -112,8 +112,7 @@ def _parameter_table(calibration: Calibration) -> str:
     head = ("camera", *INTRINSICS, "turn x y z, mrad", "shift x y z, mm")
     rows = []
     for camera in calibration.rig:
-        k = camera.intrinsics
-        values = (k.fx, k.fy, k.cx, k.cy, *k.distortion.opencv())
+        values = camera.intrinsics.values()
         sigmas = calibration.intrinsics_sigma[camera.name]
         lens = [
             f"{value:.{2 if i < 4 else 5}f} &plusmn; {sigma:.2g}"

@@ -13,7 +13,22 @@ from itertools import pairwise
 
 import numpy as np
 
+from rig.errors import InputError
+
+THREADS, THREADS_MOST = "EIGENHEAD_THREADS", 512
 SLICES = 8  # of a loop: enough that threads end together
+
+
+def thread_count() -> int:
+    """How many threads share a loop: EIGENHEAD_THREADS, else the CPUs that this process may use. Raises InputError."""
+    given = os.environ.get(THREADS, "").strip()
+    if not given:
+        return len(os.sched_getaffinity(0))
+    if not (given.isascii() and given.isdecimal() and 1 <= int(given[:9]) <= THREADS_MOST):
+        raise InputError(
+            THREADS, [f"is {given!r}; give a whole number from 1 to {THREADS_MOST}, or unset it for one thread a CPU"]
+        )
+    return int(given)
 
 
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:
@@ -22,8 +37,8 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
     The caller takes slices like everyone else. A helper that has not begun when they are gone (all busy, or left behind
     by a fork) is called off, so that nobody waits for it.
     """
-    cores = len(os.sched_getaffinity(0))
-    if cores == 1:
+    threads = thread_count()
+    if threads == 1:
         work(0, count)
         return
     ends = np.linspace(0, count, min(SLICES, count) + 1).astype(int).tolist()
@@ -37,7 +52,7 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
                 return
             work(first, last)
 
-    helpers = [_pool(cores - 1).submit(take) for _ in range(cores - 1)]
+    helpers = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
     take()
     for helper in helpers:
         if not helper.cancel():

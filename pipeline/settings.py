@@ -37,7 +37,7 @@ class SegmentationSettings:
     least_area: float = 0.01  # of the image; a smaller subject is none
     hole_share: float = 0.02  # of the subject: smaller holes that are not quite the plate are filled
     weak_contrast: float = 4.0  # standard deviations between subject and background below which a contour piece is weak
-    other_pieces_warned: float = 0.01  # of the subject: area that differs from the plate but hangs on nothing
+    other_pieces_warned: float = 0.01  # of the subject: foreground not connected to the subject
     other_pieces_unusable: float = 0.15
     weak_share_warned: float = 0.015  # of the contour; 0.003 in 95 % of 66 good views
     weak_share_unusable: float = 0.25

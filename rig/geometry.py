@@ -103,6 +103,17 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
+def rigid_fit(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
+) -> RigidTransform:
+    """target_from_source: the motion T that minimises ``sum_j w_j |target_j - T(source_j)|^2`` (Kabsch 1976), equal
+    weights by default; never a reflection."""
+    share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
+    source_mean, target_mean = share @ source, share @ target
+    rotation = nearest_rotation(((source - source_mean) * share[:, None]).T @ (target - target_mean)).T
+    return RigidTransform(rotation, target_mean - rotation @ source_mean)
+
+
 def look_at(
     centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
 ) -> RigidTransform:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.camera import Camera, lens_jacobians
-from rig.geometry import RigidTransform, cross_matrix, rotation_from_vector
+from rig.geometry import RigidTransform, cross_matrix, nearest_rotation, rotation_from_vector
 from rig.rig import Rig
 
 SUBJECT_RADIUS_MM = 110.0
@@ -117,8 +117,7 @@ def _shifted(rig: Rig, step: np.ndarray) -> Rig:
 def _brought_together(rig: Rig, reference: Rig) -> Rig:
     """Mean over the cameras of camera_from_world(rig)^-1 @ camera_from_world(reference), applied to the world."""
     moves = [camera.camera_from_world.inverse() @ reference[camera.name].camera_from_world for camera in rig]
-    u, _, vt = np.linalg.svd(np.sum([move.rotation for move in moves], axis=0))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation(np.sum([move.rotation for move in moves], axis=0))
     here = np.mean([camera.centre_world for camera in rig], axis=0)
     there = np.mean([reference[camera.name].centre_world for camera in rig], axis=0)
     motion = RigidTransform(rotation, here - rotation @ there)

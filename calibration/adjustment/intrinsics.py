@@ -21,7 +21,6 @@ from calibration.adjustment.state import (
     observations,
     orthonormal,
     residuals,
-    values_of,
 )
 from calibration.board.board import Board
 from calibration.board.corners import Found
@@ -139,7 +138,7 @@ def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> Bundle
 def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTransform]) -> BundleState:
     """The state of one camera at the world's origin."""
     return BundleState(
-        values_of(intrinsics)[None],
+        intrinsics.values()[None],
         np.eye(3)[None],
         np.zeros((1, 3)),
         np.stack([pose.rotation for pose in camera_from_boards]),

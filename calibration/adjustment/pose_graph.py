@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from calibration.adjustment.intrinsics import Lens, board_poses_of, estimate_lens
-from calibration.adjustment.state import BundleState, values_of
+from calibration.adjustment.state import BundleState
 from calibration.board.board import Board
 from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
 from rig.errors import EigenheadError
-from rig.geometry import RigidTransform
+from rig.geometry import RigidTransform, rigid_fit
 
 # Distances below are in squares of the board, seen by the camera. Depth from a single view is good to a percent of the
 # camera's distance, half a square of a usual board; a turned or mirrored board is off by its whole length.
@@ -77,7 +77,7 @@ class Graph:
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
         return BundleState(
-            np.stack([values_of(lenses[name].intrinsics) for name in self.names]),
+            np.stack([lenses[name].intrinsics.values() for name in self.names]),
             np.stack([self.cameras[name].rotation for name in self.names]),
             np.stack([self.cameras[name].translation for name in self.names]),
             np.stack([self.boards[shot].rotation for shot in self.shots]),
@@ -116,13 +116,8 @@ def _candidates(view: View, lens: Lens, board: Board) -> Candidates:
 
 def _turn_motions(board: Board) -> list[RigidTransform]:
     """The motions of the board that take corner i to corner turn[i]."""
-    corners, centre = board.corners(), board.centre()
-    motions = []
-    for turn in board.turns():
-        u, _, vt = np.linalg.svd((corners - centre).T @ (corners[turn] - centre))
-        rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-        motions.append(RigidTransform(rotation, centre - rotation @ centre))
-    return motions
+    corners = board.corners()
+    return [rigid_fit(corners, corners[turn]) for turn in board.turns()]
 
 
 def _edge(a: str, b: str, options: dict[tuple[str, str], Candidates], board: Board) -> Edge | None:

@@ -74,11 +74,6 @@ def intrinsics_of(values: Float[np.ndarray, " 9"], size: tuple[int, int]) -> Int
     return Intrinsics(*size, fx, fy, cx, cy, Distortion(*lens))
 
 
-def values_of(intrinsics: Intrinsics) -> Float[np.ndarray, " 9"]:
-    k = intrinsics
-    return np.array([k.fx, k.fy, k.cx, k.cy, *k.distortion.opencv()])
-
-
 def camera_of(state: BundleState, index: int, name: str, size: tuple[int, int]) -> Camera:
     return Camera(name, intrinsics_of(state.intrinsics[index], size), state.camera_pose(index))
 

@@ -12,6 +12,7 @@ from calibration.adjustment.gauge import align_world, image_distance
 from calibration.adjustment.lens_prior import LensPrior, fixed_prior
 from calibration.adjustment.state import BundleState, Observations, residuals
 from calibration.board.board import Board
+from rig.geometry import rigid_fit
 from rig.rig import Rig
 
 HELD_OUT_EVERY = 5  # every fifth shot is held out once
@@ -120,7 +121,7 @@ def check_against_previous(rig: Rig, previous: Rig | None) -> list[Check]:
 def _check_layout(now: Rig, then: Rig) -> Check:
     order, cost, identity = _assignment(now, then)
     here, there = (np.stack([camera.centre_world for camera in rig]) for rig in (now, then))
-    plain, mirrored = _procrustes(here, there, False), _procrustes(here, there, True)
+    plain, mirrored = _misfit_mm(here, there, False), _misfit_mm(here, there, True)
     spread = float(np.sqrt(((there - there.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if mirrored < 0.2 * min(plain, cost) and plain > 0.05 * spread:
         advice = "turn off mirroring in the cameras or their software, and take the shots again"
@@ -162,12 +163,10 @@ def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
     return best[0], best[1], float(np.linalg.norm(named - there, axis=1).mean())
 
 
-def _procrustes(here: Float[np.ndarray, "c 3"], there: Float[np.ndarray, "c 3"], mirrored: bool) -> float:
+def _misfit_mm(here: Float[np.ndarray, "c 3"], there: Float[np.ndarray, "c 3"], mirrored: bool) -> float:
     """RMS distance (mm) after the best motion, with a reflection if ``mirrored``."""
-    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    sign = np.linalg.det(u @ vt) * (-1.0 if mirrored else 1.0)
-    return float(np.sqrt(((a @ (u @ np.diag([1.0, 1.0, sign]) @ vt) - b) ** 2).sum(axis=1).mean()))
+    points = here * (-1.0, 1.0, 1.0) if mirrored else here
+    return float(np.sqrt(((rigid_fit(points, there).apply(points) - there) ** 2).sum(axis=1).mean()))
 
 
 def _check_lenses(now: Rig, then: Rig) -> Check:

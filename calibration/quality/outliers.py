@@ -11,7 +11,7 @@ from calibration.adjustment.state import BundleState, Observations, intrinsics_o
 from calibration.board.board import Board
 from calibration.board.detection import Detections, View
 from rig.camera import Camera
-from rig.geometry import RigidTransform
+from rig.geometry import RigidTransform, rigid_fit
 
 # A view is out if its RMS is this many times the median view's: with Gaussian corners the ratio passes 1.5 once in 1e4
 # views; moments that differ between cameras spread it to 5.
@@ -156,9 +156,7 @@ def board_scale(
     flat = board.corners()[ids]
     spread = np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum())
     size = float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()) / spread)
-    u, _, vt = np.linalg.svd((flat - flat.mean(axis=0)).T @ (points - points.mean(axis=0)))
-    rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-    place = RigidTransform(rotation, points.mean(axis=0) - size * rotation @ flat.mean(axis=0))
+    place = rigid_fit(size * flat, points)
     misses = [camera.project(place.apply(size * own)) - pixels for camera, own, pixels in triples]
     squares = np.concatenate([(m**2).sum(axis=1) for m in misses])
     return size, float(np.sqrt(squares.mean())) if np.isfinite(squares).all() else np.inf

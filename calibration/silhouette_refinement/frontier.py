@@ -17,7 +17,17 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.tangency import BORDER_PX, Tangency, on_contour
+from pipeline.multiview.tangency import (
+    BORDER_PX,
+    LEAST_SLOPE,
+    LONGEST_SPAN,
+    Tangency,
+    angle_slopes,
+    on_contour,
+    pencil,
+    rays_about,
+    tangency,
+)
 from rig.camera import Camera
 from rig.rig import Rig
 
@@ -26,7 +36,6 @@ REACH = 15  # contour pixels to either side over which an extreme must be one
 PROMINENCE_PX = 0.3  # by how much: an outline straighter than a radius of 400 px has no place on it
 SMOOTH_PX = 1.0  # along the contour: shifts a bend of radius r by 1 / (2 r) px
 INSIDE_PX = 4.0  # this far behind a convex extreme the subject is met
-LONGEST_SPAN = 2.0  # rad: an epipole in or near the silhouette
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,12 +79,7 @@ def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: floa
 
 
 def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
-    base = two.camera.centre_world - one.camera.centre_world
-    axis = base / np.linalg.norm(base)
-    towards = one.rays.mean(axis=0) + two.rays.mean(axis=0)
-    u = towards - axis * (towards @ axis)
-    u /= np.linalg.norm(u)
-    v = np.cross(axis, u)
+    u, v = pencil(one.camera, two.camera, one.rays.mean(axis=0) + two.rays.mean(axis=0))
     angles = [np.arctan2(contour.rays @ v, contour.rays @ u) for contour in (one, two)]
     if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
         return []
@@ -90,17 +94,9 @@ def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
         rivals = np.concatenate([np.delete(apart[i], j), np.delete(apart[:, j], i)])
         if len(rivals) and rivals.min() < 2.0 * gate_px:
             continue
-        slopes, steepness = (first.slopes[i], second.slopes[j]), (float(steep[0][i, 0]), float(steep[1][0, j]))
+        names, pixels = (one.camera.name, two.camera.name), (first.pixels[i], second.pixels[j])
         difference = float(first.angle[i] - second.angle[j])
-        found.append(
-            Tangency(
-                (one.camera.name, two.camera.name),
-                (first.pixels[i], second.pixels[j]),
-                steepness,
-                (slopes[0] / steepness[0], slopes[1] / steepness[1]),
-                (difference / steepness[0], -difference / steepness[1]),
-            )
-        )
+        found.append(tangency(names, pixels, (first.slopes[i], second.slopes[j]), difference))
     return found
 
 
@@ -110,21 +106,11 @@ def _extremes(contour: Contour, angle: Float[np.ndarray, " n"], u: np.ndarray, v
     at = np.flatnonzero((tops | bottoms) & contour.whole)
     side = np.where(tops[at], 1.0, -1.0)
     pixels = contour.pixels[at]
-    slopes = _angle_slopes(contour.camera, pixels, u, v)
+    slopes = angle_slopes(rays_about(contour.camera, pixels), u, v)
     steep = np.linalg.norm(slopes, axis=1)
     ends = np.maximum(side * angle[at - REACH], side * angle[(at + REACH) % len(angle)])
     behind = pixels - INSIDE_PX * (side / np.maximum(steep, 1e-12))[:, None] * slopes
     height, width = contour.mask.shape
     x, y = np.rint(np.clip(behind, 0, [width - 1, height - 1])).astype(int).T
-    good = (steep > 1e-9) & (side * angle[at] - ends > PROMINENCE_PX * steep) & contour.mask[y, x]
+    good = (steep > LEAST_SLOPE) & (side * angle[at] - ends > PROMINENCE_PX * steep) & contour.mask[y, x]
     return _Extremes(angle[at][good], side[good], pixels[good], slopes[good])
-
-
-def _angle_slopes(
-    camera: Camera, pixels: Float[np.ndarray, "e 2"], u: np.ndarray, v: np.ndarray
-) -> Float[np.ndarray, "e 2"]:
-    """Change of a ray's angle in the pencil of epipolar planes per pixel."""
-    shifts = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    rays = camera.rays_world((pixels[:, None] + shifts).reshape(-1, 2))
-    angle = np.arctan2(rays @ v, rays @ u).reshape(-1, 4)
-    return np.stack([angle[:, 0] - angle[:, 1], angle[:, 2] - angle[:, 3]], axis=1) / 2.0

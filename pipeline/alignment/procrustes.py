@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from rig.geometry import Similarity, cross_matrix, rotation_from_vector
+from rig.geometry import Similarity, cross_matrix, nearest_rotation, rotation_from_vector
 
 SCALE_SPREAD = 0.02  # prior on log scale: rigs are metric, and what is left is calibration's error of scale
 ITERATIONS = 20
@@ -20,12 +20,12 @@ def procrustes(
     share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     source_mean, target_mean = share @ source, share @ target
     centred, wanted = source - source_mean, target - target_mean
-    u, singular, vt = np.linalg.svd((wanted * share[:, None]).T @ centred)
+    covariance = (wanted * share[:, None]).T @ centred
+    singular = np.linalg.svd(covariance, compute_uv=False)
     if singular[1] <= 1e-12 * singular[0]:
         raise ValueError("points on a line determine no rotation")
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * signs) @ vt
-    scale = float(singular @ signs / (share @ (centred**2).sum(axis=1)))
+    rotation = nearest_rotation(covariance)
+    scale = float((rotation * covariance).sum() / (share @ (centred**2).sum(axis=1)))
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 

@@ -44,7 +44,7 @@ def depth_maps(
             apart = np.empty(shape, np.float32)
             count_agreeing(
                 int(stack.offset[view]), stack.ways(view, others), stack.lens[others, :2].copy(), matched, depth,
-                slopes, settings.agree_mm, settings.agree_deviations, agreeing, before, apart,
+                slopes, (settings.agree_mm, settings.agree_deviations), agreeing, before, apart,
             )  # fmt: skip
             deviation = stated_deviation(crops[view].camera, fields[view], agreeing, apart)
             clear = (deviation < settings.worst_mm) & (stack.image(matched, view) < settings.worst_mm)

@@ -3,12 +3,12 @@
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.dense.matching_kernels import HEIGHT, START, WIDTH
+from pipeline.imaging.projection_kernels import NEAREST_MM, placed
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def count_agreeing(
-    start, ways, lenses, deviation, depth, slopes, tolerance_mm, deviations, agreeing, before, apart
-):  # fmt: skip
+def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreeing, before, apart):
     """Fills, for every pixel of one view, how many others have the surface at the same place (``agreeing``), how many
     see past it (``before``: the place lies in their free space), and the mean square distance between the views that
     agree (``apart``, mm^2).
@@ -16,8 +16,9 @@ def count_agreeing(
     Two views agree where the distance from the other's plane is below ``tolerance_mm``, or below ``deviations`` of
     their joint standard deviation, half a ``tolerance_mm`` at least. A view in which something nearer stands before the
     place says nothing. ``depth``, ``slopes`` and ``deviation`` are those of all views in one row, ``ways`` as
-    ``Stack.ways`` has them, ``lenses`` fx and fy of the others.
+    ``Stack.ways`` has them, ``lenses`` fx and fy of the others, ``limits`` ``tolerance_mm`` and ``deviations``.
     """
+    tolerance_mm, deviations = limits
     height, width = agreeing.shape
     for row in range(height):
         for column in range(width):
@@ -31,15 +32,14 @@ def count_agreeing(
             total = 0.0
             for k in range(len(ways)):
                 way = ways[k]
-                there = z * (way[6] * column + way[7] * row + way[8]) + way[11]
-                if there < 1.0:
+                x, y, there = placed(way, z * column, z * row, z)
+                if there < NEAREST_MM:
                     continue
-                x = (z * (way[0] * column + way[1] * row + way[2]) + way[9]) / there
-                y = (z * (way[3] * column + way[4] * row + way[5]) + way[10]) / there
-                if x < 0.0 or y < 0.0 or x > way[12] - 1.0 or y > way[13] - 1.0:
+                x, y = x / there, y / there
+                if x < 0.0 or y < 0.0 or x > way[WIDTH] - 1.0 or y > way[HEIGHT] - 1.0:
                     continue
                 i, j = int(x + 0.5), int(y + 0.5)
-                q = int(way[14]) + j * int(way[12]) + i
+                q = int(way[START]) + j * int(way[WIDTH]) + i
                 if depth[q] <= 0.0:
                     continue
                 z_x, z_y = slopes[q, 0], slopes[q, 1]

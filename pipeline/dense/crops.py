@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from pipeline.imaging.grey import LUMINANCE, noise_level
 from pipeline.imaging.silhouette import Silhouette
-from rig.camera import Camera, Intrinsics
+from rig.camera import Camera, Intrinsics, lens_image
 from rig.rig import Rig
 
 LEVELS = 4  # full, half, quarter, eighth
@@ -126,9 +126,9 @@ def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
 def lens_map(camera: Camera, pinhole: Camera) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Column and row at which the camera's photograph shows each pixel of a pinhole at the same pose."""
     k, lens = pinhole.intrinsics, camera.intrinsics
-    column, row = np.meshgrid(np.arange(k.width), np.arange(k.height))
-    normalised = np.stack([(column.ravel() - k.cx) / k.fx, (row.ravel() - k.cy) / k.fy], axis=1)
-    pixel = lens.distortion.apply(normalised) * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+    column, row = np.meshgrid(np.arange(float(k.width)), np.arange(float(k.height)))
+    normalised = pinhole.undistort(np.stack([column.ravel(), row.ravel()], axis=1))
+    pixel = lens_image(np.pad(normalised, ((0, 0), (0, 1)), constant_values=1.0), lens.values())
     pixel[np.linalg.norm(normalised, axis=1) > lens.distortion.turning_radius()] = -1e4
     x, y = pixel.T.astype(np.float32).reshape(2, k.height, k.width)
     return x, y

@@ -5,6 +5,7 @@ import numpy as np
 from pipeline.compiled import njit
 from pipeline.dense.matching_kernels import (
     UNSEEN_PX,
+    Loaded,
     correlate_and_slide,
     distance_there,
     load_window,
@@ -17,27 +18,23 @@ BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken f
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def propagate(start, noise, ways, pairs, distance_px, pattern, contrast, parity, steps, depth, slopes, cost):
+def propagate(sight, parity, steps, depth, slopes, cost):
     """Every pixel of one colour of the chequerboard tries the planes of its neighbours of the other colour, ``steps``
     pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known."""
     height, width = depth.shape
-    window = np.empty((2, pattern.shape[1]), np.float32)
+    ways, window = sight.ways, np.empty((2, sight.pattern.shape[1]), np.float32)
     scores, place = np.empty(len(ways)), np.empty(8)
-    reach = np.abs(pattern).max()
+    reach = np.abs(sight.pattern).max()
     for row in range(height):
         for column in range((row + parity) % 2, width, 2):
             if depth[row, column] <= 0.0:
                 continue
-            total, energy = load_window(
-                pairs, distance_px, start, width, height, column, row, pattern, contrast, window
-            )
+            total, energy = load_window(sight, width, height, column, row, window)
+            loaded = Loaded(column, row, window, total, energy)
             best, best_z = cost[row, column], depth[row, column]
             best_x, best_y = slopes[row, column, 0], slopes[row, column, 1]
             if best < 0.0:
-                best = cost_of(
-                    ways, best_z, best_x, best_y, column, row, reach, pairs, distance_px, pattern, window, total,
-                    energy, noise, place, scores,
-                )  # fmt: skip
+                best = cost_of(sight, loaded, best_z, best_x, best_y, reach, place, scores)
             for step in steps:
                 for side in range(4):
                     i = (step, -step, 0, 0)[side]
@@ -51,10 +48,7 @@ def propagate(start, noise, ways, pairs, distance_px, pattern, contrast, parity,
                     z = there - i * z_x - j * z_y
                     if abs(z - best_z) < 1e-4 * best_z and abs(z_x - best_x) + abs(z_y - best_y) < 0.1:
                         continue
-                    value = cost_of(
-                        ways, z, z_x, z_y, column, row, reach, pairs, distance_px, pattern, window, total, energy,
-                        noise, place, scores,
-                    )  # fmt: skip
+                    value = cost_of(sight, loaded, z, z_x, z_y, reach, place, scores)
                     if value < best:
                         best, best_z, best_x, best_y = value, z, z_x, z_y
             cost[row, column] = best
@@ -64,18 +58,16 @@ def propagate(start, noise, ways, pairs, distance_px, pattern, contrast, parity,
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def slide(
-    start, noise, ways, pairs, distance_px, pattern, contrast, most_px, depth, slopes, place_mm, information, likeness
-):  # fmt: skip
+def slide(sight, most_px, depth, slopes, place_mm, information, likeness):
     """One step of least squares on the depth of every pixel, over all views that show it alike.
 
     Fills ``place_mm`` (where the depth should be; at most ``most_px`` of the most sensitive view away), its
     ``information`` (1 / mm^2 of independent samples; 0 where nothing is known) and the mean ``likeness``.
     """
     height, width = depth.shape
-    window = np.empty((2, pattern.shape[1]), np.float32)
+    ways, window = sight.ways, np.empty((2, sight.pattern.shape[1]), np.float32)
     place, found = np.empty(8), np.empty((len(ways), 3))
-    reach = np.abs(pattern).max()
+    reach = np.abs(sight.pattern).max()
     for row in range(height):
         for column in range(width):
             z = depth[row, column]
@@ -84,19 +76,18 @@ def slide(
             likeness[row, column] = 0.0
             if z <= 0.0:
                 continue
-            total, energy = load_window(
-                pairs, distance_px, start, width, height, column, row, pattern, contrast, window
-            )
+            total, energy = load_window(sight, width, height, column, row, window)
+            loaded = Loaded(column, row, window, total, energy)
             best, fastest, count = 0.0, 0.0, 0
             for k in range(len(ways)):
                 if not place_window(
                     ways[k], z, slopes[row, column, 0], slopes[row, column, 1], column, row, reach, place
                 ):
                     continue
-                beside = distance_there(ways[k], place, distance_px)
+                beside = distance_there(ways[k], place, sight.distance_px)
                 if beside > 0.0 or beside < UNSEEN_PX:
                     continue
-                correlate_and_slide(ways[k], place, pairs, pattern, window, total, energy, noise, found[count])
+                correlate_and_slide(ways[k], place, sight, loaded, found[count])
                 best = max(best, found[count, 0])
                 fastest = max(fastest, place[6] * place[6] + place[7] * place[7])
                 count += 1
@@ -111,5 +102,7 @@ def slide(
                 most = most_px / np.sqrt(fastest)
                 place_mm[row, column] = z + min(max(gradient / curvature, -most), most)
                 # Noise resembles itself by chance: a window counts by the share of its contrast that is not noise.
-                information[row, column] = curvature * max(1.0 - total * noise * noise / max(energy, 1e-6), 0.0)
+                information[row, column] = curvature * max(
+                    1.0 - total * sight.noise * sight.noise / max(energy, 1e-6), 0.0
+                )
                 likeness[row, column] = mean / spoke

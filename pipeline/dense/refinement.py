@@ -14,7 +14,7 @@ from pipeline.dense.crops import UNSEEN_MOST_PX
 from pipeline.dense.field import Field
 from pipeline.dense.field_kernels import double, fit_planes
 from pipeline.dense.refine_kernels import propagate, slide
-from pipeline.dense.stack import SHADES, Stack
+from pipeline.dense.stack import Stack
 from pipeline.parallel_for import in_threads
 from pipeline.settings import DenseSettings
 
@@ -75,22 +75,19 @@ def _refined(
     steps_px: Sequence[int],
     rounds: int,
 ) -> Field:
-    sight = (
-        int(stack.offset[view]), float(stack.noise[view]), stack.ways(view, neighbours), stack.pairs,
-        stack.distance_px, pattern, settings.contrast_levels * SHADES,
-    )  # fmt: skip
+    sight = stack.sight(view, neighbours, pattern, settings.contrast_levels)
     depth, slopes = field.depth.copy(), field.slopes.copy()
     if steps_px:
         cost = np.full(depth.shape, -1.0, np.float32)
         for parity in (0, 1):
-            propagate(*sight, parity, np.array(steps_px), depth, slopes, cost)
+            propagate(sight, parity, np.array(steps_px), depth, slopes, cost)
     live = depth > 0.0
     pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
     before, known = depth, field.information + LEAST_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
     for _ in range(rounds):
         place, seen, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
-        slide(*sight, MOST_SLIDE_PX, depth, slopes, place, seen, likeness)
+        slide(sight, MOST_SLIDE_PX, depth, slopes, place, seen, likeness)
         seen = seen / (settings.match_factor**2 + settings.match_floor_mm**2 * seen)
         information = seen + known
         joined = np.where(live, (seen * place + known * before) / information, 0.0).astype(np.float32)

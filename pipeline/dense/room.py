@@ -76,10 +76,11 @@ def _bounds(
     middle, half = float(camera.camera_from_world.apply(centre)[2]), 0.5 * np.sqrt(3.0) * edge
     step = 2.0 * half / STEPS
     width, height = least.size[view]
+    others = np.delete(np.arange(len(least)), view)
     near, far = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     find_room(
-        view, least.size, least.offset, least.distance_px, least.turn, least.shift, SLACK_PX, max(middle - half, 1.0),
-        middle + half, step, near.ravel(), far.ravel(),
+        int(least.offset[view]), least.ways(view, others), least.distance_px, SLACK_PX, max(middle - half, 1.0),
+        middle + half, step, near, far,
     )  # fmt: skip
     room = near > 0.0
     near[room] -= step

@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int
 
 from pipeline.dense.field import Field
 from pipeline.dense.room import Room
-from pipeline.dense.stack import SHADES, Stack
+from pipeline.dense.stack import Stack
 from pipeline.dense.sweep_kernels import aggregate, sweep_view
 from pipeline.parallel_for import in_threads
 from pipeline.settings import DenseSettings
@@ -35,11 +35,8 @@ def first_fields(
     def work(first: int, last: int) -> None:
         for view in range(first, last):
             cost = np.empty((*rooms[view].near.shape, settings.labels), np.float32)
-            sweep_view(
-                int(stack.offset[view]), float(stack.noise[view]), stack.ways(view, neighbours[view]), stack.pairs,
-                stack.distance_px, pattern, settings.contrast_levels * SHADES, rooms[view].near, rooms[view].far,
-                rooms[view].slopes, cost,
-            )  # fmt: skip
+            sight = stack.sight(view, neighbours[view], pattern, settings.contrast_levels)
+            sweep_view(sight, rooms[view].near, rooms[view].far, rooms[view].slopes, cost)
             fields[view] = _cheapest(cost, rooms[view])
 
     in_threads(len(stack), work)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt32
 
 from pipeline.dense.crops import Crop
+from pipeline.dense.matching_kernels import Sight
 
 SHADES = 256  # of a grey level: the images are smooth, and rounding is to be far below their noise
 
@@ -38,6 +39,15 @@ class Stack:
         return np.column_stack(
             [flat, self.shift[view, others], self.size[others], self.offset[others], self.noise[others]]
         )
+
+    def sight(
+        self, view: int, others: Int[np.ndarray, " m"], pattern: Float32[np.ndarray, "2 s"], contrast_levels: float
+    ) -> Sight:
+        """A view and the others that it is matched with, for compiled loops."""
+        return Sight(
+            int(self.offset[view]), float(self.noise[view]), self.ways(view, others), self.pairs, self.distance_px,
+            pattern, contrast_levels * SHADES,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.size)
@@ -69,7 +79,7 @@ def stack_crops(crops: Sequence[Crop], level: int) -> Stack:
         pairs=np.concatenate([pack_pairs(each.grey).ravel() for each in levels]),
         distance_px=np.concatenate([each.distance_px.ravel() for each in levels]),
         noise=SHADES * np.array([each.noise for each in levels]),
-        lens=np.array([(k.fx, k.fy, k.cx, k.cy) for k in intrinsics]),
+        lens=np.stack([k.values()[:4] for k in intrinsics]),
         turn=turn,
         shift=shift,
     )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.dense.matching_kernels import AGAINST, NO_SAY, load_window, match
+from pipeline.dense.matching_kernels import AGAINST, NO_SAY, Loaded, load_window, match
 
 NOT_COMPARED = 1.0  # cost of a place that no pair of views says anything about: that of no likeness
 ALONE = 0.15  # cost of a place that a single other view speaks for
@@ -29,15 +29,11 @@ def score_best_half(scores, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
-def cost_of(
-    ways, z, z_x, z_y, column, row, reach, pairs, distance_px, pattern, window, total, energy, noise, place, scores
-):  # fmt: skip
+def cost_of(sight, loaded, z, z_x, z_y, reach, place, scores):
     """1 minus the likeness of the loaded window with the other views, if the surface is that plane."""
     count = 0
-    for k in range(len(ways)):
-        score = match(
-            ways[k], z, z_x, z_y, column, row, reach, pairs, distance_px, pattern, window, total, energy, noise, place
-        )
+    for k in range(len(sight.ways)):
+        score = match(sight.ways[k], sight, loaded, z, z_x, z_y, reach, place)
         if score == AGAINST:
             return 1.0 - AGAINST
         if score < NO_SAY:
@@ -47,32 +43,28 @@ def cost_of(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def sweep_view(start, noise, ways, pairs, distance_px, pattern, contrast, near, far, slopes, cost):
+def sweep_view(sight, near, far, slopes, cost):
     """Fills ``cost`` (h, w, labels): 1 minus the likeness at ``near + share (far - near)``, mm.
 
     ``slopes`` (h, w, 4): of near by x and y, of far by x and y, mm a pixel.
     """
     height, width, labels = cost.shape
-    window = np.empty((2, pattern.shape[1]), np.float32)
-    scores, place = np.empty(len(ways)), np.empty(8)
-    reach = np.abs(pattern).max()
+    window = np.empty((2, sight.pattern.shape[1]), np.float32)
+    scores, place = np.empty(len(sight.ways)), np.empty(8)
+    reach = np.abs(sight.pattern).max()
     for row in range(height):
         for column in range(width):
             if far[row, column] <= 0.0:
                 cost[row, column] = NOT_COMPARED
                 continue
-            total, energy = load_window(
-                pairs, distance_px, start, width, height, column, row, pattern, contrast, window
-            )
+            total, energy = load_window(sight, width, height, column, row, window)
+            loaded = Loaded(column, row, window, total, energy)
             for d in range(labels):
                 share = d / (labels - 1.0)
                 z = near[row, column] + share * (far[row, column] - near[row, column])
                 z_x = slopes[row, column, 0] + share * (slopes[row, column, 2] - slopes[row, column, 0])
                 z_y = slopes[row, column, 1] + share * (slopes[row, column, 3] - slopes[row, column, 1])
-                cost[row, column, d] = cost_of(
-                    ways, z, z_x, z_y, column, row, reach, pairs, distance_px, pattern, window, total, energy, noise,
-                    place, scores,
-                )  # fmt: skip
+                cost[row, column, d] = cost_of(sight, loaded, z, z_x, z_y, reach, place, scores)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from rig.geometry import rigid_fit
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
@@ -21,18 +23,6 @@ class Components:
     scores: Float[np.ndarray, "N M"]  # standard deviations
 
 
-def rigid_fit(
-    source: Float[np.ndarray, "V 3"], target: Float[np.ndarray, "V 3"], weights: Float[np.ndarray, " V"]
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
-    """R, t that minimise sum w |R source + t - target|² (Kabsch 1976; no reflection)."""
-    w = weights / weights.sum()
-    source_centre, target_centre = w @ source, w @ target
-    u, _, vt = np.linalg.svd(((source - source_centre) * w[:, None]).T @ (target - target_centre))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    rotation = (vt.T * sign) @ u.T
-    return rotation, target_centre - rotation @ source_centre
-
-
 def align(
     heads: Float[np.ndarray, "N V 3"], weights: Float[np.ndarray, " V"], *, rounds: int = 10
 ) -> Float[np.ndarray, "N V 3"]:
@@ -41,11 +31,9 @@ def align(
     first = heads[0]
     for _ in range(rounds):
         for k, head in enumerate(heads):
-            rotation, translation = rigid_fit(head, mean, weights)
-            aligned[k] = head @ rotation.T + translation
+            aligned[k] = rigid_fit(head, mean, weights).apply(head)
         new = aligned.mean(0)
-        rotation, translation = rigid_fit(new, first, weights)  # else the mean drifts with the first estimates
-        new = new @ rotation.T + translation
+        new = rigid_fit(new, first, weights).apply(new)  # else the mean drifts with the first estimates
         settled = np.abs(new - mean).max() < 1e-6
         mean = new
         if settled:

@@ -22,12 +22,13 @@ from pipeline.fitting import (
     rim_kernels,
     rim_term,
 )
+from pipeline.imaging import projection_kernels, sampling_kernels
 from rig.atomic_write import write_atomically
 
 # What rows of the contour solver depend on, for keys.
 CONTOUR = (
     *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, feature_term, prior_term),
-    *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels),
+    *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels, projection_kernels, sampling_kernels),
 )
 
 

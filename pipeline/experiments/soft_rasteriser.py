@@ -109,8 +109,8 @@ def shape_of(model: HeadModel, world_from_head: Similarity, rig: Rig, modes: int
     basis = np.einsum("ab,mvb->mva", turn, model.basis(MESH, modes), optimize=True)
     cameras = []
     for camera in rig:
-        k, pose = camera.intrinsics, camera.camera_from_world
-        cameras.append([*pose.rotation.ravel(), *pose.translation, k.fx, k.fy, k.cx, k.cy, *k.distortion.opencv()])
+        pose = camera.camera_from_world
+        cameras.append([*pose.rotation.ravel(), *pose.translation, *camera.intrinsics.values()])
     return mean.astype(np.float32), basis.astype(np.float32), np.array(cameras, np.float32)
 
 

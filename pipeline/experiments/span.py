@@ -16,13 +16,12 @@ from jaxtyping import Float
 from pipeline.eigenheads.correspondence.surface_fit import SurfaceFit, fit_surface
 from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.pca import rigid_fit
 from pipeline.eigenheads.subdivision import vertex_areas
 from pipeline.eigenheads.training.model_metrics import of_draws
 from pipeline.experiments.outcome import Outcome
 from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
-from rig.geometry import RigidTransform
+from rig.geometry import rigid_fit
 
 Report = Callable[[str, float], None]
 
@@ -88,7 +87,7 @@ def best_likeness(model: HeadModel, truth: Truth, count: int) -> SurfaceFit:
     """The model fitted to the truth's points, from the seven feature points on; distances to every point."""
     ours = model.vertices(np.zeros(0))
     source = np.array([ours[model.landmarks[name]] for name in truth.features])
-    start = RigidTransform(*rigid_fit(source, np.array(list(truth.features.values())), np.ones(len(source))))
+    start = rigid_fit(source, np.array(list(truth.features.values())))
     some = np.random.default_rng(0).permutation(len(truth.points))[:POINTS]
     areas = truth.areas[some] * (truth.areas.sum() / truth.areas[some].sum())
     rough = fit_surface(model, truth.points[some], areas, start, count, sigma_mm=SIGMA_MM)

@@ -17,7 +17,22 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
 
-from pipeline.fitting.rim_kernels import normals_and_planes, projected_with_slopes, see, swept
+from pipeline.fitting.rim_kernels import (
+    BLEND,
+    COLUMNS,
+    LENGTH,
+    NX,
+    RESIDUAL,
+    SLOPE,
+    Pictures,
+    Surface,
+    U,
+    X,
+    find_rim_samples,
+    normals_and_planes,
+    projected_with_slopes,
+    sweep_views,
+)
 from pipeline.imaging.projection import packed_lens
 from pipeline.parallel_for import in_threads
 from rig.rig import Rig
@@ -48,6 +63,10 @@ class Views:
     size: Int32[np.ndarray, "k 2"]  # width, height
     distance: Float32[np.ndarray, " pixels"]  # all views, one after the other, row by row
     offset: Int[np.ndarray, " k"]
+
+    def packed(self) -> Float[np.ndarray, "k 22"]:
+        """The cameras as ``packed_camera`` has them."""
+        return np.concatenate([self.rotation.reshape(-1, 9), self.translation, self.lens], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,52 +138,46 @@ def find_rim(
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
     normals, planes = normals_and_planes(vertices, topology.faces)
+    surface = Surface(vertices, normals, topology.faces, topology.edges)
     words = [slice(k, k + VIEWS_A_WORD) for k in range(0, len(views.names), VIEWS_A_WORD)]
-    found = [
-        part for some in words for part in _outlines(topology, vertices, normals, planes, faces, views, some, averaged)
-    ]
+    found = [part for some in words for part in _outlines(surface, planes, faces, views, some, averaged)]
     view = np.repeat(np.arange(len(found), dtype=np.int32), [len(corner) for corner, _ in found])
     corner, values = (np.concatenate([part[i] for part in found]) for i in (0, 1))
     return Rim(
-        view, corner, values[:, 0], values[:, 1:4], values[:, 4:7], values[:, 7:9], values[:, 9:11], values[:, 11],
-        values[:, 12],
+        view, corner, values[:, BLEND], values[:, X : X + 3], values[:, SLOPE : SLOPE + 3], values[:, U : U + 2],
+        values[:, NX : NX + 2], values[:, LENGTH], values[:, RESIDUAL],
     )  # fmt: skip
 
 
 def _outlines(
-    topology: Topology,
-    vertices: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
+    surface: Surface,
     planes: Float[np.ndarray, "4 f"],
-    speaking: Int32[np.ndarray, " s"],
+    active: Int32[np.ndarray, " s"],
     views: Views,
     some: slice,
     averaged: bool,
-) -> list[tuple[Int32[np.ndarray, "_ 2"], Float[np.ndarray, "_ 13"]]]:
-    """Of each view, at most VIEWS_A_WORD: corners, and the columns of ``Rim`` from the blend on.
+) -> list[tuple[Int32[np.ndarray, "_ 2"], Float[np.ndarray, "_ 14"]]]:
+    """Of each view, at most VIEWS_A_WORD: corners, and samples as ``rim_kernels`` names their columns.
 
     Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.
     """
-    rotation, translation = views.rotation[some], views.translation[some]
-    centres = -np.einsum("kji,kj->ki", rotation, translation)
-    by_bits = swept(vertices, normals, planes, topology.faces, topology.edges, speaking, centres)
-    counts = np.zeros(len(rotation), np.int64)
-    corners = np.empty((len(rotation), SAMPLES_MOST, 2), np.int32)
-    floats = np.empty((len(rotation), SAMPLES_MOST, 14))
+    centres = -np.einsum("kji,kj->ki", views.rotation[some], views.translation[some])
+    pictures = Pictures(views.packed()[some], centres, views.size[some], views.distance, views.offset[some])
+    sweep = sweep_views(surface, planes, active, centres)
+    counts = np.zeros(len(centres), np.int64)
+    corners = np.empty((len(centres), SAMPLES_MOST, 2), np.int32)
+    samples = np.empty((len(centres), SAMPLES_MOST, COLUMNS))
+    steps = np.array(STEPS_OUT_PX)
 
-    def look(first: int, last: int) -> None:
-        see(
-            first, last, vertices, normals, topology.faces, topology.edges, *by_bits, rotation, translation,
-            views.lens[some], views.size[some], views.distance, views.offset[some], np.array(STEPS_OUT_PX),
-            averaged, counts, corners, floats,
-        )  # fmt: skip
+    def fill(first: int, last: int) -> None:
+        find_rim_samples(first, last, surface, sweep, pictures, steps, averaged, counts, corners, samples)
 
-    in_threads(len(rotation), look)
-    return [(corners[k, :count], floats[k, :count, :13]) for k, count in enumerate(counts.tolist())]
+    in_threads(len(centres), fill)
+    return [(corners[k, :count], samples[k, :count]) for k, count in enumerate(counts.tolist())]
 
 
 def project_with_slopes(
     points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
     """Pixel of every point in the view named beside it, and d(pixel) / d(point)."""
-    return projected_with_slopes(points_world, view, views.rotation, views.translation, views.lens)
+    return projected_with_slopes(points_world, view, views.packed())

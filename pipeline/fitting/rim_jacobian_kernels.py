@@ -1,16 +1,40 @@
 """The compiled inner loop of the rim's Jacobian: a row a sample, written in place."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.imaging.projection_kernels import placed, turned
 
 POSE = 7  # rotation, translation, log scale
 
 
+class Level(NamedTuple):
+    """A mesh level's operator from the cage (compressed sparse rows), and the modes of the cage."""
+
+    indptr: np.ndarray
+    indices: np.ndarray
+    data: np.ndarray
+    modes: np.ndarray
+
+
+class RimSamples(NamedTuple):
+    """The columns of ``rim.Rim`` that its rows follow from."""
+
+    view: np.ndarray
+    corner: np.ndarray
+    blend: np.ndarray
+    point: np.ndarray
+    gradient: np.ndarray
+
+
 @njit(cache=True, nogil=True, fastmath=True)
-def fill_rows(first, last, indptr, indices, data, modes, count, turn, place, rotation, translation, view, corner,
-               blend, point, gradient, out):  # fmt: skip
-    """Modes: the sum over the cage of (gradient . mode), through the level's operator and the edge's blend."""
+def fill_rows(first, last, level, count, turn, place, cameras, rim, out):
+    """``turn`` and ``place``: of the head in the world. Modes: the sum over the cage of (gradient . mode),
+    through the level's operator and the edge's blend."""
+    indptr, indices, data, modes = level
+    view, corner, blend, point, gradient = rim
     for s in range(first, last):
         gx, gy, gz = gradient[s]
         hx = gx * turn[0, 0] + gy * turn[1, 0] + gz * turn[2, 0]
@@ -31,16 +55,10 @@ def fill_rows(first, last, indptr, indices, data, modes, count, turn, place, rot
         out[s, count + 6] = (
             gx * (point[s, 0] - place[0]) + gy * (point[s, 1] - place[1]) + gz * (point[s, 2] - place[2])
         )
-        r, t = rotation[view[s]], translation[view[s]]
-        _fill_rigid(
-            r[0, 0] * point[s, 0] + r[0, 1] * point[s, 1] + r[0, 2] * point[s, 2] + t[0],
-            r[1, 0] * point[s, 0] + r[1, 1] * point[s, 1] + r[1, 2] * point[s, 2] + t[1],
-            r[2, 0] * point[s, 0] + r[2, 1] * point[s, 1] + r[2, 2] * point[s, 2] + t[2],
-            r[0, 0] * gx + r[0, 1] * gy + r[0, 2] * gz,
-            r[1, 0] * gx + r[1, 1] * gy + r[1, 2] * gz,
-            r[2, 0] * gx + r[2, 1] * gy + r[2, 2] * gz,
-            out[s], count + POSE,
-        )  # fmt: skip
+        camera = cameras[view[s]]
+        x, y, z = placed(camera, point[s, 0], point[s, 1], point[s, 2])
+        ax, ay, az = turned(camera, gx, gy, gz)
+        _fill_rigid(x, y, z, ax, ay, az, out[s], count + POSE)
 
 
 @njit(cache=True, fastmath=True)

@@ -3,22 +3,60 @@
 Plain loops over arrays; the views are shared out to threads. ``rim`` says what they are for.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.imaging.projection_kernels import NOWHERE, distorted
+from pipeline.imaging.projection_kernels import project, projection_slopes
+from pipeline.imaging.sampling_kernels import cell, sample_row
 
 BLOCK = 1024  # faces whose planes stay in the cache while all views look at them
+# Columns of a sample: weight of its edge's second vertex; world point; d(outline along its normal) / d(point), before
+# that the surface normal; pixel; the outline's normal; px of outline that it stands for; signed distance read there;
+# the sample found before it on an edge of the same first vertex.
+BLEND, X, Y, Z, SLOPE, U, V, NX, NY, LENGTH, RESIDUAL, NEXT, COLUMNS = 0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 12, 13, 14
 LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by more than 60 degrees, they are no curve
 
 
+class Surface(NamedTuple):
+    """A mesh level in the world; ``edges``: from, to (as in face one), face one, face two or -1."""
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    edges: np.ndarray
+
+
+class Sweep(NamedTuple):
+    """What all views say of faces, edges and vertices: a word each, with a bit a view."""
+
+    facing: np.ndarray  # of all faces: that look to the view
+    outline: np.ndarray  # edges where the number of layers changes in some view,
+    outline_words: np.ndarray
+    behind: np.ndarray  # of all vertices: whose normals look away
+    crossed: np.ndarray  # faces that the rim crosses in some view,
+    crossed_words: np.ndarray
+
+
+class Pictures(NamedTuple):
+    """The views: cameras as ``packed_camera`` has them, their centres, and their signed distances one after another."""
+
+    cameras: np.ndarray
+    centres: np.ndarray
+    size: np.ndarray  # width, height
+    distance: np.ndarray
+    offset: np.ndarray
+
+
 @njit(cache=True, fastmath=True)
-def projected_with_slopes(points, view, rotation, translation, lens):
+def projected_with_slopes(points, view, cameras):
     pixels, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
     for n in range(len(points)):
-        k = view[n]
-        pixels[n] = _project(points[n], rotation[k], translation[k], lens[k])
-        slopes[n] = _projection_jacobian(points[n], rotation[k], translation[k], lens[k])
+        camera = cameras[view[n]]
+        x, y, z = points[n]
+        pixels[n] = project(camera, x, y, z)
+        slopes[n, 0], slopes[n, 1] = projection_slopes(camera, x, y, z)
     return pixels, slopes
 
 
@@ -45,53 +83,6 @@ def normals_and_planes(vertices, faces):
 
 
 @njit(cache=True, fastmath=True)
-def _project(point, rotation, translation, lens):
-    """Pixel of a world point; not finite behind the camera or past the lens's turning radius."""
-    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
-    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
-    z = rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2]
-    if z <= 1.0:
-        return NOWHERE, NOWHERE
-    return distorted(x / z, y / z, lens)
-
-
-@njit(cache=True, fastmath=True)
-def _slopes(point, rotation, translation, lens):
-    """P = d(pixel) / d(world point): the two rows, x and y, as six numbers."""
-    x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
-    y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
-    iz = 1.0 / (rotation[2, 0] * point[0] + rotation[2, 1] * point[1] + rotation[2, 2] * point[2] + translation[2])
-    x, y = x * iz, y * iz
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
-    slope = 2.0 * (lens[4] + r2 * (2.0 * lens[5] + 3.0 * r2 * lens[8]))
-    xy = slope * x * y + 2.0 * lens[6] * x + 2.0 * lens[7] * y
-    xx = lens[0] * iz * (radial + slope * x * x + 2.0 * lens[6] * y + 6.0 * lens[7] * x)
-    yy = lens[1] * iz * (radial + slope * y * y + 6.0 * lens[6] * y + 2.0 * lens[7] * x)
-    xy, yx = lens[0] * iz * xy, lens[1] * iz * xy
-    dx0, dx1, dx2 = (
-        rotation[0, 0] - x * rotation[2, 0],
-        rotation[0, 1] - x * rotation[2, 1],
-        rotation[0, 2] - x * rotation[2, 2],
-    )
-    dy0, dy1, dy2 = (
-        rotation[1, 0] - y * rotation[2, 0],
-        rotation[1, 1] - y * rotation[2, 1],
-        rotation[1, 2] - y * rotation[2, 2],
-    )
-    return (
-        (xx * dx0 + xy * dy0, xx * dx1 + xy * dy1, xx * dx2 + xy * dy2),
-        (yx * dx0 + yy * dy0, yx * dx1 + yy * dy1, yx * dx2 + yy * dy2),
-    )
-
-
-@njit(cache=True, fastmath=True)
-def _projection_jacobian(point, rotation, translation, lens):
-    """P = d(pixel) / d(world point), 2 x 3."""
-    return np.array(_slopes(point, rotation, translation, lens))
-
-
-@njit(cache=True, fastmath=True)
 def _facing(planes, centres):
     """By face a word: bit k is set where it looks to view k."""
     words = np.zeros(planes.shape[1], np.uint64)
@@ -114,7 +105,7 @@ def _side(vertex, normal, centre):
 
 
 @njit(cache=True, fastmath=True)
-def _turned(vertices, normals, centres):
+def _back_facing(vertices, normals, centres):
     """By vertex a word: bit k is set where its normal looks away from view k."""
     words = np.zeros(len(vertices), np.uint64)
     for v in range(len(vertices)):
@@ -127,7 +118,7 @@ def _turned(vertices, normals, centres):
 
 
 @njit(cache=True, fastmath=True)
-def _folds(edges, facing):
+def _silhouette_edges(edges, facing):
     """The edges where the number of layers changes in some view, and the word of those views; borders in all."""
     count = 0
     for e in range(len(edges)):
@@ -147,36 +138,36 @@ def _folds(edges, facing):
 
 
 @njit(cache=True, fastmath=True)
-def _crossed(faces, speaking, turned):
-    """The speaking faces that the rim crosses in some view, and the word of those views."""
-    which, words = np.empty(len(speaking), np.int32), np.empty(len(speaking), np.uint64)
+def _crossed(faces, active, behind):
+    """The active faces that the rim crosses in some view, and the word of those views."""
+    which, words = np.empty(len(active), np.int32), np.empty(len(active), np.uint64)
     count = 0
-    for s in range(len(speaking)):
-        a, b, c = faces[speaking[s]]
-        word = (turned[a] ^ turned[b]) | (turned[a] ^ turned[c])
+    for s in range(len(active)):
+        a, b, c = faces[active[s]]
+        word = (behind[a] ^ behind[b]) | (behind[a] ^ behind[c])
         if word:
-            which[count], words[count] = speaking[s], word
+            which[count], words[count] = active[s], word
             count += 1
     return which[:count], words[:count]
 
 
 @njit(cache=True, fastmath=True)
-def _chain(vertices, edges, folds, words, bit, facing, rotation, translation, lens):
-    """Image of one view's folds: x0 y0 x1 y1, directed as in the face that looks to the camera (against the direction
+def _chain(surface, sweep, bit, camera):
+    """Image of one view's outline: x0 y0 x1 y1, directed as in the face that looks to the camera (against the direction
     in one that looks away), and by how many layers."""
-    total = 0
-    for word in words:
+    vertices, total = surface.vertices, 0
+    for word in sweep.outline_words:
         total += 1 if word & bit else 0
     chain = np.empty((total, 5))
     i = 0
-    for j in range(len(folds)):
-        if not words[j] & bit:
+    for j in range(len(sweep.outline)):
+        if not sweep.outline_words[j] & bit:
             continue
-        a, b, one, two = edges[folds[j]]
-        if not facing[one] & bit:
+        a, b, one, two = surface.edges[sweep.outline[j]]
+        if not sweep.facing[one] & bit:
             a, b = b, a
-        chain[i, 0], chain[i, 1] = _project(vertices[a], rotation, translation, lens)
-        chain[i, 2], chain[i, 3] = _project(vertices[b], rotation, translation, lens)
+        chain[i, 0], chain[i, 1] = project(camera, vertices[a, 0], vertices[a, 1], vertices[a, 2])
+        chain[i, 2], chain[i, 3] = project(camera, vertices[b, 0], vertices[b, 1], vertices[b, 2])
         chain[i, 4] = 1.0 if two < 0 else 2.0
         i += 1
     return chain
@@ -225,32 +216,32 @@ def _layers(x, y, start, entries):
 
 
 @njit(cache=True, fastmath=True)
-def _bilinear(distance, offset, width, height, x, y):
-    x0, y0 = min(max(int(np.floor(x)), 0), width - 2), min(max(int(np.floor(y)), 0), height - 2)
-    fx, fy = x - x0, y - y0
-    i = offset + y0 * width + x0
-    top = distance[i] * (1.0 - fx) + distance[i + 1] * fx
-    bottom = distance[i + width] * (1.0 - fx) + distance[i + width + 1] * fx
-    return top * (1.0 - fy) + bottom * fy
+def _read(pictures, k, x, y):
+    """The signed distance of a view at a pixel."""
+    width, height = pictures.size[k]
+    column, right = cell(x, width)
+    row, down = cell(y, height)
+    return sample_row(pictures.distance, pictures.offset[k] + row * width + column, width, right, down)
 
 
 @njit(cache=True, fastmath=True)
-def _crossings(vertices, normals, turned, faces, crossed, words, bit, centre, corners, floats):
+def _crossings(surface, sweep, bit, centre, corners, samples):
     """Zero crossings of N . (X - C) along the edges of the crossed faces; each edge once. Fills the sample's edge,
-    blend, point, normal (in the place of the gradient); returns how many, and the segments that join them."""
+    blend, point, normal (in the place of the slope); returns how many, and the segments that join them."""
+    vertices, normals, faces, behind = surface.vertices, surface.normals, surface.faces, sweep.behind
     kept_index = np.full(len(vertices), -1, np.int32)
     segments = np.empty((corners.shape[0], 2), np.int32)
     count = joined = 0
     ends = np.empty(2, np.int32)
-    for s in range(len(crossed)):
-        if not words[s] & bit:
+    for s in range(len(sweep.crossed)):
+        if not sweep.crossed_words[s] & bit:
             continue
-        f = crossed[s]
+        f = sweep.crossed[s]
         n = 0
         for j in range(3):
             k = (j + 1) % 3
             a, b = min(faces[f, j], faces[f, k]), max(faces[f, j], faces[f, k])
-            if not (turned[a] ^ turned[b]) & bit:
+            if not (behind[a] ^ behind[b]) & bit:
                 continue
             # An edge has at most two faces: the sample that the first made is found by its ends.
             found = -1
@@ -259,7 +250,7 @@ def _crossings(vertices, normals, turned, faces, crossed, words, bit, centre, co
                 if corners[probe, 1] == b:
                     found = probe
                     break
-                probe = np.int32(floats[probe, 13])
+                probe = np.int32(samples[probe, NEXT])
             if found < 0:
                 if count >= corners.shape[0]:
                     return count, joined, segments
@@ -268,17 +259,17 @@ def _crossings(vertices, normals, turned, faces, crossed, words, bit, centre, co
                 here, there = _side(vertices[a], normals[a], centre), _side(vertices[b], normals[b], centre)
                 t = min(max(here / (here - there), 0.0), 1.0)
                 corners[found, 0], corners[found, 1] = a, b
-                floats[found, 0] = t
+                samples[found, BLEND] = t
                 # The chord lies below the surface: by t (1 - t) / 2 (n_b - n_a) . (b - a), its sagitta.
                 bend = 0.0
                 for c in range(3):
                     bend += (normals[b, c] - normals[a, c]) * (vertices[b, c] - vertices[a, c])
                 for c in range(3):
-                    floats[found, 4 + c] = (1.0 - t) * normals[a, c] + t * normals[b, c]
-                    lift = 0.5 * t * (1.0 - t) * bend * floats[found, 4 + c]
-                    floats[found, 1 + c] = (1.0 - t) * vertices[a, c] + t * vertices[b, c] + lift
-                floats[found, 11] = 0.0
-                floats[found, 13] = kept_index[a]
+                    samples[found, SLOPE + c] = (1.0 - t) * normals[a, c] + t * normals[b, c]
+                    lift = 0.5 * t * (1.0 - t) * bend * samples[found, SLOPE + c]
+                    samples[found, X + c] = (1.0 - t) * vertices[a, c] + t * vertices[b, c] + lift
+                samples[found, LENGTH] = 0.0
+                samples[found, NEXT] = kept_index[a]
                 kept_index[a] = found
             if n < 2:
                 ends[n] = found
@@ -290,30 +281,28 @@ def _crossings(vertices, normals, turned, faces, crossed, words, bit, centre, co
 
 
 @njit(cache=True, fastmath=True)
-def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words, bit, rotation,
-          translation, lens, width, height, distance, offset, steps, averaged, corners, floats):  # fmt: skip
-    """One view: fills ``corners`` and ``floats`` with the samples on the outer outline; returns their number."""
-    centre = -(rotation.T @ translation)
-    chain = _chain(vertices, edges, folds, fold_words, bit, facing, rotation, translation, lens)
-    start, entries = _rows(chain, height)
-    count, joined, segments = _crossings(
-        vertices, normals, turned, faces, crossed, crossed_words, bit, centre, corners, floats
-    )
+def _view(k, surface, sweep, bit, pictures, steps, averaged, corners, samples):
+    """One view: fills ``corners`` and ``samples`` with the samples on the outer outline; returns their number."""
+    camera = pictures.cameras[k]
+    width, height = pictures.size[k]
+    start, entries = _rows(_chain(surface, sweep, bit, camera), height)
+    count, joined, segments = _crossings(surface, sweep, bit, pictures.centres[k], corners, samples)
     for s in range(count):
-        floats[s, 7], floats[s, 8] = _project(floats[s, 1:4], rotation, translation, lens)
+        samples[s, U], samples[s, V] = project(camera, samples[s, X], samples[s, Y], samples[s, Z])
     for j in range(joined):
         a, b = segments[j]
-        half = 0.5 * np.sqrt((floats[a, 7] - floats[b, 7]) ** 2 + (floats[a, 8] - floats[b, 8]) ** 2)
-        floats[a, 11] += half
-        floats[b, 11] += half
+        dx, dy = samples[b, U] - samples[a, U], samples[b, V] - samples[a, V]
+        half = 0.5 * np.sqrt(dx * dx + dy * dy)
+        samples[a, LENGTH] += half
+        samples[b, LENGTH] += half
     kept, place = 0, np.full(count, -1, np.int32)
     for s in range(count):
-        u, v = floats[s, 7], floats[s, 8]
+        u, v = samples[s, U], samples[s, V]
         if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
             continue
-        to_x, to_y = _slopes(floats[s, 1:4], rotation, translation, lens)
+        to_x, to_y = projection_slopes(camera, samples[s, X], samples[s, Y], samples[s, Z])
         # l = N^T P^+ through the 2 x 2 normal matrix of P's rows.
-        n0, n1, n2 = floats[s, 4], floats[s, 5], floats[s, 6]
+        n0, n1, n2 = samples[s, SLOPE], samples[s, SLOPE + 1], samples[s, SLOPE + 2]
         g00 = to_x[0] ** 2 + to_x[1] ** 2 + to_x[2] ** 2
         g11 = to_y[0] ** 2 + to_y[1] ** 2 + to_y[2] ** 2
         g01 = to_x[0] * to_y[0] + to_x[1] * to_y[1] + to_x[2] * to_y[2]
@@ -331,22 +320,22 @@ def _view(vertices, normals, faces, edges, facing, folds, fold_words, turned, cr
         if covered:
             continue
         corners[kept, 0], corners[kept, 1] = corners[s, 0], corners[s, 1]
-        for c in range(4):
-            floats[kept, c] = floats[s, c]
+        for c in range(SLOPE):  # blend and point
+            samples[kept, c] = samples[s, c]
         for c in range(3):
-            floats[kept, 4 + c] = nx * to_x[c] + ny * to_y[c]
-        floats[kept, 7], floats[kept, 8], floats[kept, 9], floats[kept, 10] = u, v, nx, ny
-        floats[kept, 11] = floats[s, 11]
-        floats[kept, 12] = _bilinear(distance, offset, width, height, u, v)
+            samples[kept, SLOPE + c] = nx * to_x[c] + ny * to_y[c]
+        samples[kept, U], samples[kept, V], samples[kept, NX], samples[kept, NY] = u, v, nx, ny
+        samples[kept, LENGTH] = samples[s, LENGTH]
+        samples[kept, RESIDUAL] = _read(pictures, k, u, v)
         place[s] = kept
         kept += 1
     if averaged:
-        _average(segments[:joined], place, kept, distance, offset, width, height, floats)
+        _average(segments[:joined], place, kept, pictures, k, samples)
     return kept
 
 
 @njit(cache=True, fastmath=True)
-def _average(segments, place, kept, distance, offset, width, height, floats):
+def _average(segments, place, kept, pictures, k, samples):
     """Residuals as means over the outline that samples stand for, half way to their neighbours.
 
     The rim crosses the mesh every 2 to 6 px, and the noise of a contour is another after 2 px: read at the samples
@@ -357,9 +346,9 @@ def _average(segments, place, kept, distance, offset, width, height, floats):
         a, b = place[segments[j, 0]], place[segments[j, 1]]
         if a < 0 or b < 0:
             continue
-        dx, dy = floats[b, 7] - floats[a, 7], floats[b, 8] - floats[a, 8]
+        dx, dy = samples[b, U] - samples[a, U], samples[b, V] - samples[a, V]
         half = 0.5 * np.sqrt(dx * dx + dy * dy)
-        turn_x, turn_y = floats[b, 9] - floats[a, 9], floats[b, 10] - floats[a, 10]
+        turn_x, turn_y = samples[b, NX] - samples[a, NX], samples[b, NY] - samples[a, NY]
         if 2.0 * half > LONGEST_PX or turn_x * turn_x + turn_y * turn_y > 1.0:
             continue
         bend = turn_x * dx + turn_y * dy  # the outline bulges over the chord by t (1 - t) / 2 of it, its sagitta
@@ -368,32 +357,31 @@ def _average(segments, place, kept, distance, offset, width, height, floats):
             t = (i + 0.5) / (2 * reads)
             end = a if i < reads else b
             lift = 0.5 * t * (1.0 - t) * bend
-            x = floats[a, 7] + t * dx + lift * floats[end, 9]
-            y = floats[a, 8] + t * dy + lift * floats[end, 10]
-            total[end] += half / reads * _bilinear(distance, offset, width, height, x, y)
+            x = samples[a, U] + t * dx + lift * samples[end, NX]
+            y = samples[a, V] + t * dy + lift * samples[end, NY]
+            total[end] += half / reads * _read(pictures, k, x, y)
         read[a] += half
         read[b] += half
     for s in range(kept):
-        if floats[s, 11] > 0.0:
-            floats[s, 12] = (total[s] + (floats[s, 11] - read[s]) * floats[s, 12]) / floats[s, 11]
+        if samples[s, LENGTH] > 0.0:
+            samples[s, RESIDUAL] = (total[s] + (samples[s, LENGTH] - read[s]) * samples[s, RESIDUAL]) / samples[
+                s, LENGTH
+            ]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def swept(vertices, normals, planes, faces, edges, speaking, centres):
-    """What all views ask of faces, edges and vertices: a bit of a word for each view."""
+def sweep_views(surface, planes, active, centres):
+    """A ``Sweep`` of at most 64 views, of whose rim the ``active`` faces may speak."""
     facing = _facing(planes, centres)
-    folds, fold_words = _folds(edges, facing)
-    turned = _turned(vertices, normals, centres)
-    crossed, crossed_words = _crossed(faces, speaking, turned)
-    return facing, folds, fold_words, turned, crossed, crossed_words
+    outline, outline_words = _silhouette_edges(surface.edges, facing)
+    behind = _back_facing(surface.vertices, surface.normals, centres)
+    crossed, crossed_words = _crossed(surface.faces, active, behind)
+    return Sweep(facing, outline, outline_words, behind, crossed, crossed_words)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def see(first, last, vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
-         rotation, translation, lens, size, distance, offset, steps, averaged, counts, corners, floats):  # fmt: skip
+def find_rim_samples(first, last, surface, sweep, pictures, steps, averaged, counts, corners, samples):
+    """Of views ``first`` to ``last``: fills ``counts``, ``corners`` (the edge's two vertices) and ``samples``."""
     for k in range(first, last):
-        counts[k] = _view(
-            vertices, normals, faces, edges, facing, folds, fold_words, turned, crossed, crossed_words,
-            np.uint64(1) << np.uint64(k), rotation[k], translation[k], lens[k], size[k, 0], size[k, 1], distance,
-            offset[k], steps, averaged, corners[k], floats[k],
-        )  # fmt: skip
+        bit = np.uint64(1) << np.uint64(k)
+        counts[k] = _view(k, surface, sweep, bit, pictures, steps, averaged, corners[k], samples[k])

@@ -25,7 +25,7 @@ from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.clutter import held_inside, without_clutter
 from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State, moved_views
 from pipeline.fitting.rim import Rim, find_rim
-from pipeline.fitting.rim_jacobian_kernels import fill_rows
+from pipeline.fitting.rim_jacobian_kernels import Level, RimSamples, fill_rows
 from pipeline.parallel_for import in_threads
 
 OUTSIDE_SCALE = 2.0  # robust scale where the model sticks out of the input, by the other side's; 3 (10 px at least)
@@ -116,15 +116,14 @@ def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> F
     operator = basis.operator
     rows = np.empty((len(rim.view), stage.modes + POSE + PER_CAMERA))
     # One type for every level, or the loop is compiled once for each.
-    start, member = operator.indptr.astype(np.int64), operator.indices.astype(np.int64)
-    blend, point, gradient = (np.ascontiguousarray(part) for part in (rim.blend, rim.point, rim.gradient))
-    turn = pose.scale * pose.rotation
+    level = Level(operator.indptr.astype(np.int64), operator.indices.astype(np.int64), operator.data, basis.modes)
+    samples = RimSamples(
+        rim.view, rim.corner, *(np.ascontiguousarray(part) for part in (rim.blend, rim.point, rim.gradient))
+    )
+    turn, cameras = pose.scale * pose.rotation, views.packed()
 
     def fill(first: int, last: int) -> None:
-        fill_rows(
-            first, last, start, member, operator.data, basis.modes, stage.modes, turn, pose.translation, views.rotation,
-            views.translation, rim.view, rim.corner, blend, point, gradient, rows,
-        )  # fmt: skip
+        fill_rows(first, last, level, stage.modes, turn, pose.translation, cameras, samples, rows)
 
     in_threads(len(rows), fill)
     return rows

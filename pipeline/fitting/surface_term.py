@@ -2,8 +2,8 @@
 
 An observation says that a vertex of the full level lies ``displacement`` mm along a normal from where it stood when it
 was observed, with an information (mm^-2). Sliding along the surface is free, as for the rim. Where it came from images,
-it leans on the cameras: moving camera k by c_k moves the observed place by ``by_camera . c_k``, and what the images say
-of the cameras alone (shifts between them that no surface explains) stands in ``camera_matrix``. With
+it depends on the cameras: moving camera k by c_k moves the observed place by ``by_camera . c_k``, and what the images
+say of the cameras alone (shifts between them that no surface explains) stands in ``camera_matrix``. With
 
     e = n . (X(theta) - X_seen) - displacement - by_camera . (c - c_seen)
 

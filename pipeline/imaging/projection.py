@@ -1,4 +1,4 @@
-"""The lens for compiled loops: one packing, one projection. ``rig.camera`` is the reference that tests hold it to."""
+"""Cameras as rows for compiled loops; ``projection_kernels`` reads them. ``rig.camera`` is the reference."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,5 +10,11 @@ RADIUS_MOST = 1e6  # instead of an endless turning radius, which compiled loops 
 
 def packed_lens(camera: Camera) -> Float[np.ndarray, " 10"]:
     """fx fy cx cy k1 k2 p1 p2 k3 and the turning radius."""
-    k, d = camera.intrinsics, camera.intrinsics.distortion
-    return np.array([k.fx, k.fy, k.cx, k.cy, *d.opencv(), min(d.turning_radius(), RADIUS_MOST)])
+    k = camera.intrinsics
+    return np.append(k.values(), min(k.distortion.turning_radius(), RADIUS_MOST))
+
+
+def packed_camera(camera: Camera) -> Float[np.ndarray, " 22"]:
+    """Rotation (row by row), translation, and ``packed_lens``."""
+    pose = camera.camera_from_world
+    return np.concatenate([pose.rotation.ravel(), pose.translation, packed_lens(camera)])

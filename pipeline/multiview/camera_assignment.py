@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.tangency import BORDER_PX, outer_hull
+from pipeline.multiview.tangency import BORDER_PX, LONGEST_SPAN, angle_slopes, outer_hull, pencil, rays_about
 from rig.camera import Camera
 from rig.rig import Rig
 
@@ -37,7 +37,6 @@ FITTING_MISFIT = (
 NAMED_GAIN = 1.5  # tangents that an exchange explains before it is named: of three cameras that share three at most
 REPAIRED_GAIN = 4.0  # and before it is believed without asking: five planes, met by chance once in 10,000
 CAMERAS_LEAST = 3
-STEPS_OF_A_PIXEL = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,27 +204,19 @@ def _touches(
             part = angle[low:high]
             top, bottom = low + int(np.argmax(part)), low + int(np.argmin(part))
             touched[h, j] = top, bottom
-            if not angle[top] - angle[bottom] > 2.0:  # else the epipole lies in or near it: no outer tangent
+            if not angle[top] - angle[bottom] > LONGEST_SPAN:  # else there is no outer tangent
                 angles[h, j] = [np.nan if border[at] else angle[at] for at in (top, bottom)]
-    around = camera.rays_world((pixels[touched][..., None, :] + STEPS_OF_A_PIXEL).reshape(-1, 2))
-    around = around.reshape(*touched.shape, 4, 3)
+    around = rays_about(camera, pixels[touched])
     steps = np.full(angles.shape, np.nan)
     for j, (u, v) in frames.items():
-        turn = np.arctan2(around[:, j] @ v, around[:, j] @ u)
-        steps[:, j] = np.hypot(turn[..., 0] - turn[..., 1], turn[..., 2] - turn[..., 3]) / 2.0
+        steps[:, j] = np.linalg.norm(angle_slopes(around[:, j], u, v), axis=-1)
     return angles + steps * (INSET_PX, -INSET_PX), steps
 
 
 def _pencil(cameras: Sequence[Camera], i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (world) across the line of two camera centres, the same for (i, j) and (j, i): the planes
-    through that line are told apart by their angle, counted from where the two cameras look."""
+    """``pencil`` of two cameras from where both look; the same for (i, j) and (j, i)."""
     one, two = cameras[min(i, j)], cameras[max(i, j)]
-    axis = two.centre_world - one.centre_world
-    axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
-    towards = one.axis_world + two.axis_world
-    u = towards - axis * (towards @ axis)
-    u = u / max(float(np.linalg.norm(u)), 1e-9)
-    return u, np.cross(axis, u)
+    return pencil(one, two, one.axis_world + two.axis_world)
 
 
 def _size(camera: Camera) -> tuple[int, int]:

@@ -16,6 +16,8 @@ from rig.camera import Camera
 from rig.rig import Rig
 
 BORDER_PX = 4.0  # a tangent this near the image border may belong to what the border has cut off
+LONGEST_SPAN = 2.0  # rad of a silhouette about the line of two centres: beyond, the epipole lies in or near it
+LEAST_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,42 +83,60 @@ def on_contour(pixels: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, "h 
 
 
 def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[Tangency]:
-    base = two.centre_world - one.centre_world
-    axis = base / np.linalg.norm(base)
-    towards = first.rays.mean(axis=0) + second.rays.mean(axis=0)
-    u = towards - axis * (towards @ axis)
-    u /= np.linalg.norm(u)
-    v = np.cross(axis, u)
+    u, v = pencil(one, two, first.rays.mean(axis=0) + second.rays.mean(axis=0))
     angles = [np.arctan2(outline.rays @ v, outline.rays @ u) for outline in (first, second)]
-    if max(np.ptp(angle) for angle in angles) > 2.0:  # the epipole lies in or near the silhouette: no outer tangent
+    if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
         return []
     found = []
     for pick in (np.argmax, np.argmin):
         i, j = int(pick(angles[0])), int(pick(angles[1]))
         if first.cut(i) or second.cut(j):
             continue
-        difference = float(angles[0][i] - angles[1][j])
-        slopes = [_angle_slope(one, first.pixels[i], u, v), _angle_slope(two, second.pixels[j], u, v)]
-        steep = [float(np.linalg.norm(slope)) for slope in slopes]
-        if min(steep) < 1e-9:
-            continue
-        normals = (slopes[0] / steep[0], slopes[1] / steep[1])
-        found.append(
-            Tangency(
-                (one.name, two.name),
-                (first.pixels[i], second.pixels[j]),
-                (steep[0], steep[1]),
-                normals,
-                (difference / steep[0], -difference / steep[1]),
-            )
-        )
+        pixels = first.pixels[i], second.pixels[j]
+        slopes = [
+            angle_slopes(rays_about(camera, pixel), u, v) for camera, pixel in zip((one, two), pixels, strict=True)
+        ]
+        if min(np.linalg.norm(slope) for slope in slopes) >= LEAST_SLOPE:
+            difference = float(angles[0][i] - angles[1][j])
+            found.append(tangency((one.name, two.name), pixels, (slopes[0], slopes[1]), difference))
     return found
 
 
-def _angle_slope(
-    camera: Camera, pixel: Float[np.ndarray, " 2"], u: np.ndarray, v: np.ndarray
-) -> Float[np.ndarray, " 2"]:
-    """Change of a ray's angle in the pencil of epipolar planes per pixel."""
-    rays = camera.rays_world(pixel + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
-    angle = np.arctan2(rays @ v, rays @ u)
-    return np.array([angle[0] - angle[1], angle[2] - angle[3]]) / 2.0
+def pencil(
+    one: Camera, two: Camera, towards: Float[np.ndarray, " 3"]
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Two unit vectors (world) across the line through both centres: its planes are told apart by their angle
+    ``arctan2(ray @ v, ray @ u)``, counted from the direction ``towards``."""
+    axis = two.centre_world - one.centre_world
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
+    u = towards - axis * (towards @ axis)
+    u = u / max(float(np.linalg.norm(u)), 1e-9)
+    return u, np.cross(axis, u)
+
+
+def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 4 3"]:
+    """Unit rays (world) a pixel to the right, left, below and above of each pixel."""
+    around = pixels[..., None, :] + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    return camera.rays_world(around.reshape(-1, 2)).reshape(*around.shape[:-1], 3)
+
+
+def angle_slopes(
+    around: Float[np.ndarray, "*n 4 3"], u: Float[np.ndarray, " 3"], v: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "*n 2"]:
+    """Change of a ray's angle in a pencil of epipolar planes per pixel (rad), by x and by y; ``around``: of
+    ``rays_about``."""
+    angle = np.arctan2(around @ v, around @ u)
+    return np.stack([angle[..., 0] - angle[..., 1], angle[..., 2] - angle[..., 3]], axis=-1) / 2.0
+
+
+def tangency(
+    cameras: tuple[str, str],
+    pixels: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]],
+    slopes: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]],
+    difference: float,
+) -> Tangency:
+    """Two contour points that one plane should touch, by ``angle_slopes`` there and the difference (rad) of their
+    planes' angles, first less second."""
+    steepness = float(np.linalg.norm(slopes[0])), float(np.linalg.norm(slopes[1]))
+    normals = slopes[0] / steepness[0], slopes[1] / steepness[1]
+    return Tangency(cameras, pixels, steepness, normals, (difference / steepness[0], -difference / steepness[1]))

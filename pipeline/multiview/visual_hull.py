@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.imaging.projection import packed_lens
+from pipeline.imaging.projection import packed_camera
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull_kernels import COARSE, carve_view, mark_occupied, surface_net
 from rig.camera import Camera
@@ -106,9 +106,7 @@ def _field(
     votes = np.zeros(coarse.shape, np.int32)
     everywhere = np.ones((blocks,) * 3, bool)
     for camera in cameras:
-        carve_view(
-            coarse, votes, everywhere, 1, corner, wide, camera_parameters(camera), silhouettes[camera.name].distance
-        )
+        carve_view(coarse, votes, everywhere, 1, corner, wide, packed_camera(camera), silhouettes[camera.name].distance)
     _settle(coarse, votes, LEAST_SHARE * len(cameras))
     # The field grows by at most a millimetre a millimetre (and a little: perspective), so that only blocks whose
     # corners are within their own diagonal of the surface can hold any of it.
@@ -121,9 +119,7 @@ def _field(
     exact = np.full(fine.shape, -np.inf, np.float32)
     step = wide / COARSE
     for camera in cameras:
-        carve_view(
-            exact, votes, active, COARSE, corner, step, camera_parameters(camera), silhouettes[camera.name].distance
-        )
+        carve_view(exact, votes, active, COARSE, corner, step, packed_camera(camera), silhouettes[camera.name].distance)
     _settle(exact, votes, LEAST_SHARE * len(cameras))
     known = np.zeros(fine.shape, bool)
     mark_occupied(known, active)
@@ -142,9 +138,3 @@ def _spread(coarse: Float32[np.ndarray, "b b b"]) -> Float32[np.ndarray, "n n n"
 def _settle(field: np.ndarray, votes: np.ndarray, least: float) -> None:
     """Points that too few views see are outside."""
     field[votes < max(2.0, least)] = np.float32(1e3)
-
-
-def camera_parameters(camera: Camera) -> Float[np.ndarray, " 22"]:
-    """Rotation, translation and ``packed_lens``, for compiled projections."""
-    pose = camera.camera_from_world
-    return np.concatenate([pose.rotation.ravel(), pose.translation, packed_lens(camera)])

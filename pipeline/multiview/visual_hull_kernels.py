@@ -3,7 +3,8 @@
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.imaging.projection_kernels import distorted
+from pipeline.imaging.projection_kernels import LENS, NEAREST_MM, distorted, placed
+from pipeline.imaging.sampling_kernels import sample
 
 COARSE = 4  # fine cells along the side of a coarse one
 
@@ -29,7 +30,7 @@ def carve_view(
 ) -> None:
     """Raises ``field`` to this view's distance (mm) at the points of the active blocks, and counts the view there."""
     height, width = distance.shape
-    lens = p[12:]
+    lens = p[LENS:]
     blocks = active.shape[0]
     for block in range(blocks * blocks * blocks):
         bi, bj, bk = block // (blocks * blocks), (block // blocks) % blocks, block % blocks
@@ -43,19 +44,13 @@ def carve_view(
                     if not owner_of(i, j, k, split, bi, bj, bk, active):
                         continue
                     x, y, z = corner[0] + i * step, corner[1] + j * step, corner[2] + k * step
-                    cz = p[6] * x + p[7] * y + p[8] * z + p[11]
-                    if cz <= 1.0:
+                    cx, cy, cz = placed(p, x, y, z)
+                    if cz <= NEAREST_MM:
                         continue
-                    u = (p[0] * x + p[1] * y + p[2] * z + p[9]) / cz
-                    v = (p[3] * x + p[4] * y + p[5] * z + p[10]) / cz
-                    column, row = distorted(u, v, lens)
+                    column, row = distorted(cx / cz, cy / cz, lens)
                     if not (column >= 0 and row >= 0 and column < width - 1 and row < height - 1):
                         continue
-                    c, r = int(column), int(row)
-                    fx, fy = column - c, row - r
-                    top = distance[r, c] + fx * (distance[r, c + 1] - distance[r, c])
-                    low = distance[r + 1, c] + fx * (distance[r + 1, c + 1] - distance[r + 1, c])
-                    value = np.float32((top + fy * (low - top)) * cz / p[12])
+                    value = np.float32(sample(distance, column, row) * cz / lens[0])
                     votes[i, j, k] += 1
                     if value > field[i, j, k]:
                         field[i, j, k] = value

@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int8
 
-from pipeline.multiview.visual_hull import camera_parameters, mask_extent
+from pipeline.imaging.projection import packed_camera
+from pipeline.multiview.visual_hull import mask_extent
 from pipeline.silhouettes.cross_view_kernels import LEAST_WITNESSES, least_dissent
 from rig.rig import Rig
 
 
-def ask_the_others(
+def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
     """How many of the other cameras deny the subject at each doubtful pixel of camera ``name`` (at most ``MOST``); -1
@@ -34,7 +35,7 @@ def ask_the_others(
     scale = asking.intrinsics.width / doubt.shape[1]
     rays = asking.rays_world((np.stack([columns, rows], axis=1) + 0.5) * scale - 0.5)
     distances, scales = _stacked([masks[camera.name] for camera in others], [c.intrinsics.width for c in others])
-    parameters = np.array([camera_parameters(camera) for camera in others])
+    parameters = np.array([packed_camera(camera) for camera in others])
     middle = float(np.linalg.norm(centre - asking.centre_world))
     span = (middle - 0.75 * edge, middle + 0.75 * edge)
     out[rows, columns] = least_dissent(asking.centre_world, rays, span, parameters, distances, scales)

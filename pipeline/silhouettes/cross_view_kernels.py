@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.imaging.projection_kernels import distorted
+from pipeline.imaging.projection_kernels import LENS, NEAREST_MM, distorted, placed
 
 MOST = 3  # more dissent than this is not counted
 LEAST_WITNESSES = 4  # cameras that must see a point before it can be allowed
@@ -30,12 +30,10 @@ def least_dissent(
             seen, against = 0, 0
             for k in range(len(cameras)):
                 p = cameras[k]
-                cz = p[6] * x + p[7] * y + p[8] * z + p[11]
-                if cz <= 1.0:
+                cx, cy, cz = placed(p, x, y, z)
+                if cz <= NEAREST_MM:
                     continue
-                u = (p[0] * x + p[1] * y + p[2] * z + p[9]) / cz
-                v = (p[3] * x + p[4] * y + p[5] * z + p[10]) / cz
-                column, row = distorted(u, v, p[12:])
+                column, row = distorted(cx / cz, cy / cz, p[LENS:])
                 i, j = int((row + 0.5) / scales[k]), int((column + 0.5) / scales[k])
                 if row < 0 or column < 0 or i >= distances.shape[1] or j >= distances.shape[2]:
                     continue
@@ -43,7 +41,7 @@ def least_dissent(
                 if away < 0:
                     continue
                 seen += 1
-                against += away > SLACK + 0.5 * step * p[12] / (cz * scales[k])
+                against += away > SLACK + 0.5 * step * p[LENS] / (cz * scales[k])
                 if against >= best:
                     break
             if seen >= LEAST_WITNESSES and against < best:

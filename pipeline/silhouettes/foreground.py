@@ -1,6 +1,6 @@
 """What is subject and what plate, decided at a coarse level, where averaging quarters the noise.
 
-Log odds of any colour at all against the plate as it would look now (``pipeline.silhouettes.background``), a soft
+Foreground log-odds against the exposure-corrected background (``pipeline.silhouettes.background``), a soft
 shadow being no subject, are made smooth by mean-field sweeps whose links are cut where the *difference* to the plate
 has an edge (Sun et al., *Background Cut*, ECCV 2006), so that edges of the backdrop cut nothing.
 
@@ -32,14 +32,14 @@ ALLOWED, DENIED = 4.0, 3.0  # log odds for a pixel that no other camera denies, 
 PALETTE = 16  # bins a channel of the subject's colours
 ANY_LEVELS = 64  # a channel: the spread of any colour at all, as in settings.evidence
 REACH = 24  # coarse pixels from the mask in which a doubtful pixel may still be the subject
-PLAIN = 3.0  # chi-squared by its median over the background, up to which a pixel is the plate: 93 % of it are
+PLATE_CHI2_MOST = 3.0  # chi-squared by its median over the background, up to which a pixel is the plate: 93 % of it are
 HAIR_DEPTH = 6  # coarse pixels (24 px)
 
 
-SPECK = 3  # coarse pixels: a hole of this size is noise wherever it is
+NOISE_HOLE_COARSE_PX = 3  # coarse pixels: a hole of this size is noise wherever it is
 MIXED = 0.1  # of the difference to the plate: standard deviation within a coarse pixel from which it is a mixture
 STRAND_SHADES = 0.75, 1.0, 1.33  # of the subject's colour nearby, in which strands before the plate may be
-FAINT = 100.0  # chi-squared of a mean over nine pixels
+FAINT_CHI2_MOST = 100.0  # chi-squared of a mean over nine pixels
 UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must leave, and that by the whole
 
 
@@ -52,7 +52,7 @@ class Decision:
     odds: Float32[np.ndarray, "h w"]  # of subject against plate, clipped
     probability: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]  # the subject's one piece, with what a person would fill
-    strangers: tuple[float, ...]  # areas of the other pieces by its own
+    detached_component_areas: tuple[float, ...]  # areas of the other pieces by its own
     paint: Float32[np.ndarray, "h w 3"]  # the subject's own colour nearby
     own_odds: Float32[np.ndarray, "h w"]  # of the subject's own colours, rather than any, against the plate
     clear: Bool[np.ndarray, "h w"]  # that is nothing like the plate, in any shade
@@ -83,12 +83,18 @@ def decide(
     clear = _apart(paint, background.coarse, variance) > CONCLUSIVE
     other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance, settings)
     clear &= ~dilated(other, 1)
-    plain = clear & (chi2 < PLAIN * np.median(chi2[background.inliers])) if background.inliers.any() else clear & False
-    mask, strangers = _subject_only(raw, plain, settings)
+    plain = (
+        clear & (chi2 < PLATE_CHI2_MOST * np.median(chi2[background.inliers]))
+        if background.inliers.any()
+        else clear & False
+    )
+    mask, detached_component_areas = _subject_only(raw, plain, settings)
     mixed = (mixture > 1) & (away > (2 * background.noise @ CHANNEL_SUM / 3) ** 2)
     own_odds = _own_odds(coarse, raw, paint, chi2, variance, settings)
     own_odds = np.where(other, np.maximum(own_odds, 0.5 * unexplained - settings.evidence), own_odds)
-    return Decision(coarse, background, odds, probability, mask, strangers, paint, own_odds, clear, plain, mixed)
+    return Decision(
+        coarse, background, odds, probability, mask, detached_component_areas, paint, own_odds, clear, plain, mixed
+    )
 
 
 def doubtful(decision: Decision) -> Bool[np.ndarray, "h w"]:
@@ -104,8 +110,10 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: Se
     told = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MOST_ODDS, MOST_ODDS)
     odds = np.where(dissent >= 0, told, decision.odds).astype(np.float32)
     probability = smooth_odds(odds, decision.coarse, decision.background, settings)
-    mask, strangers = _subject_only(probability > 0.5, decision.plain, settings)
-    return replace(decision, odds=odds, probability=probability, mask=mask, strangers=strangers)
+    mask, detached_component_areas = _subject_only(probability > 0.5, decision.plain, settings)
+    return replace(
+        decision, odds=odds, probability=probability, mask=mask, detached_component_areas=detached_component_areas
+    )
 
 
 def _own_odds(
@@ -178,7 +186,7 @@ def _other_colour(
     shades: strands are not all alike) explains a faint difference, so that the subject has another colour there; and
     the chi-squared that they leave, of nine pixels' mean."""
     weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
-    faint = ((difference**2 * weight) @ CHANNEL_SUM < FAINT).astype(np.float32)
+    faint = ((difference**2 * weight) @ CHANNEL_SUM < FAINT_CHI2_MOST).astype(np.float32)
     mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]
     square = (mean**2 * weight) @ CHANNEL_SUM
     left = square
@@ -219,7 +227,7 @@ def _subject_only(
     small = size < settings.hole_share * subject.sum()
     inner = np.bincount(holes[eroded(subject | small[holes], HAIR_DEPTH)], minlength=count) > 0.5 * size
     shown = np.bincount(holes[plain], minlength=count) / size
-    gap = (shown > 0.5) & ~(inner & (size <= SPECK))
+    gap = (shown > 0.5) & ~(inner & (size <= NOISE_HOLE_COARSE_PX))
     filled = small & ~gap
     filled[0] = False
     return subject | filled[holes], tuple(others)

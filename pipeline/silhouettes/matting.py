@@ -9,7 +9,7 @@ that of cheeks, which end in their own shade, was 0.2 px too far in.
 
 B is first matched to the pixels just outside, so that a shadow or bounced light at the edge does not move it; F, which
 may vary (a dark rim, a lock of hair), is taken again from inside the first contour. Where the colours are too close to
-tell, alpha leans on the coarse mask.
+tell, alpha follows the coarse mask.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from pipeline.imaging.masks import box_around, dilated, eroded, spread
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import Background
 from pipeline.silhouettes.foreground import Decision
-from pipeline.silhouettes.matting_kernels import FAINT, solve_alpha
+from pipeline.silhouettes.matting_kernels import ALPHA_INFORMATION_MOST, solve_alpha
 from rig.colour_space import linear_from_srgb
 
 INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour: beyond the blur of an edge (3 sigma)
@@ -31,7 +31,7 @@ INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour
 SOLID = 0.85  # alpha above which a pixel shows the subject's own colour, and not hair before the background
 WINDOW_PX = 3.0  # sigma of the window it is averaged in
 DEPTH = 6  # bands inside the outline up to which a gap before the plate is looked for: 48 px
-LEAN = 1.0  # standard deviation of alpha at which the coarse mask counts as much as the pixel
+COARSE_ALPHA_SIGMA = 1.0  # standard deviation of alpha at which the coarse mask counts as much as the pixel
 LINEAR = (255 * linear_from_srgb(np.arange(257) / 255.0)).astype(np.float32)  # by code, one more to interpolate to
 
 
@@ -72,9 +72,9 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     sigma = background.noise[cells] @ np.full(3, 1 / 3, np.float32)
     own, paint = image[box], decision.paint[cells]
     args = (LINEAR, own, background.plates[:, *box], light, sigma, zone[cells], probability[cells].astype(np.float32))
-    alpha, _, _ = solve_alpha(*args, paint, LEAN, SHADE, True)
+    alpha, _, _ = solve_alpha(*args, paint, (COARSE_ALPHA_SIGMA, SHADE), True)
     alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)
-    alpha, contrast, trust = solve_alpha(*args, _subject_inside(own, alpha, paint), LEAN, SHADE, False)
+    alpha, contrast, trust = solve_alpha(*args, _subject_inside(own, alpha, paint), (COARSE_ALPHA_SIGMA, SHADE), False)
     alpha = _smooth(alpha, trust, settings.alpha_blur_px)
     unasked = dilated(contrast < 0, 1)
     return Matte(alpha, box, np.where(unasked, np.float32(0), contrast)[np.abs(alpha - 0.5) < 0.25])
@@ -94,11 +94,11 @@ def _smooth(
 ) -> Float32[np.ndarray, "h w"]:
     """Alpha averaged by ``trust`` (1 / variance), in a window that is wider where it is low."""
     near = cv2.GaussianBlur(alpha, (0, 0), sigma)
-    if not (trust < FAINT).any():
+    if not (trust < ALPHA_INFORMATION_MOST).any():
         return near
     weight = cv2.GaussianBlur(trust, (0, 0), WIDE_PX)
     far = cv2.GaussianBlur(trust * alpha, (0, 0), WIDE_PX) / weight
-    share = np.clip(2 - 2 * weight / FAINT, 0, 1)
+    share = np.clip(2 - 2 * weight / ALPHA_INFORMATION_MOST, 0, 1)
     return near + share * (far - near)
 
 

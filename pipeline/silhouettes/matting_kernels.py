@@ -3,9 +3,10 @@
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.imaging.sampling_kernels import bilinear
 
 OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
-FAINT = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
+ALPHA_INFORMATION_MOST = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -18,9 +19,7 @@ def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
 
 @njit(cache=True, nogil=True, inline="always")
 def interpolated_colour(a: np.ndarray, y: int, x: int, c: int, fy: float, fx: float) -> float:
-    top = a[y, x, c] + fx * (a[y, x + 1, c] - a[y, x, c])
-    low = a[y + 1, x, c] + fx * (a[y + 1, x + 1, c] - a[y + 1, x, c])
-    return top + fy * (low - top)
+    return bilinear(a[y, x, c], a[y, x + 1, c], a[y + 1, x, c], a[y + 1, x + 1, c], fx, fy)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -40,21 +39,22 @@ def solve_alpha(
     zone: np.ndarray,
     probability: np.ndarray,
     subject: np.ndarray,
-    lean: float,
-    shade: float,
+    sigmas: tuple[float, float],
     first: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Alpha (-0.5 to 1.5) of every pixel, and in the band |F - B| in standard deviations of the image's noise (-1
     elsewhere) and 1 / variance of alpha (1 elsewhere).
 
     ``zone``: 0 outside, 1 band, 2 inside, 3 band in which the first guess of the subject's colour is no help.
+    ``sigmas``: standard deviations of alpha about the coarse mask, and of the subject's brightness at the rim.
     """
+    coarse_sigma, shade = sigmas
     height, width = image.shape[:2]
     ch, cw = zone.shape
     columns = np.minimum(np.arange(width) * cw // width, cw - 1)
     alpha = np.empty((height, width), np.float32)
     contrast = np.full((height, width), -1.0, np.float32)
-    trust = np.full((height, width), FAINT, np.float32)
+    trust = np.full((height, width), ALPHA_INFORMATION_MOST, np.float32)
     for y in range(height):
         zy = min(y * ch // height, ch - 1)
         ly, fly = corner_of(y, height, ch)
@@ -68,7 +68,7 @@ def solve_alpha(
             lx, flx = corner_of(x, width, cw)
             p00, p01 = probability[ly, lx], probability[ly, lx + 1]
             p10, p11 = probability[ly + 1, lx], probability[ly + 1, lx + 1]
-            prior = (1 - fly) * (p00 + flx * (p01 - p00)) + fly * (p10 + flx * (p11 - p10))
+            prior = bilinear(p00, p01, p10, p11, flx, fly)
             if first and kind == 3:
                 alpha[y, x] = prior
                 continue
@@ -94,9 +94,9 @@ def solve_alpha(
                 df += (i - b) * f
                 db += (i - b) * b
                 dd += (i - b) * (i - b)
-            # Normal equations of I - B = q F - alpha B, with q = alpha (within shade) and alpha = prior (within LEAN).
-            m11, m12, m22 = ff + 1 / shade**2, -fb - 1 / shade**2, bb + 1 / shade**2 + 1 / lean**2
-            r1, r2 = df, -db + prior / lean**2
+            # Normal equations of I - B = q F - alpha B, q = alpha (within shade), alpha = prior (within coarse_sigma).
+            m11, m12, m22 = ff + 1 / shade**2, -fb - 1 / shade**2, bb + 1 / shade**2 + 1 / coarse_sigma**2
+            r1, r2 = df, -db + prior / coarse_sigma**2
             determinant = m11 * m22 - m12 * m12
             value = (m11 * r2 - m12 * r1) / determinant
             square = ff - 2 * fb + bb
@@ -110,7 +110,7 @@ def solve_alpha(
                 left += along * along * bb - 2 * along * (db - a * (fb - bb))
                 value += max(0.0, 1.0 - value) / (1.0 + np.exp(OTHER - 0.5 * left))
             alpha[y, x] = value
-            known = max(determinant / m11 - 1 / lean**2, 1e-6)
+            known = max(determinant / m11 - 1 / coarse_sigma**2, 1e-6)
             contrast[y, x] = np.sqrt(known)
-            trust[y, x] = min(FAINT, known)
+            trust[y, x] = min(ALPHA_INFORMATION_MOST, known)
     return alpha, contrast, trust

@@ -20,7 +20,7 @@ from pipeline.imaging.contour_distance import distance_to_level
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import Background
-from pipeline.silhouettes.cross_view import ask_the_others
+from pipeline.silhouettes.cross_view import count_rejecting_cameras
 from pipeline.silhouettes.foreground import Decision, decide, doubtful, reconsider
 from pipeline.silhouettes.matting import Matte, solve_matte
 from pipeline.silhouettes.view_consistency import judge_agreement
@@ -61,7 +61,7 @@ def segment(
             decision = decisions[name]
             doubt = doubtful(decision)
             if doubt.any():
-                decision = reconsider(decision, ask_the_others(doubt, name, masks, rig), settings)
+                decision = reconsider(decision, count_rejecting_cameras(doubt, name, masks, rig), settings)
             return _refined(capture.images[name], decision, settings)
 
         finished = {name: pool.submit(finish, name) for name in decisions}
@@ -96,7 +96,7 @@ def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings
     distance = distance_to_level(alpha)
     weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
     contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
-    others = sum(a for a in decision.strangers if a > STRANGER_SHARE)
+    others = sum(a for a in decision.detached_component_areas if a > STRANGER_SHARE)
     background = decision.background
     figures = {
         "gain": [round(float(g), 4) for g in background.gain],

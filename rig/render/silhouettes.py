@@ -16,6 +16,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from rig.camera import lens_image
 from rig.errors import InputError
 from rig.render.context import GlContext, Owned
 from rig.render.tile_packing import (
@@ -162,7 +163,7 @@ class SilhouetteSet:
             all_in_front &= in_front
             normalised = points[:, :2] / points[:, 2:] if in_front else np.full((1, 2), np.inf)
             if (normalised**2).sum(axis=1).max() < limit**2:  # else the lens may bend the box's edges any way
-                pixels = k.distortion.apply(normalised) * (k.fx, k.fy) + (k.cx, k.cy)
+                pixels = lens_image(points, k.values())
                 low, high = np.floor((pixels.min(axis=0) - 2) / BLOCK_PX), np.ceil((pixels.max(axis=0) + 3) / BLOCK_PX)
                 low, high = np.clip(low, 0, whole[2:]), np.clip(high, 0, whole[2:])
                 boxes.append(np.concatenate([low, high]).astype(int))

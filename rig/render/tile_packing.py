@@ -99,12 +99,10 @@ def instances(
     rows = np.zeros((len(page.cameras), 30), np.float32)
     for row, index, tile in zip(rows, page.cameras, page.tiles, strict=True):
         camera = cameras[index]
-        k, d = camera.intrinsics, camera.intrinsics.distortion
         pose = camera.camera_from_world
         row[:12] = np.column_stack([pose.rotation, pose.apply(origin_world)]).ravel()
-        row[12:16] = k.fx, k.fy, k.cx, k.cy
-        row[16:20] = d.k1, d.k2, d.p1, d.p2
-        row[20:24] = d.k3, min(d.turning_radius(), 1e6), lens_limit(camera), NEAR_MM
+        row[12:21] = camera.intrinsics.values()
+        row[21:24] = min(camera.intrinsics.distortion.turning_radius(), 1e6), lens_limit(camera), NEAR_MM
         row[24:28] = tile
         if depth_ranges is not None:
             near, far = depth_ranges[index]

@@ -14,13 +14,14 @@ from urllib.parse import quote
 
 from pipeline.eigenheads.data_folder import MODELS, models_folder
 from pipeline.eigenheads.model_names import model_path
+from pipeline.parallel_for import THREADS, thread_count
 from rig.errors import EigenheadError
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_egl
 
-OTHER_VARIABLES = frozenset({MODELS, PREFIX + "DEBUG", PREFIX + "CACHE"})  # read elsewhere than in ServiceSettings
+OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", PREFIX + "CACHE"})  # not read in ServiceSettings
 # The tables of server.storage.database in words of the databases' own: SQLAlchemy takes longer to load than all checks.
 TABLES = {
     "sqlite": "SELECT name FROM sqlite_master WHERE name = 'eigenhead_workers'",
@@ -87,7 +88,9 @@ def _model(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _cores(settings: ServiceSettings) -> tuple[bool, str]:
     count = len(os.sched_getaffinity(0))
-    return count >= 2, f"{count}" if count >= 2 else f"{count}: a job and the service share it; expect slow answers"
+    threads = thread_count()
+    used = f"{count}" if threads == count else f"{count}; {THREADS} gives a job's loops {threads} threads"
+    return count >= 2, used if count >= 2 else f"{used}: a job and the service share it; expect slow answers"
 
 
 def _memory(settings: ServiceSettings) -> tuple[bool, str]:

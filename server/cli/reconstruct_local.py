@@ -13,7 +13,7 @@ from rig.formats.archive import extract_archive
 from server.cli.answers import CannotWrite
 from server.storage.result_folder import fresh_folder
 from server.tasks.prepare import prepare_kernels
-from server.tasks.progress import Course, Expectation
+from server.tasks.progress import JobProgress, StageDurations
 
 if TYPE_CHECKING:
     from pipeline.results.report import Report as ReportDocument
@@ -64,11 +64,11 @@ def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "
     from pipeline.results.write import write_result
     from rig.render.renderer import Renderer
 
-    course = Course(Expectation().of(chosen.method))
+    progress = JobProgress(StageDurations().of(chosen.method))
 
     def tell(stage: str, fraction: float) -> None:
-        course.report(stage, fraction)
-        report(stage, course.progress())
+        progress.report(stage, fraction)
+        report(stage, progress.progress())
 
     tell("read", 0.0)
     head_model = load_model(model or "default")

@@ -20,7 +20,7 @@ EVERY_S = 0.25  # the shortest time between two progress events of one stage
 LEARNING = 0.3  # weight of the newest job
 
 
-class Expectation:
+class StageDurations:
     """Seconds that each stage is expected to take, by method."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Expectation:
             known[stage] = (1 - LEARNING) * known.get(stage, took) + LEARNING * took
 
 
-class Course:
+class JobProgress:
     """One job on its way: feed it reports, ask for progress and remaining seconds."""
 
     def __init__(self, expected: dict[str, float]) -> None:
@@ -79,15 +79,15 @@ class Course:
 class ProgressMeter:
     """Turns the reports of a job into events: at most one in ``EVERY_S`` within a stage, with the remaining time."""
 
-    def __init__(self, log: "EventLog", job_id: str, course: Course) -> None:
-        self._log, self._job_id, self._course = log, job_id, course
+    def __init__(self, log: "EventLog", job_id: str, progress: JobProgress) -> None:
+        self._log, self._job_id, self._progress = log, job_id, progress
         self._last = ("", 0.0)
 
     def report(self, stage: str, fraction: float) -> None:
-        self._course.report(stage, fraction)
+        self._progress.report(stage, fraction)
         now = time.monotonic()
         if stage == self._last[0] and now - self._last[1] < EVERY_S:
             return
         self._last = (stage, now)
-        progress, eta_s = round(self._course.progress(), 4), round(self._course.remaining_s(), 1)
-        self._log.append(self._job_id, {"state": "running", "stage": stage, "progress": progress, "eta_s": eta_s})
+        document = {"state": "running", "stage": stage, "progress": round(self._progress.progress(), 4)}
+        self._log.append(self._job_id, document | {"eta_s": round(self._progress.remaining_s(), 1)})

@@ -43,7 +43,7 @@ from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, We
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
-from server.tasks.progress import Course, Expectation, ProgressMeter
+from server.tasks.progress import JobProgress, ProgressMeter, StageDurations
 from server.tasks.reconstruct import CaptureWork
 from server.worker.engine import take_over
 from server.worker.heartbeat import dead_workers, process_identity
@@ -66,7 +66,7 @@ class Worker:
         self._work: CaptureWork = function_at(settings.work)
         self._stop = threading.Event()
         self._webhooks = Webhooks(self.engine)
-        self._expectation = Expectation()
+        self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
 
     def start(self) -> None:
@@ -170,8 +170,8 @@ class Worker:
         try:
             folder.mkdir(parents=True)
             method = str(settings.get("method", "contour"))
-            course = Course(self._expectation.of(method))
-            meter = ProgressMeter(self.events, job_id, course)
+            progress = JobProgress(self._durations.of(method))
+            meter = ProgressMeter(self.events, job_id, progress)
             with self._children.one() as child:
                 cancelled = lambda: not self._states.runs(job_id)  # noqa: E731
                 child.remote(self._work, report=meter.report, cancelled=cancelled)(
@@ -181,7 +181,7 @@ class Worker:
                     model=request.get("model"),
                     settings=settings,
                 )
-            self._expectation.learn(method, course.finish())
+            self._durations.learn(method, progress.finish())
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
             raise self._failure(error) from error

@@ -17,7 +17,7 @@ from scipy.sparse import coo_matrix
 from calibration.adjustment.bundle import Free, free_mask, solve
 from calibration.adjustment.corner_term import CornerTerm, places
 from calibration.adjustment.lens_prior import weak_prior
-from calibration.adjustment.state import BundleState, Observations, moved_state, observations, residuals, values_of
+from calibration.adjustment.state import BundleState, Observations, moved_state, observations, residuals
 from tests.support.board_sessions import Session, session
 
 
@@ -26,7 +26,7 @@ def start(source: Session, rng: np.random.Generator) -> tuple[BundleState, Obser
     rig, d = source.rig, source.detections
     seen = observations(d.views, rig.names, d.shots, d.board)
     state = BundleState(
-        np.stack([values_of(camera.intrinsics) for camera in rig]),
+        np.stack([camera.intrinsics.values() for camera in rig]),
         np.stack([camera.camera_from_world.rotation for camera in rig]),
         np.stack([camera.camera_from_world.translation for camera in rig]),
         np.stack([source.poses[shot].rotation for shot in d.shots]),

@@ -37,7 +37,7 @@ def without(subjects: list[int]) -> HeadModel:
 def errors(found: Correspondence, truths: list[np.ndarray], model: HeadModel) -> np.ndarray:
     """Vertex errors (mm) over the face region, of every scan but the reference; void vertices left out."""
     faces, region = model.levels["full"].faces, model.levels["cage"].face_region
-    ours = [(head - shift) @ turn for head, (turn, shift) in zip(found.heads, found.frame_from_scan, strict=True)]
+    ours = [frame.inverse().apply(head) for head, frame in zip(found.heads, found.frame_from_scan, strict=True)]
     place = SurfaceIndex(truths[found.reference], faces).closest(ours[found.reference])
     out = []
     for k, truth in enumerate(truths):

@@ -12,6 +12,7 @@ from rig.geometry import (
     cross_matrix,
     look_at,
     nearest_rotation,
+    rigid_fit,
     rotation_from_vector,
     vector_from_rotation,
 )
@@ -97,3 +98,25 @@ def test_look_at_sees_the_target_ahead_and_up_above() -> None:
     assert above[1] < 0  # image rows count downwards
     assert above[0] == pytest.approx(0.0, abs=1e-9)
     assert np.linalg.det(camera_from_world.rotation) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_rigid_fit_finds_a_planted_motion(flat: bool) -> None:
+    rng = np.random.default_rng(4)
+    source = rng.normal(0.0, 50.0, (9, 3)) * (1.0, 1.0, 0.0 if flat else 1.0)
+    planted = RigidTransform(rotation_from_vector(np.array([0.9, -1.7, 0.4])), np.array([30.0, -700.0, 12.0]))
+    target, weights = planted.apply(source), rng.uniform(0.1, 2.0, 9)
+    for found in (rigid_fit(source, target), rigid_fit(source, target, weights)):
+        np.testing.assert_allclose(found.rotation, planted.rotation, atol=1e-12)
+        np.testing.assert_allclose(found.translation, planted.translation, atol=1e-10)
+
+
+def test_rigid_fit_is_scipy_s_and_no_reflection() -> None:
+    rng = np.random.default_rng(5)
+    source, weights = rng.normal(0.0, 50.0, (9, 3)), rng.uniform(0.1, 2.0, 9)
+    target = source * (-1.0, 1.0, 1.0) + rng.normal(0.0, 5.0, (9, 3))
+    found = rigid_fit(source, target, weights)
+    share = weights / weights.sum()
+    expected = Rotation.align_vectors(target - share @ target, source - share @ source, weights)[0]
+    np.testing.assert_allclose(found.rotation, expected.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(found.apply(share @ source), share @ target, atol=1e-10)

@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from pipeline.compiled import njit
 from pipeline.dense.surface.view_stack import ViewStack
-from pipeline.dense.surface.vote_kernels import nearest_pixel, project
+from pipeline.dense.surface.vote_kernels import CENTRE, DEPTH, FRAME, OUTLINE, SIGMA, nearest_pixel, seen_at
+from pipeline.imaging.projection_kernels import LENS, NEAREST_MM
 from pipeline.parallel_for import in_threads
 
 BLOCK = 4  # pixels along the side of what is decided at once
@@ -36,7 +37,7 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
             if wrong.any():
                 whole = np.kron(wrong, np.ones((BLOCK, BLOCK), np.uint8))[:height, :width].ravel()
                 own = pixels[views.starts[v] : views.starts[v] + height * width]
-                own[whole > 0, 5] = SILENT_PX
+                own[whole > 0, OUTLINE] = SILENT_PX
 
     in_threads(len(views.cameras), one)
     return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
@@ -61,16 +62,16 @@ def _mark(
         for row in range(0, sizes[v, 0], STRIDE):
             for column in range(0, sizes[v, 1], STRIDE):
                 at = starts[v] + row * sizes[v, 1] + column
-                if not pixels[at, 4] < SURE_MM:
+                if not pixels[at, SIGMA] < SURE_MM:
                     continue
-                depth = pixels[at, 0]
-                x, y = (column - p[14]) / p[12] * depth, (row - p[15]) / p[13] * depth
+                depth = pixels[at, DEPTH]
+                x, y = (column - p[LENS + 2]) / p[LENS] * depth, (row - p[LENS + 3]) / p[LENS + 1] * depth
                 for axis in range(3):  # the rotation's inverse, from the camera's centre
-                    place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[16 + axis]
-                ahead, at_column, at_row = project(cameras[target], place)
-                if ahead <= 1.0:
+                    place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[CENTRE + axis]
+                ahead, at_column, at_row = seen_at(cameras[target], place)
+                if ahead <= NEAREST_MM:
                     continue
                 near, beyond = nearest_pixel(at_column, at_row, sizes[target])
                 there = starts[target] + near
-                if beyond == 0.0 and pixels[there, 6] < 0.0 and pixels[there, 5] > CLEAR_PX:
+                if beyond == 0.0 and pixels[there, FRAME] < 0.0 and pixels[there, OUTLINE] > CLEAR_PX:
                     blocks[near // width // BLOCK, near % width // BLOCK] |= bit

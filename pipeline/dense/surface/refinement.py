@@ -55,7 +55,6 @@ def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewS
     offset, information, scatter = (np.zeros(count) for _ in range(3))
     seen = np.zeros(count, np.uint8)
     limits = np.array([gate_mm, AGREEMENT_MM, FLOOR_MM])
-    stack = (views.cameras, views.sizes, views.starts, views.pixels)
-    given = (mesh.vertices, normals, *stack, limits, offset, information, scatter, seen)
+    given = (mesh.vertices, normals, views.packed(), limits, offset, information, scatter, seen)
     in_threads(count, lambda first, last: measure(*given, first, last))
     return Measured(offset, information, scatter, seen)

@@ -3,7 +3,21 @@
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.dense.surface.vote_kernels import FLATTEST, UNKNOWN_MM, VIEWS_MOST, agreed, cosine, nearest_pixel, project
+from pipeline.dense.surface.vote_kernels import (
+    DEPTH,
+    FLATTEST,
+    NORMAL,
+    SIGMA,
+    UNKNOWN_MM,
+    VIEWS_MOST,
+    Pixels,
+    agreed,
+    cosine,
+    nearest_pixel,
+    seen_at,
+)
+from pipeline.imaging.projection_kernels import NEAREST_MM
+from pipeline.imaging.sampling_kernels import bilinear
 
 TURNED = 0.4  # cosine between the normals of a vertex and of a pixel below which the pixel shows another surface
 STEP_MM = 4.0  # four pixels that differ by more in depth show two surfaces
@@ -13,10 +27,7 @@ STEP_MM = 4.0  # four pixels that differ by more in depth show two surfaces
 def measure(
     vertices: np.ndarray,
     normals: np.ndarray,
-    cameras: np.ndarray,
-    sizes: np.ndarray,
-    starts: np.ndarray,
-    pixels: np.ndarray,
+    seen: Pixels,
     limits: np.ndarray,
     offset: np.ndarray,
     information: np.ndarray,
@@ -30,22 +41,23 @@ def measure(
 
     ``limits``: distance (mm) beyond which a view shows another surface, agreement (mm) and floor of a deviation (mm).
     """
+    cameras, sizes, starts, pixels = seen
     gate, agreement, floor = limits
     votes, weights = np.empty(VIEWS_MOST), np.empty(VIEWS_MOST)
     for n in range(first, last):
         place, count = vertices[n], 0
         for v in range(len(cameras)):
-            depth, column, row = project(cameras[v], place)
-            if depth <= 1.0:
+            depth, column, row = seen_at(cameras[v], place)
+            if depth <= NEAREST_MM:
                 continue
             near, beyond = nearest_pixel(column, row, sizes[v])
             near += starts[v]
-            sigma = pixels[near, 4]
+            sigma = pixels[near, SIGMA]
             if beyond > 0.0 or not sigma < UNKNOWN_MM:
                 continue
             turn = 0.0
             for axis in range(3):
-                turn += pixels[near, 1 + axis] * normals[n, axis]
+                turn += pixels[near, NORMAL + axis] * normals[n, axis]
             facing = cosine(cameras[v], place, depth, pixels[near])
             if turn < TURNED or facing < FLATTEST:
                 continue
@@ -72,13 +84,12 @@ def depth_between(pixels: np.ndarray, start: int, size: np.ndarray, column: floa
     c, r = min(int(column), size[1] - 2), min(int(row), size[0] - 2)
     a = start + r * size[1] + c
     b, d, e = a + 1, a + size[1], a + size[1] + 1
-    sigma = max(max(pixels[a, 4], pixels[b, 4]), max(pixels[d, 4], pixels[e, 4]))
-    low = min(min(pixels[a, 0], pixels[b, 0]), min(pixels[d, 0], pixels[e, 0]))
-    high = max(max(pixels[a, 0], pixels[b, 0]), max(pixels[d, 0], pixels[e, 0]))
+    sigma = max(max(pixels[a, SIGMA], pixels[b, SIGMA]), max(pixels[d, SIGMA], pixels[e, SIGMA]))
+    low = min(min(pixels[a, DEPTH], pixels[b, DEPTH]), min(pixels[d, DEPTH], pixels[e, DEPTH]))
+    high = max(max(pixels[a, DEPTH], pixels[b, DEPTH]), max(pixels[d, DEPTH], pixels[e, DEPTH]))
     if not sigma < UNKNOWN_MM or high - low > STEP_MM:
-        return pixels[near, 0]
-    x, y = column - c, row - r
-    return (1 - y) * ((1 - x) * pixels[a, 0] + x * pixels[b, 0]) + y * ((1 - x) * pixels[d, 0] + x * pixels[e, 0])
+        return pixels[near, DEPTH]
+    return bilinear(pixels[a, DEPTH], pixels[b, DEPTH], pixels[d, DEPTH], pixels[e, DEPTH], column - c, row - r)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,18 +1,26 @@
 """The membrane through what is known of a field: over-relaxed Gauss-Seidel on a sparse grid, one colour at a time, so
 that threads never meet and the order of work does not show (compiled)."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import njit
 
 
+class Membrane(NamedTuple):
+    """What holds the field: where it is drawn to and how much, what it may not go below, and where it stays."""
+
+    target: np.ndarray
+    weight: np.ndarray
+    bound: np.ndarray
+    fixed: np.ndarray
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def relax(
     field: np.ndarray,
-    target: np.ndarray,
-    weight: np.ndarray,
-    bound: np.ndarray,
-    fixed: np.ndarray,
+    membrane: Membrane,
     index: np.ndarray,
     neighbours: np.ndarray,
     colour: int,
@@ -21,6 +29,7 @@ def relax(
     last: int,
 ) -> None:
     """One half sweep towards the least of ``sum w (u - target)^2 + sum over edges (u - u')^2`` with ``u >= bound``."""
+    target, weight, bound, fixed = membrane
     for n in range(first, last):
         if fixed[n] or (index[n, 0] + index[n, 1] + index[n, 2]) & 1 != colour:
             continue

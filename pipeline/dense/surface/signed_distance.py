@@ -21,7 +21,7 @@ from pipeline.dense.depth_map import DepthMap, points_world
 from pipeline.dense.surface import grid_kernels
 from pipeline.dense.surface.grid import Grid, everywhere, marked_box, refined, whole_box
 from pipeline.dense.surface.prior import distance_to_head
-from pipeline.dense.surface.relaxation_kernels import relax
+from pipeline.dense.surface.relaxation_kernels import Membrane, relax
 from pipeline.dense.surface.view_stack import ViewStack
 from pipeline.dense.surface.vote_kernels import vote
 from pipeline.parallel_for import in_threads
@@ -79,8 +79,9 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
     pull = np.where(unseen, (grid.step_mm / blend) ** 2, DATA_WEIGHT * votes.weight).astype(np.float32)
     field = np.where(grid.outer, start, np.maximum(target, votes.bound)).astype(np.float32)
     fixed = grid.outer | (votes.bound >= reach)
+    membrane = Membrane(target, pull, votes.bound, fixed)
     for sweep in range(2 * sweeps):
-        given = (field, target, pull, votes.bound, fixed, grid.index, grid.neighbours, sweep % 2, factor)
+        given = (field, membrane, grid.index, grid.neighbours, sweep % 2, factor)
         in_threads(len(grid), lambda first, last, given=given: relax(*given, first, last))
     return Level(grid, field, votes.weight)
 
@@ -91,7 +92,7 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
     step = grid.step_mm
     limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_MM, FLOOR_MM])
     place = (grid.index, grid.corner, step)
-    given = (*place, views.cameras, views.sizes, views.starts, views.pixels, limits, value, weight, bound)
+    given = (*place, views.packed(), limits, value, weight, bound)
     in_threads(len(grid), lambda first, last: vote(*given, first, last))
     return Votes(value, weight, bound)
 

@@ -8,8 +8,10 @@ from jaxtyping import Float, Float32, Int64
 
 from pipeline.compiled import njit
 from pipeline.dense.depth_map import DepthMap
+from pipeline.dense.surface.vote_kernels import DEPTH, FRAME, NORMAL, OUTLINE, SIGMA, Pixels
 from pipeline.imaging.projection import packed_lens
 from pipeline.imaging.projection_kernels import distorted
+from pipeline.imaging.sampling_kernels import held, sample
 from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera
 from rig.rig import Rig
@@ -33,6 +35,10 @@ class ViewStack:
     starts: Int64[np.ndarray, " k"]
     pixels: Float32[np.ndarray, "p 8"]
 
+    def packed(self) -> Pixels:
+        """For compiled loops."""
+        return Pixels(self.cameras, self.sizes, self.starts, self.pixels)
+
 
 def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhouette], rig: Rig) -> ViewStack:
     """The views of the depth maps, in their order."""
@@ -41,23 +47,20 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
     pixels = np.zeros((starts[-1], 8), np.float32)
     for depth_map, first, last in zip(depth_maps, starts[:-1], starts[1:], strict=True):
         camera, own = rig[depth_map.camera.name], pixels[first:last]
-        own[:, 0] = depth_map.depth_mm.ravel()
-        own[:, 1:4] = depth_map.normal.reshape(-1, 3)
+        own[:, DEPTH] = depth_map.depth_mm.ravel()
+        own[:, NORMAL : NORMAL + 3] = depth_map.normal.reshape(-1, 3)
         alone = depth_map.views.ravel() < VIEWS_SURE
-        own[:, 4] = depth_map.deviation_mm.ravel() * np.where(alone, np.float32(ALONE_FACTOR), np.float32(1))
-        crop = np.array(_lens(depth_map.camera))
+        own[:, SIGMA] = depth_map.deviation_mm.ravel() * np.where(alone, np.float32(ALONE_FACTOR), np.float32(1))
+        crop = depth_map.camera.intrinsics.values()[:4]
         _outline(crop, packed_lens(camera), depth_map.depth_mm.shape[1], silhouettes[camera.name].distance, own)
     return ViewStack(np.stack([_packed(depth_map.camera) for depth_map in depth_maps]), sizes, starts[:-1], pixels)
 
 
-def _lens(camera: Camera) -> tuple[float, float, float, float]:
-    k = camera.intrinsics
-    return k.fx, k.fy, k.cx, k.cy
-
-
 def _packed(camera: Camera) -> Float[np.ndarray, " 19"]:
     pose = camera.camera_from_world
-    return np.concatenate([pose.rotation.ravel(), pose.translation, _lens(camera), camera.centre_world])
+    return np.concatenate(
+        [pose.rotation.ravel(), pose.translation, camera.intrinsics.values()[:4], camera.centre_world]
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -69,10 +72,5 @@ def _outline(crop: np.ndarray, lens: np.ndarray, width: int, distance: np.ndarra
     rows, columns = distance.shape
     for at in range(len(pixels)):
         u, v = distorted((at % width - crop[2]) / crop[0], (at // width - crop[3]) / crop[1], lens)
-        pixels[at, 6] = max(max(-u, u - (columns - 1)), max(-v, v - (rows - 1)))
-        u, v = min(max(u, 0.0), columns - 1.001), min(max(v, 0.0), rows - 1.001)
-        c, r = int(u), int(v)
-        fx, fy = u - c, v - r
-        top = distance[r, c] + fx * (distance[r, c + 1] - distance[r, c])
-        low = distance[r + 1, c] + fx * (distance[r + 1, c + 1] - distance[r + 1, c])
-        pixels[at, 5] = top + fy * (low - top)
+        pixels[at, FRAME] = max(max(-u, u - (columns - 1)), max(-v, v - (rows - 1)))
+        pixels[at, OUTLINE] = sample(distance, held(u, columns), held(v, rows))

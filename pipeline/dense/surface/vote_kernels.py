@@ -1,9 +1,14 @@
 """What the views say of a place: how far in front of the surface it lies, and that nobody may be there (compiled)."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.imaging.projection_kernels import LENS, NEAREST_MM, pinhole, placed
 
+DEPTH, NORMAL, SIGMA, OUTLINE, FRAME = 0, 1, 4, 5, 6  # columns of a pixel; the normal has three
+CENTRE = 16  # of a camera's row: its centre
 VIEWS_MOST = 64
 PLANE_SHARE = 0.3  # of the way along the ray that a place before a surface is off at least, however flat that is seen
 THICKEST_MM = 60.0  # of a body behind its surface, where no silhouette bounds it
@@ -12,15 +17,21 @@ FLATTEST = 0.1  # cosine beyond which a tangent plane says nothing of a place be
 UNKNOWN_MM = 1e9  # deviations beyond are infinite
 
 
+class Pixels(NamedTuple):
+    """What the views see, as ``view_stack.ViewStack`` has it."""
+
+    cameras: np.ndarray
+    sizes: np.ndarray
+    starts: np.ndarray
+    pixels: np.ndarray
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def vote(
     index: np.ndarray,
     corner: np.ndarray,
     step_mm: float,
-    cameras: np.ndarray,
-    sizes: np.ndarray,
-    starts: np.ndarray,
-    pixels: np.ndarray,
+    views: Pixels,
     limits: np.ndarray,
     value: np.ndarray,
     weight: np.ndarray,
@@ -37,6 +48,7 @@ def vote(
     ``limits``: reach, behind, agreement (mm), unit and
     floor of a vote's deviation (mm).
     """
+    cameras, sizes, starts, pixels = views
     reach, behind, agreement, unit, floor = limits
     votes, weights, place = np.empty(VIEWS_MOST), np.empty(VIEWS_MOST), np.empty(3)
     for n in range(first, last):
@@ -48,13 +60,13 @@ def vote(
         hidden = 1e9  # smallest depth behind a surface that is seen
         framed, framed_next = 1e9, 1e9  # smallest and second smallest distance outside a photograph
         for v in range(len(cameras)):
-            depth, column, row = project(cameras[v], place)
-            if depth <= 1.0:
+            depth, column, row = seen_at(cameras[v], place)
+            if depth <= NEAREST_MM:
                 continue
             at, beyond = nearest_pixel(column, row, sizes[v])
             at += starts[v]
-            scale = depth / cameras[v, 12]
-            edge, off = (pixels[at, 6] + beyond) * scale, pixels[at, 5] * scale
+            scale = depth / cameras[v, LENS]
+            edge, off = (pixels[at, FRAME] + beyond) * scale, pixels[at, OUTLINE] * scale
             framed, framed_next = min(framed, edge), min(framed_next, max(framed, edge))
             guess = max(guess, off)
             if edge > 0.0:
@@ -62,18 +74,18 @@ def vote(
             hull, hull_next = max(hull, off), max(hull_next, min(hull, off))
             if hull_next > reach:
                 break  # two silhouettes say that nobody is there
-            sigma = pixels[at, 4]
+            sigma = pixels[at, SIGMA]
             if beyond > 0.0 or not sigma < UNKNOWN_MM:
                 continue
             facing = max(cosine(cameras[v], place, depth, pixels[at]), FLATTEST)
-            before = (pixels[at, 0] - depth) * facing
+            before = (pixels[at, DEPTH] - depth) * facing
             if before < -behind:
-                hidden = min(hidden, depth - pixels[at, 0])
+                hidden = min(hidden, depth - pixels[at, DEPTH])
                 continue
             share = min(unit * unit / (sigma * sigma + floor * floor) * min(1.0, 2.0 * facing), 2.0)
             if before < 0.0:
                 share *= 1.0 + 0.75 * before / behind
-            votes[count] = min(max(before, PLANE_SHARE * (pixels[at, 0] - depth)), reach)
+            votes[count] = min(max(before, PLANE_SHARE * (pixels[at, DEPTH] - depth)), reach)
             weights[count] = share
             count += 1
         hull = max(hull, framed_next)
@@ -87,12 +99,11 @@ def vote(
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def project(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
+def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
     """Depth (mm), column and row of a place in the world frame; see ``view_stack.ViewStack.cameras``."""
-    depth = camera[6] * place[0] + camera[7] * place[1] + camera[8] * place[2] + camera[11]
-    x = camera[0] * place[0] + camera[1] * place[1] + camera[2] * place[2] + camera[9]
-    y = camera[3] * place[0] + camera[4] * place[1] + camera[5] * place[2] + camera[10]
-    return depth, camera[12] * x / depth + camera[14], camera[13] * y / depth + camera[15]
+    x, y, depth = placed(camera, place[0], place[1], place[2])
+    column, row = pinhole(x / depth, y / depth, camera[LENS:])
+    return depth, column, row
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
@@ -106,8 +117,8 @@ def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, flo
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def cosine(camera: np.ndarray, place: np.ndarray, depth: float, pixel: np.ndarray) -> float:
     """Cosine between a pixel's normal and the way to the camera, times the length of the ray a unit of depth."""
-    x, y, z = place[0] - camera[16], place[1] - camera[17], place[2] - camera[18]
-    return -(x * pixel[1] + y * pixel[2] + z * pixel[3]) / depth
+    x, y, z = place[0] - camera[CENTRE], place[1] - camera[CENTRE + 1], place[2] - camera[CENTRE + 2]
+    return -(x * pixel[NORMAL] + y * pixel[NORMAL + 1] + z * pixel[NORMAL + 2]) / depth
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")

@@ -26,16 +26,15 @@ from pipeline.eigenheads.correspondence.scans import Scan
 from pipeline.eigenheads.correspondence.warp import landmark_warp
 from pipeline.eigenheads.landmarks import NAMES, stacked
 from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.pca import align, rigid_fit
+from pipeline.eigenheads.pca import align
 from pipeline.eigenheads.subdivision import edges_of, vertex_areas
-from rig.geometry import cross_matrix
+from rig.geometry import RigidTransform, cross_matrix, rigid_fit
 from rig.mesh import vertex_normals
 
 _TAUBIN = (0.5, -0.53)  # a step that smooths and one that gives the size back
 _SMOOTHINGS = 4  # of both: noise of single points falls to half; with 8, fine shape goes too
 
 Report = Callable[[str, float], None]
-Frame = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]  # rotation and translation, frame from scan
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +72,7 @@ class Correspondence:
     heads: Float[np.ndarray, "N V 3"]
     void: Bool[np.ndarray, "N V"]
     reference: int
-    frame_from_scan: list[Frame]
+    frame_from_scan: list[RigidTransform]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +91,9 @@ def correspond(
     matching = matching or Matching()
     frames = common_frame(scans, template)
     given = list(zip(scans, frames, strict=True))
-    reference = nearest_mean(np.array([stacked(scan.landmarks) @ r.T + t for scan, (r, t) in given]))
+    reference = nearest_mean(np.array([frame.apply(stacked(scan.landmarks)) for scan, frame in given]))
     with workers(matching.workers, len(scans)) as crew:
-        shape = on_reference(prepared(scans[reference], *frames[reference]), template, matching)
+        shape = on_reference(prepared(scans[reference], frames[reference]), template, matching)
         heads, void = np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
         for stage in ("first pass", "second pass"):
             sample = partial(_resampled, shape, _landmark_rows(template), matching)
@@ -107,19 +106,19 @@ def correspond(
     return Correspondence(heads, void, reference, frames)
 
 
-def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[Frame]:
+def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransform]:
     """Rigid motions into the head frame: landmarks aligned with each other, their mean with the template's."""
     marks = np.array([stacked(scan.landmarks) for scan in scans])
     ours = template.vertices(np.zeros(0))[[template.landmarks[name] for name in NAMES]]
     weights = np.ones(len(NAMES))
-    start = np.array([m @ r.T + t for m in marks for r, t in [rigid_fit(m, ours, weights)]])
+    start = np.array([rigid_fit(m, ours, weights).apply(m) for m in marks])
     mean = align(start, weights).mean(0)
     return [rigid_fit(m, mean, weights) for m in marks]
 
 
-def prepared(scan: Scan, rotation: np.ndarray, translation: np.ndarray) -> Target:
+def prepared(scan: Scan, frame_from_scan: RigidTransform) -> Target:
     """The scan in the common frame, its noise smoothed away without shrinking it (Taubin 1995), and smooth normals."""
-    vertices = scan.vertices @ rotation.T + translation
+    vertices = frame_from_scan.apply(scan.vertices)
     averaging = _averaging(scan.faces, len(vertices))
     for factor in _TAUBIN * _SMOOTHINGS:
         vertices += factor * (averaging @ vertices - vertices)
@@ -127,7 +126,7 @@ def prepared(scan: Scan, rotation: np.ndarray, translation: np.ndarray) -> Targe
     for _ in range(2):
         normals = averaging @ normals
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    marks = stacked(scan.landmarks) @ rotation.T + translation
+    marks = frame_from_scan.apply(stacked(scan.landmarks))
     return Target(vertices, normals, marks)
 
 
@@ -179,16 +178,19 @@ def warp_and_resample(
 
 
 def _resampled(
-    shape: Float[np.ndarray, "V 3"], index: Int[np.ndarray, " L"], matching: Matching, given: tuple[Scan, Frame]
+    shape: Float[np.ndarray, "V 3"],
+    index: Int[np.ndarray, " L"],
+    matching: Matching,
+    given: tuple[Scan, RigidTransform],
 ) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
-    scan, (rotation, translation) = given
-    vertices = scan.vertices @ rotation.T + translation
-    marks = stacked(scan.landmarks) @ rotation.T + translation
+    scan, frame_from_scan = given
+    vertices = frame_from_scan.apply(scan.vertices)
+    marks = frame_from_scan.apply(stacked(scan.landmarks))
     return warp_and_resample(shape, index, marks, CylinderIndex(vertices, scan.faces), matching)[1:]
 
 
 def _refined(
-    given: Sequence[tuple[Scan, Frame]],
+    given: Sequence[tuple[Scan, RigidTransform]],
     template: HeadModel,
     matching: Matching,
     crew: Workers,
@@ -206,10 +208,10 @@ def _most_probable(
     faces: Int[np.ndarray, "F 3"],
     index: Int[np.ndarray, " L"],
     matching: Matching,
-    given: tuple[Scan, Frame],
+    given: tuple[Scan, RigidTransform],
 ) -> Float[np.ndarray, "V 3"]:
     scan, frame = given
-    target = prepared(scan, *frame)
+    target = prepared(scan, frame)
     likeness = statistical(prior, faces, index, target, matching)
     return refined(likeness, faces, target, matching.fine, matching.stiffness)
 

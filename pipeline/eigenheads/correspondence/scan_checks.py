@@ -16,8 +16,8 @@ from pipeline.eigenheads.correspondence.cylinder import CylinderIndex
 from pipeline.eigenheads.correspondence.scans import Scan
 from pipeline.eigenheads.landmarks import NAMES, PAIRED, mirrored, stacked
 from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.pca import rigid_fit
 from rig.errors import InputError
+from rig.geometry import rigid_fit
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SIZE_RANGE = (0.7, 1.4)  # of the mean head: wider than any adult, narrower than the steps between units
@@ -104,8 +104,7 @@ def _sides_and_windings(scan: Scan, template: HeadModel) -> tuple[Scan, list[str
 def _landmark_faults(scan: Scan, template: HeadModel) -> list[str]:
     mean = _mean_marks(template)
     marks = stacked(scan.landmarks)
-    rotation, translation = rigid_fit(marks, mean, np.ones(len(NAMES)))
-    placed = dict(zip(NAMES, marks @ rotation.T + translation, strict=True))
+    placed = dict(zip(NAMES, rigid_fit(marks, mean).apply(marks), strict=True))
     swapped = [pair for pair in PAIRED if placed[f"{pair}_left"][0] <= placed[f"{pair}_right"][0]]
     faults = [f"{pair}_left and {pair}_right are swapped" for pair in swapped]
     for name, wanted in zip(NAMES, mean, strict=True):
@@ -143,8 +142,7 @@ def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
 def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Bool[np.ndarray, "H A"]]:
     """Cells of 4 mm (height, angle) from chin to above the brow where no surface is, and those of the face."""
     marks, placed = stacked(scan.landmarks), _placed(scan, template)
-    rotation, translation = rigid_fit(marks, _mean_marks(template), np.ones(len(NAMES)))
-    at = dict(zip(NAMES, marks @ rotation.T + translation, strict=True))
+    at = dict(zip(NAMES, rigid_fit(marks, _mean_marks(template)).apply(marks), strict=True))
     heights = np.arange(at["gnathion"][1] + 4, at["glabella"][1] + 35, _CELL_MM)
     angles = -np.pi + 2 * np.pi * (np.arange(_ROUND) + 0.5) / _ROUND
     columns, rows = np.meshgrid(angles, heights)
@@ -172,8 +170,7 @@ def _widest(mask: Bool[np.ndarray, "H A"]) -> float:
 
 
 def _placed(scan: Scan, template: HeadModel) -> Float[np.ndarray, "S 3"]:
-    rotation, translation = rigid_fit(stacked(scan.landmarks), _mean_marks(template), np.ones(len(NAMES)))
-    return scan.vertices @ rotation.T + translation
+    return rigid_fit(stacked(scan.landmarks), _mean_marks(template)).apply(scan.vertices)
 
 
 def _mean_marks(template: HeadModel) -> Float[np.ndarray, "26 3"]:
@@ -182,8 +179,7 @@ def _mean_marks(template: HeadModel) -> Float[np.ndarray, "26 3"]:
 
 
 def _misfit(marks: Float[np.ndarray, "26 3"], mean: Float[np.ndarray, "26 3"]) -> float:
-    rotation, translation = rigid_fit(marks, mean, np.ones(len(mean)))
-    return float(np.linalg.norm(marks @ rotation.T + translation - mean))
+    return float(np.linalg.norm(rigid_fit(marks, mean).apply(marks) - mean))
 
 
 def _spread(marks: Float[np.ndarray, "26 3"]) -> float:

@@ -22,11 +22,11 @@ from pipeline.eigenheads.correspondence.warp import landmark_warp
 from pipeline.eigenheads.landmarks import MIDLINE, NAMES, mirrored
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.model_file import ModelParts, read_parts, rounded
-from pipeline.eigenheads.pca import Components, orthogonalised, rigid_fit
+from pipeline.eigenheads.pca import Components, orthogonalised
 from pipeline.eigenheads.subdivision import boundary_loops, close_loop, vertex_areas
 from pipeline.eigenheads.training.training import Training, above_neck, face_region, finish
 from rig.errors import EigenheadError
-from rig.geometry import RigidTransform
+from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
 
 Report = Callable[[str, float], None]
@@ -343,7 +343,7 @@ def _start(default: HeadModel, mean: Float[np.ndarray, "V 3"], known: Mapping[st
     ours = default.vertices(np.zeros(0))
     if len(known) >= 3:
         source = ours[[default.landmarks[name] for name in known]]
-        return RigidTransform(*rigid_fit(source, mean[list(known.values())], np.ones(len(known))))
+        return rigid_fit(source, mean[list(known.values())])
     nose = mean[mean[:, 2].argmax()]
     return RigidTransform(np.eye(3), nose - ours[default.landmarks["pronasale"]])
 

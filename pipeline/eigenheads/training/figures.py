@@ -107,7 +107,7 @@ def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
         for _ in range(2)
     ]
     frames = common_frame(scans, model)
-    reference, target = (prepared(scan, *frame) for scan, frame in zip(scans, frames, strict=True))
+    reference, target = (prepared(scan, frame) for scan, frame in zip(scans, frames, strict=True))
     matching = Matching()
     index = np.array([model.landmarks[name] for name in NAMES])
     shape = on_reference(reference, model, matching)

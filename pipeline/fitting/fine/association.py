@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.fitting.fine.association_kernels import closest_triangles
+from pipeline.fitting.fine.association_kernels import Head, closest_triangles
 from pipeline.parallel_for import in_threads
 
 CANDIDATES = 4  # vertices whose triangles are tried
@@ -60,18 +60,15 @@ def associate(
         The points that have a place, in their order.
     """
     reach = np.broadcast_to(np.asarray(reach_mm, float), len(points))
-    start, member = faces_at_vertices(faces, len(vertices))
+    head = Head(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
     _, near = KDTree(vertices).query(points, k=min(CANDIDATES, len(vertices)), workers=-1)
     near = near.reshape(len(points), min(CANDIDATES, len(vertices)))
     triangle = np.empty(len(points), np.int64)
     blend, square = np.zeros((len(points), 3)), np.empty(len(points))
     in_threads(
         len(points),
-        lambda a, b: closest_triangles(
-            a, b, points, normals, near, vertices, vertex_normals, faces, start, member, least_agreement,
-            triangle, blend, square,
-        ),
-    )  # fmt: skip
+        lambda a, b: closest_triangles(a, b, points, normals, near, head, least_agreement, triangle, blend, square),
+    )
     row = np.flatnonzero((triangle >= 0) & (square <= reach**2))
     return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
 

@@ -1,18 +1,30 @@
 """The compiled loop of ``association``: the closest of the triangles about a few vertices."""
 
+from typing import NamedTuple
+
+import numpy as np
+
 from pipeline.compiled import njit
 
 
+class Head(NamedTuple):
+    """Vertices with their unit normals, triangles, and by vertex where its triangles begin, and those."""
+
+    vertices: np.ndarray
+    vertex_normals: np.ndarray
+    faces: np.ndarray
+    start: np.ndarray
+    member: np.ndarray
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def closest_triangles(
-    first, last, points, normals, near, vertices, vertex_normals, faces, start, member, least_agreement,
-    triangle, blend, square,
-):  # fmt: skip
+def closest_triangles(first, last, points, normals, near, head, least_agreement, triangle, blend, square):
     """For points ``first`` to ``last``: of the triangles at the vertices ``near`` whose side agrees with the point's
     normal, the closest one, its barycentric weights, and the squared distance; triangle -1 where none agrees.
 
     Point to triangle after C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5.
     """
+    vertices, vertex_normals, faces, start, member = head
     for p in range(first, last):
         triangle[p] = -1
         best = 1e30

@@ -7,25 +7,25 @@ texture exactly, and sliding along the surface with it). Linear in the image shi
     H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
 
 g_k the images' slopes. A displacement u along the normal and camera corrections c_k make ``delta_k = p_k u + C_k c_k``.
-Eliminating u leaves how the place that the patch reports leans on the cameras, and a quadratic form in the cameras
+Eliminating u leaves the derivative of patch depth with respect to camera pose, and a quadratic form in the cameras
 alone: shifts that no surface explains. A camera of 0.2 px error shows in thousands of patches.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Int
 
 from pipeline.compiled import njit
-from pipeline.fitting.photo.correlation import read
+from pipeline.fitting.photo.correlation import Members, Pictures, Samples, read
 from pipeline.fitting.photo.patches import Patches
 from pipeline.parallel_for import in_threads
 from rig.camera import Camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Leaning:
-    """Of n patches: how the place that each reports leans on the cameras, and what they say of the cameras alone."""
+class CameraSensitivity:
+    """Of n patches: the derivative of depth with respect to camera pose, and what they say of the cameras alone."""
 
     by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
     stiff: Float[np.ndarray, "n a a"]  # of the image shifts of its views, by the patch's own information
@@ -39,14 +39,14 @@ class Leaning:
         return slides.T @ pulled.reshape(slides.shape), -(self.slope * information[:, None]).ravel() @ slides
 
 
-def lean(
+def camera_sensitivity(
     view: Int[np.ndarray, "n v"],
     value: Float[np.ndarray, "n v"],
     grams: tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]],
     places: Float[np.ndarray, "n 3"],
     axes: Float[np.ndarray, "n 3"],
     cameras: tuple[Camera, ...],
-) -> Leaning:
+) -> CameraSensitivity:
     """Of patches whose surface lies at ``places`` and moves along ``axes``; ``grams``: of ``gram_matrices``."""
     slopes, mixed = grams
     axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes
@@ -62,7 +62,7 @@ def lean(
     own = np.einsum("na,na->n", ahead, across)
     own = np.where(own > 1e-12, own, np.inf)[:, None]
     down = np.einsum("na,na->n", ahead, gradient)[:, None]
-    return Leaning(
+    return CameraSensitivity(
         by_camera=np.einsum("na,nac->nc", -across / own, slides),
         stiff=(matrix - across[:, :, None] * across[:, None, :] / own[:, :, None]) / own[:, :, None],
         slope=(gradient - across * down / own) / own,
@@ -97,32 +97,23 @@ def gram_matrices(
     weights: Float[np.ndarray, " e"],
     view: Int[np.ndarray, "n v"],
     shifts: Float[np.ndarray, " n"],
-    pixel: Float[np.ndarray, "k s 2"],
-    along: Float[np.ndarray, "k s 2"],
-    seen: Bool[np.ndarray, "k s"],
-    size: Int[np.ndarray, "k 2"],
-    offset: Int[np.ndarray, " k"],
-    image: Float32[np.ndarray, " i"],
-    noise: Float[np.ndarray, " k"],
+    samples: Samples,
+    pictures: Pictures,
 ) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
     """<g, g> of the slopes of a patch's views, two axes each, and <g, f> of slopes and grey values, with the surface
     moved by ``shifts`` (mm along the normals)."""
     count, views = view.shape
     slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))
-    start, member = patches.start, patches.member
-    in_threads(
-        count,
-        lambda a, b: _grams(
-            a, b, chosen, start, member, weights, view, shifts, pixel, along, seen, size, offset, image, noise,
-            slopes, mixed,
-        ),
-    )  # fmt: skip
+    members = Members(patches.start, patches.member, weights)
+    in_threads(count, lambda a, b: _grams(a, b, chosen, members, view, shifts, samples, pictures, slopes, mixed))
     return slopes, mixed
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _grams(first, last, chosen, start, member, weight, view, shifts, pixel, along, seen, size, offset, image, noise,
-           slopes, mixed):  # fmt: skip
+def _grams(first, last, chosen, members, view, shifts, samples, pictures, slopes, mixed):
+    start, member, weight = members
+    pixel, along, seen = samples
+    size, offset, image, noise = pictures
     for q in range(first, last):
         begin, count, views = start[chosen[q]], start[chosen[q] + 1] - start[chosen[q]], 0
         while views < view.shape[1] and view[q, views] >= 0:

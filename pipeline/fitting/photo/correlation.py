@@ -3,14 +3,42 @@
 Plain loops over arrays; threads share them out.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.compiled import njit
 from pipeline.fitting.photo.patches import Patches
+from pipeline.imaging.sampling_kernels import held, sample_row
 from pipeline.parallel_for import in_threads
 
 LEAST_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
+
+
+class Samples(NamedTuple):
+    """Where each camera sees each sample, how that moves along the normal (px / mm), and whether it does."""
+
+    pixel: Float[np.ndarray, "k s 2"]
+    along: Float[np.ndarray, "k s 2"]
+    seen: Bool[np.ndarray, "k s"]
+
+
+class Pictures(NamedTuple):
+    """Grey images of all cameras, one after the other, row by row."""
+
+    size: Int[np.ndarray, "k 2"]  # width, height
+    offset: Int[np.ndarray, " k"]
+    image: Float32[np.ndarray, " n"]
+    noise: Float[np.ndarray, " k"]  # standard deviation of grey values
+
+
+class Members(NamedTuple):
+    """The samples of patch p are ``member[start[p] : start[p + 1]]``, with their weights in the window."""
+
+    start: np.ndarray
+    member: np.ndarray
+    weight: np.ndarray
 
 
 def choose_views(
@@ -28,19 +56,11 @@ def choose_views(
     return np.where(speaks, view, -1), np.where(speaks, value, 0.0)
 
 
-def sweep(
-    pixel: Float[np.ndarray, "k s 2"],
-    along: Float[np.ndarray, "k s 2"],
-    seen: Bool[np.ndarray, "k s"],
-    size: Int[np.ndarray, "k 2"],
-    offset: Int[np.ndarray, " k"],
-    image: Float32[np.ndarray, " n"],
-    steps: Float[np.ndarray, " d"],
-) -> Float32[np.ndarray, "s k d"]:
-    """Grey values of every sample moved along its normal by ``steps`` (mm), as each camera shows it. ``pixel``: where
-    it sees the sample, ``along``: how that moves (px / mm)."""
-    out = np.zeros((pixel.shape[1], len(pixel), len(steps)), np.float32)
-    in_threads(len(out), lambda a, b: _sweep(a, b, pixel, along, seen, size, offset, image, steps, out))
+def sweep(samples: Samples, pictures: Pictures, steps: Float[np.ndarray, " d"]) -> Float32[np.ndarray, "s k d"]:
+    """Grey values of every sample moved along its normal by ``steps`` (mm), as each camera shows it."""
+    cameras, count = samples.seen.shape
+    out = np.zeros((count, cameras, len(steps)), np.float32)
+    in_threads(count, lambda a, b: _sweep(a, b, samples, pictures, steps, out))
     return out
 
 
@@ -59,25 +79,23 @@ def correlate(
     so that a patch without texture is like nothing, however alike its noise may look.
     """
     score = np.zeros((len(patches.centre), grey.shape[2]), np.float32)
-    start, member = patches.start, patches.member
-    in_threads(len(score), lambda a, b: _correlate(a, b, start, member, weights, view, value, seen, grey, noise, score))
+    members = Members(patches.start, patches.member, weights)
+    in_threads(len(score), lambda a, b: _correlate(a, b, members, view, value, seen, grey, noise, score))
     return score
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def read(image, start, width, height, x, y):
     """The image that begins at ``start`` of the row of images, bilinear, held inside."""
-    x, y = min(max(x, 0.0), width - 1.001), min(max(y, 0.0), height - 1.001)
+    x, y = held(x, width), held(y, height)
     column, row = int(x), int(y)
-    fx, fy = np.float32(x - column), np.float32(y - row)
-    i = start + row * width + column
-    top = image[i] + fx * (image[i + 1] - image[i])
-    bottom = image[i + width] + fx * (image[i + width + 1] - image[i + width])
-    return top + fy * (bottom - top)
+    return sample_row(image, start + row * width + column, width, np.float32(x - column), np.float32(y - row))
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _sweep(first, last, pixel, along, seen, size, offset, image, steps, out):
+def _sweep(first, last, samples, pictures, steps, out):
+    pixel, along, seen = samples
+    size, offset, image, _ = pictures
     for s in range(first, last):
         for k in range(len(pixel)):
             if not seen[k, s]:
@@ -89,7 +107,8 @@ def _sweep(first, last, pixel, along, seen, size, offset, image, steps, out):
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _correlate(first, last, start, member, weight, view, value, seen, grey, noise, score):
+def _correlate(first, last, members, view, value, seen, grey, noise, score):
+    start, member, weight = members
     for p in range(first, last):
         begin, count, views = start[p], start[p + 1] - start[p], 0
         while views < view.shape[1] and view[p, views] >= 0:

@@ -14,13 +14,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.fitting.photo.camera_term import gram_matrices, lean
-from pipeline.fitting.photo.correlation import choose_views, correlate, sweep
+from pipeline.fitting.photo.camera_term import camera_sensitivity, gram_matrices
+from pipeline.fitting.photo.correlation import Pictures, Samples, choose_views, correlate, sweep
 from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.fitting.photo.patches import Patches
 from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import rasterise
+from pipeline.parallel_for import thread_count
 from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.geometry import RigidTransform
@@ -44,7 +45,7 @@ class Round:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looks:
+class SampleVisibility:
     """The head as it stands, and who sees what of it."""
 
     cameras: tuple[Camera, ...]  # where the state has them
@@ -56,9 +57,9 @@ class Looks:
     along: Float[np.ndarray, "k s 2"]  # both 0 where it does not
 
 
-def look(
+def sample_visibility(
     problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
-) -> Looks:
+) -> SampleVisibility:
     """Draws the depth of the head in every view, and asks for every sample."""
     model, pose = problem.model, state.world_from_head
     cage = model.cage(state.coefficients)
@@ -82,9 +83,9 @@ def look(
         ends[:, seen] = here, further - here
         return facing, ends[0], ends[1]
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         facing, pixel, along = zip(*pool.map(one, range(len(cameras))), strict=True)
-    return Looks(cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along))
+    return SampleVisibility(cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along))
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
@@ -131,7 +132,7 @@ def observe(
     state: State,
     photographs: Photographs,
     patches: Patches,
-    looks: Looks,
+    visibility: SampleVisibility,
     hair: Bool[np.ndarray, " c"],
     basis: Float32[np.ndarray, "m c 3"],
     each: Round,
@@ -142,11 +143,13 @@ def observe(
     the model's modes at the centres."""
     views = problem.views
     steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
-    scale = pixels_per_mm(looks.cameras, state.world_from_head.translation)
+    scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
     image, noise = blurred(photographs, each.blur_mm * scale)
-    weights, seen = patches.weights(each.window_mm), looks.facing > 0
-    grey = sweep(looks.pixel, looks.along, seen, views.size, views.offset, image, steps)
-    view, value = choose_views(patches, weights, looks.facing, settings.least_seen, settings.views_most)
+    weights, seen = patches.weights(each.window_mm), visibility.facing > 0
+    samples = Samples(visibility.pixel, visibility.along, seen)
+    pictures = Pictures(views.size, views.offset, image, noise)
+    grey = sweep(samples, pictures, steps)
+    view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
     found = find_peaks(correlate(patches, weights, view, value, seen, grey, noise), steps)
     blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
     variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - found.height) / found.curvature
@@ -156,14 +159,13 @@ def observe(
     overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / settings.centre_mm**2)
     information = 1.0 / (overlap * variance[kept])
     rows, place = patches.centre[kept], found.place[kept]
-    grams = gram_matrices(
-        patches, kept, weights, view[kept], place, looks.pixel, looks.along, seen, views.size, views.offset, image,
-        noise,
-    )  # fmt: skip
-    stood, normal = looks.vertices[rows], looks.normals[rows]
-    leaning = lean(view[kept], value[kept], grams, stood + place[:, None] * normal, normal, looks.cameras)
-    camera_matrix, camera_gradient = leaning.cameras(information)
-    metric = metric_rig(looks.cameras, state.world_from_head.translation, settings.rig_scale_spread)
+    grams = gram_matrices(patches, kept, weights, view[kept], place, samples, pictures)
+    stood, normal = visibility.vertices[rows], visibility.normals[rows]
+    sensitivity = camera_sensitivity(
+        view[kept], value[kept], grams, stood + place[:, None] * normal, normal, visibility.cameras
+    )
+    camera_matrix, camera_gradient = sensitivity.cameras(information)
+    metric = metric_rig(visibility.cameras, state.world_from_head.translation, settings.rig_scale_spread)
     observations = SurfaceObservations(
         vertex=rows,
         basis=basis.take(kept, axis=1),  # basis[:, kept] is laid out by vertex, and copied whenever it is used
@@ -172,7 +174,7 @@ def observe(
         seen_at=stood,
         displacement=place,
         information=information,
-        by_camera=leaning.by_camera,
+        by_camera=sensitivity.by_camera,
         camera_shift=state.camera_shift,
         camera_matrix=camera_matrix + metric,
         camera_gradient=camera_gradient - metric @ state.camera_shift.ravel(),

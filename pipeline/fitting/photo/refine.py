@@ -21,7 +21,7 @@ from pipeline.diagnostics import Detail
 from pipeline.eigenheads.gaussian_process import with_fine_kernel
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.contour import Solved, run_stage
-from pipeline.fitting.photo.depth_search import Round, look, observe
+from pipeline.fitting.photo.depth_search import Round, observe, sample_visibility
 from pipeline.fitting.photo.hair_mask import HairProbability, under_hair
 from pipeline.fitting.photo.images import load_photographs
 from pipeline.fitting.photo.patches import Patches, arrays_of, make_patches
@@ -74,9 +74,10 @@ def refine_with_photographs(
     centres = model.vertices(np.zeros(0))[patches.centre]
     lost = np.zeros(0, int)
     for each in ROUNDS:
-        looks = look(problem, state, patches, photographs.speaks, settings)
-        hidden = under_hair(patches, hair or {}, problem.views.names, looks.pixel, looks.facing > 0, centres)
-        surface, lost = observe(problem, state, photographs, patches, looks, hidden, basis, each, settings)
+        visibility = sample_visibility(problem, state, patches, photographs.speaks, settings)
+        seen = visibility.facing > 0
+        hidden = under_hair(patches, hair or {}, problem.views.names, visibility.pixel, seen, centres)
+        surface, lost = observe(problem, state, photographs, patches, visibility, hidden, basis, each, settings)
         share = len(surface.vertex) / max(len(patches.centre), 1)
         if share < settings.least_share:
             why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"

@@ -5,7 +5,7 @@ Enters: coefficients. Leaves: one number, drawn and summed by the renderer; no i
 What may speak. Eq. (5) lets a mismatch far from the input contour hardly count. That answers what the model lacks
 *inside* the outline. It does not answer what the input has and the model cannot make: below the cut through the neck
 the input goes on into shoulders, and every pixel by which the open edge of the mesh creeps down them pays off, so that
-the head grows a neck; hair outside the skull pays the skull for growing. So pixels have a say only where the outline of
+the head grows a neck; hair lowers the cost of an enlarged skull. So pixels have a say only where the outline of
 the aligned head nearest to them belongs to the face region (ear to ear, forehead to chin), and weight zero elsewhere.
 The division is made once per level from the head that the level starts with: within a level the cost is a fixed
 function of the coefficients, eq. (5) with some weights zero. ``speaking="all"`` is the paper's cost to the letter.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from rig.camera import Camera, Intrinsics
+from rig.camera import Camera, Intrinsics, lens_image
 from rig.geometry import look_at
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -95,8 +95,7 @@ def _reached(
     """Share of the four nearest pixels of the depth map, weighted bilinearly, that the point is not behind."""
     k = camera.intrinsics
     seen = camera.camera_from_world.apply(points)
-    x = np.clip(seen[:, 0] / seen[:, 2] * k.fx + k.cx, 0, k.width - 1.001)
-    y = np.clip(seen[:, 1] / seen[:, 2] * k.fy + k.cy, 0, k.height - 1.001)
+    x, y = np.clip(lens_image(seen, k.values()), 0, (k.width - 1.001, k.height - 1.001)).T
     left, top = x.astype(int), y.astype(int)
     across, down = x - left, y - top
     limit = seen[:, 2] - BIAS_MM

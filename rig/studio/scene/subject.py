@@ -49,7 +49,7 @@ HAIR = Grain((5.0, 30.0, 5.0), (0.30, 0.0, 0.0, 0.0), (0.9, 14.0, 5.0), (0.0, 0.
 CLOTH = Grain((9.0, 9.0, 9.0), (0.0, 0.12, 0.0, 0.0), (1.3, 1.3, 1.3), (0.0, 0.0, 0.12, 0.0))
 FRAME_TONE: Colour = (0.025, 0.018, 0.014)
 FRAME = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), gloss=0.15)
-PLAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0))
+NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +145,7 @@ def dress(
     pieces = [_skin(head, body, look, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
     pieces += [_hair_piece(hair, style) for hair, style in hairs]
     if worn:
-        grain = CLOTH if look.texture else PLAIN
+        grain = CLOTH if look.texture else NO_GRAIN
         pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], look.cloth), grain, False))
     pieces += _headwear(head, body, look, hairs[0][0] if look.hair else None)
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
@@ -175,7 +175,7 @@ def dress(
 def _skin(head: Mesh, body: Anatomy, look: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
     if not look.texture:
         return Piece(
-            "head", head.vertices, head.faces, head.vertices, _even(head.vertices, look.skin), PLAIN, one_sided
+            "head", head.vertices, head.faces, head.vertices, _even(head.vertices, look.skin), NO_GRAIN, one_sided
         )
     paint = skin_paint(head.vertices, body, look.skin, look.stubble, rng)
     return Piece(
@@ -215,7 +215,7 @@ def _headwear(head: Mesh, body: Anatomy, look: Look, scalp: Hair | None) -> list
     found = []
     if look.cap:
         surface = cap(head.vertices, scalp.shell if scalp else None, body)
-        grain = CLOTH if look.texture else PLAIN
+        grain = CLOTH if look.texture else NO_GRAIN
         found.append(Piece("clothes", *surface, surface[0], _even(surface[0], look.cap), grain, False))
     if look.glasses:
         surface = glasses(head.vertices, body)

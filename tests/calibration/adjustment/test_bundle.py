@@ -28,7 +28,6 @@ from calibration.adjustment.state import (
     intrinsics_of,
     observations,
     residuals,
-    values_of,
 )
 from calibration.board.board import Board
 from calibration.calibrate import calibrate_detections
@@ -42,7 +41,7 @@ from tests.support.board_sessions import CHARUCO, Session, rig_of, session
 def planted(source: Session) -> BundleState:
     rig, shots = source.rig, source.detections.shots
     return BundleState(
-        np.stack([values_of(camera.intrinsics) for camera in rig]),
+        np.stack([camera.intrinsics.values() for camera in rig]),
         np.stack([camera.camera_from_world.rotation for camera in rig]),
         np.stack([camera.camera_from_world.translation for camera in rig]),
         np.stack([source.poses[shot].rotation for shot in shots]),
@@ -98,7 +97,7 @@ def test_jacobians_of_pose_and_lens_are_finite_differences() -> None:
         step[index] = 1e-5
         numeric = (moved(camera, step).project(points) - moved(camera, -step).project(points)) / 2e-5
         np.testing.assert_allclose(pose_jacobian(camera, points)[:, :, index], numeric, atol=1e-4, rtol=1e-6)
-    values = values_of(camera.intrinsics)
+    values = camera.intrinsics.values()
     for index in range(9):
         step = np.zeros(9)
         step[index] = 1e-6

@@ -22,7 +22,6 @@ from calibration.adjustment.state import (
     Observations,
     moved_state,
     observations,
-    values_of,
 )
 from calibration.silhouette_refinement.tangency_term import PackedTangencies, TangencyTerm
 from pipeline.estimation.terms import Residuals
@@ -97,7 +96,7 @@ def small_bundle() -> tuple[BundleState, Observations]:
     source, rng = session(cameras=3, shots=5, seed=1), np.random.default_rng(0)
     d = source.detections
     state = BundleState(
-        np.stack([values_of(camera.intrinsics) for camera in source.rig]),
+        np.stack([camera.intrinsics.values() for camera in source.rig]),
         np.stack([camera.camera_from_world.rotation for camera in source.rig]),
         np.stack([camera.camera_from_world.translation for camera in source.rig]),
         np.stack([source.poses[shot].rotation for shot in d.shots]),

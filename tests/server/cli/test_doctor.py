@@ -49,6 +49,19 @@ def test_it_names_misspelt_variables_and_a_missing_rig_file(
     assert "rig.toml: cannot be read" in found["rig"]["detail"]
 
 
+def test_it_judges_the_number_of_threads(
+    examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EIGENHEAD_THREADS", "97")
+    found = examine(data=tmp_path)
+    assert found["variables"]["ok"]
+    assert "EIGENHEAD_THREADS gives a job's loops 97 threads" in found["cores"]["detail"]
+    monkeypatch.setenv("EIGENHEAD_THREADS", "many")
+    found = examine(data=tmp_path)
+    assert not found["cores"]["ok"]
+    assert "EIGENHEAD_THREADS: is 'many'; give a whole number from 1 to 512" in found["cores"]["detail"]
+
+
 def test_it_shows_where_data_models_and_keys_live(
     examine: Callable[..., dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

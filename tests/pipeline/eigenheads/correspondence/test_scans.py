@@ -23,6 +23,7 @@ from pipeline.eigenheads.correspondence.scans import Scan
 from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.eigenheads.landmarks import NAMES, mirrored, stacked
 from pipeline.eigenheads.model import HeadModel, load_model
+from rig.geometry import RigidTransform
 
 SUBJECTS = (4, 40, 100)
 
@@ -51,7 +52,7 @@ def papers(model: HeadModel, scans: list[Scan]) -> Correspondence:
 
 def in_scans(found: Correspondence) -> list[np.ndarray]:
     """The heads in their scans' own frames."""
-    return [(head - t) @ r for head, (r, t) in zip(found.heads, found.frame_from_scan, strict=True)]
+    return [frame.inverse().apply(head) for head, frame in zip(found.heads, found.frame_from_scan, strict=True)]
 
 
 def test_landmarks_stay_where_they_were_marked(model: HeadModel, scans: list[Scan], papers: Correspondence) -> None:
@@ -163,7 +164,7 @@ def test_smoothing_a_scan_takes_noise_and_keeps_size(model: HeadModel) -> None:
     faces, head = model.levels["full"].faces, model.vertices(np.zeros(0))
     scanner = Scanner(noise_mm=0.3, landmark_noise_mm=0, turn_rad=0, shift_mm=0, ear_holes=False, holes=0)
     scan = scan_head("s", head, faces, model.landmarks, scanner, np.random.default_rng(0))
-    smooth = prepared(scan, np.eye(3), np.zeros(3)).vertices
+    smooth = prepared(scan, RigidTransform.identity()).vertices
     brow = np.linalg.norm(scan.vertices - scan.landmarks["glabella"], axis=1) < 30
     skull = (scan.vertices[:, 1] > scan.landmarks["glabella"][1] + 40) & (scan.vertices[:, 2] < 0)
     for where in (brow, skull):
@@ -191,7 +192,7 @@ def test_processes_give_what_one_gives_in_order_and_say_how_far_they_are() -> No
 def test_what_processes_are_given_can_travel(model: HeadModel, scans: list[Scan]) -> None:
     """A scan, the template and the work on them, as processes receive them."""
     index = np.array([model.landmarks[name] for name in NAMES])
-    frame = (np.eye(3), np.zeros(3))
+    frame = RigidTransform.identity()
     work = partial(_resampled, model.mean.astype(float), index, Matching())
     again = pickle.loads(pickle.dumps(work))
     scan, template = pickle.loads(pickle.dumps((scans[0], model)))

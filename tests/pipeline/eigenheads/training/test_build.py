@@ -15,10 +15,10 @@ from pipeline.eigenheads.correspondence.scans import Scan, read_scan, write_land
 from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.eigenheads.landmarks import NAMES, mirrored
 from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.eigenheads.pca import rigid_fit
 from pipeline.eigenheads.training.build import build_model
 from rig.errors import InputError
 from rig.formats.obj import obj_bytes
+from rig.geometry import rigid_fit
 from rig.mesh import Mesh
 
 SUBJECTS = (4, 40, 100, 120)
@@ -239,10 +239,8 @@ def test_a_folder_of_scans_becomes_a_model_of_those_heads(tmp_path: Path, model:
         head = mine.vertices(scores.astype(float))
         # scores and truths differ by a rigid motion, which corresponding landmarks begin and the surface ends
         marks = list(model.landmarks.values())
-        rotation, shift = rigid_fit(head[marks], truth[marks], np.ones(26))
-        points = (head @ rotation.T + shift)[region][::5]
+        points = rigid_fit(head[marks], truth[marks]).apply(head)[region][::5]
         for _ in range(8):
             near = SurfaceIndex(truth, faces).closest(points)
-            rotation, shift = rigid_fit(points, near.points, np.ones(len(points)))
-            points = points @ rotation.T + shift
+            points = rigid_fit(points, near.points).apply(points)
         assert np.median(SurfaceIndex(truth, faces).closest(points).distances) < 0.5

@@ -9,7 +9,7 @@ from pipeline.eigenheads.model import HeadModel
 from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.head_problem import apply_step
 from pipeline.fitting.photo.correlation import choose_views, correlate
-from pipeline.fitting.photo.depth_search import facing_of, look, pixels_per_mm
+from pipeline.fitting.photo.depth_search import facing_of, pixels_per_mm, sample_visibility
 from pipeline.fitting.photo.patches import Patches, spread_samples
 from pipeline.fitting.photo.refine import finer, refine_with_photographs
 from pipeline.fitting.problem import Stage, State, SurfaceObservations
@@ -115,17 +115,19 @@ def test_what_is_hidden_is_not_seen(bump: Scene) -> None:
     """Samples behind a plate that covers the left half of the picture, or on the far side, do not face the camera."""
     start = bump.start()
     _, patches, _ = finer(start.problem.model, SETTINGS)
-    looks = look(start.problem, start.state, patches, np.ones(len(bump.rig), bool), SETTINGS)
+    visibility = sample_visibility(start.problem, start.state, patches, np.ones(len(bump.rig), bool), SETTINGS)
     k, camera = 3, bump.rig["cam03"]
-    towards = camera.centre_world - looks.points
-    outward = patches.normals(looks.normals)
+    towards = camera.centre_world - visibility.points
+    outward = patches.normals(visibility.normals)
     cosine = (outward * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
-    np.testing.assert_allclose(looks.facing[k][looks.facing[k] > 0], cosine[looks.facing[k] > 0], atol=1e-6)
-    assert not looks.facing[k][cosine <= 0].any()
-    assert (looks.facing[k][cosine > 0.4] > 0).all()
+    np.testing.assert_allclose(
+        visibility.facing[k][visibility.facing[k] > 0], cosine[visibility.facing[k] > 0], atol=1e-6
+    )
+    assert not visibility.facing[k][cosine <= 0].any()
+    assert (visibility.facing[k][cosine > 0.4] > 0).all()
     plate = np.where(np.arange(640) < 320, 900.0, np.inf)[None].repeat(480, axis=0).astype(np.float32)
-    seen = facing_of(looks.points, outward, camera, plate, np.full((480, 640), -50.0, np.float32), SETTINGS)
-    left = camera.project(looks.points)[:, 0] < 315
+    seen = facing_of(visibility.points, outward, camera, plate, np.full((480, 640), -50.0, np.float32), SETTINGS)
+    left = camera.project(visibility.points)[:, 0] < 315
     assert not seen[left].any()
     assert seen[~left].any()
 
