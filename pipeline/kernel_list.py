@@ -2,8 +2,9 @@
 
 ``kernels.txt`` beside this file has a line for each: module and function, then the types of the arguments.
 ``float32[2C]`` is a two-dimensional array in C order (A: any strides), with ``r`` behind it one that is not written to;
-``4*float64`` is a tuple. The list is recorded, not thought out: ``python -m tests.support.kernel_recorder`` writes it
-from jobs that it runs, and a test runs a job and fails where the list lacks a loop.
+``4*float64`` is a tuple, ``dense.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is recorded, not
+thought out: ``python -m tests.support.kernel_recorder`` writes it from jobs that it runs, and a test runs a job and
+fails where the list lacks a loop.
 
 Signatures in the decorators would say the same in 105 places, most of them loops that only other loops call, and a type
 that is wrong there is an error in a job. To run the whole pipeline in set-up takes as long as a job, in one process.
@@ -25,6 +26,7 @@ LIST = Path(__file__).with_name("kernels.txt")
 PACKAGE = __package__ or "pipeline"  # "eigenhead.pipeline" in the wheel
 _ARRAY = re.compile(r"(\w+)\[(\d)([CFA])\](r?)")
 _TUPLE = re.compile(r"(\d+)\*(\w+)")
+_NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,13 +101,32 @@ def type_from_text(text: str) -> types.Type:
         return types.Array(_scalar(dtype), int(dimensions), layout, readonly=bool(readonly))
     if several := _TUPLE.fullmatch(text):
         return types.UniTuple(_scalar(several[2]), int(several[1]))
+    if named := _NAMED.fullmatch(text):
+        module, name, inside = named.groups()
+        kind = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
+        return types.BaseTuple.from_types([type_from_text(each) for each in _members(inside)], kind)
     return _scalar(text)
+
+
+def _members(text: str) -> Iterator[str]:
+    """The parts between semicolons that no inner braces hold."""
+    depth = start = 0
+    for at, sign in enumerate(text):
+        depth += (sign == "{") - (sign == "}")
+        if sign == ";" and not depth:
+            yield text[start:at]
+            start = at + 1
+    yield text[start:]
 
 
 def text_from_type(kind: Any) -> str:
     """The list's notation. Raises ValueError where it has none."""
     if isinstance(kind, types.Array):
         text = f"{kind.dtype}[{kind.ndim}{kind.layout}]" + "r" * (not kind.mutable)
+    elif isinstance(kind, types.NamedTuple | types.NamedUniTuple):
+        module = kind.instance_class.__module__.removeprefix(PACKAGE + ".")
+        inside = ";".join(text_from_type(each) for each in kind.types)
+        text = f"{module}:{kind.instance_class.__name__}{{{inside}}}"
     elif isinstance(kind, types.UniTuple):
         text = f"{kind.count}*{kind.dtype}"
     else:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, Protocol, TypedDict
 from urllib.parse import quote
 
 from pipeline.eigenheads.data_folder import MODELS, models_folder
@@ -32,6 +32,14 @@ NOW = {
     "postgresql": "extract(epoch from clock_timestamp())",
 }
 MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
+
+
+class Connection(Protocol):
+    """What the two databases' own connections have alike (PEP 249)."""
+
+    def cursor(self) -> Any: ...
+
+    def close(self) -> None: ...
 
 
 class Finding(TypedDict):
@@ -121,7 +129,7 @@ def _models(settings: ServiceSettings) -> tuple[bool, str]:
 def _database(settings: ServiceSettings) -> tuple[bool, str]:
     """Reads it where there is one."""
     scheme, _, rest = settings.url.partition("://")
-    connection: object
+    connection: Connection
     if scheme == "sqlite":
         path = Path(rest.removeprefix("/"))
         if not path.is_file():
@@ -132,18 +140,23 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
         connection = psycopg.connect(f"postgresql://{rest}", connect_timeout=10)
     with closing(connection):
-        ask = connection.cursor()
-        if scheme == "sqlite" and ask.execute("PRAGMA quick_check(1)").fetchone() != ("ok",):
+        if scheme == "sqlite" and _rows(connection, "PRAGMA quick_check(1)") != [("ok",)]:
             return False, f"{settings.place} is damaged: stop the service, keep the file, and restore a copy of it"
         kind = "sqlite" if scheme == "sqlite" else "postgresql"
-        if not ask.execute(TABLES[kind]).fetchone():
+        if not _rows(connection, TABLES[kind]):
             return True, f"{settings.place}, empty: `eigenhead serve` will make its tables"
         alive = (
             f"SELECT count(*) FROM eigenhead_workers WHERE stopped IS NULL AND seen > {NOW[kind]} - {settings.silent_s}"
         )
-        ((count,),) = ask.execute(alive).fetchall()
-        ((keys,),) = ask.execute("SELECT count(*) FROM eigenhead_api_keys").fetchall()
+        ((count,),) = _rows(connection, alive)
+        ((keys,),) = _rows(connection, "SELECT count(*) FROM eigenhead_api_keys")
     return True, f"{settings.place}, {count} workers alive, {keys} API keys"
+
+
+def _rows(connection: Connection, query: str) -> list[tuple[Any, ...]]:
+    cursor = connection.cursor()
+    cursor.execute(query)
+    return cursor.fetchall()
 
 
 def _read_only(path: Path) -> sqlite3.Connection:

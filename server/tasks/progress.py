@@ -89,5 +89,5 @@ class ProgressMeter:
         if stage == self._last[0] and now - self._last[1] < EVERY_S:
             return
         self._last = (stage, now)
-        document = {"state": "running", "stage": stage, "progress": round(self._progress.progress(), 4)}
-        self._log.append(self._job_id, document | {"eta_s": round(self._progress.remaining_s(), 1)})
+        share, left_s = round(self._progress.progress(), 4), round(self._progress.remaining_s(), 1)
+        self._log.append(self._job_id, {"state": "running", "stage": stage, "progress": share, "eta_s": left_s})

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from numba import types
 
+from pipeline.dense.surface.vote_kernels import Pixels
 from pipeline.kernel_list import LIST, Kernel, by_module, listed_kernels, text_from_type, type_from_text
 from server.processes import python_command, python_environment
 
@@ -31,6 +32,10 @@ def test_every_line_names_a_loop_and_its_types() -> None:
         ("bool", types.boolean),
         ("4*float64", types.UniTuple(types.float64, 4)),
         ("float32[2C]", types.Array(types.float32, 2, "C")),
+        (
+            "dense.surface.vote_kernels:Pixels{" + ";".join(["float32[1C]"] * len(Pixels._fields)) + "}",
+            types.NamedUniTuple(types.Array(types.float32, 1, "C"), len(Pixels._fields), Pixels),
+        ),
         ("bool[3A]r", types.Array(types.boolean, 3, "A", readonly=True)),
     ],
 )
