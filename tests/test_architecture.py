@@ -73,6 +73,12 @@ LONG_FOR_A_REASON = {
     "closest_triangles": "one compiled loop over points and their neighbourhoods",
 }
 
+MANY_FOR_A_REASON = {
+    "server.cli.heads.reconstruct": "each is an option of a command",
+    "server.cli.heads.simulate": "each is an option of a command",
+    "pipeline.experiments.soft_rasteriser.loss": "JAX compiles a function of plain arrays",
+}
+
 
 def product_modules() -> dict[str, ast.Module]:
     files = [path for room in ROOMS for path in (ROOT / room).rglob("*.py")]
@@ -98,6 +104,23 @@ def test_long_functions_have_a_reason() -> None:
         if function.name not in LONG_FOR_A_REASON
     }
     assert found == set()
+
+
+def test_many_parameters_have_a_reason() -> None:
+    found = {
+        f"{name}.{function.name}"
+        for name, module in product_modules().items()
+        for function in functions(module)
+        if len(parameters(function)) > PARAMETERS_MOST
+    }
+    assert found == set(MANY_FOR_A_REASON)
+
+
+def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    """All but the object or class of a method."""
+    given = function.args
+    names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    return names[1:] if names[:1] in (["self"], ["cls"]) else names
 
 
 def test_no_two_modules_import_each_other() -> None:
