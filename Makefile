@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup demo serve test test-slow check format bench
+.PHONY: setup demo serve test test-slow check coverage format bench
 BIN := .venv/bin
 
 setup:       ## uv, the locked environment, an EGL; nothing where nothing is missing
@@ -22,6 +22,12 @@ check: setup ## ruff, pyright, import-linter
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+
+coverage: setup ## what share of the product's lines the fast tests run, child processes included, compiled loops left out
+	@mkdir -p out/coverage && rm -f out/coverage/data*
+	$(BIN)/coverage run -m pytest -n 2 --dist loadfile
+	$(BIN)/coverage combine -q
+	$(BIN)/coverage report --skip-covered --sort=cover
 
 format: setup
 	$(BIN)/ruff check --fix --select I .

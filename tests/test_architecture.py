@@ -3,6 +3,7 @@
 import ast
 import graphlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -63,6 +64,19 @@ def test_no_room_is_called_utils() -> None:
     banned = {"utils", "util", "helpers", "common", "manager", "processor"}
     names = {path.stem for room in ROOMS for path in (ROOT / room).rglob("*")}
     assert not names & banned
+
+
+def test_the_map_names_what_is_there() -> None:
+    """Paths in docs/architecture.md exist, and so does every module of a room's row."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    paths = re.findall(r"`([\w/]+/[\w.]+\.(?:py|txt|md))`", text)
+    assert len(paths) > 10
+    assert [path for path in paths if not (ROOT / path).exists()] == ["eigenhead/__init__.py"]  # of the wheel
+    gone = []
+    for room, row in re.findall(r"^\| \**([\w/]+?)/?\** \| (.*) \|$", text, re.MULTILINE):
+        there = {path.stem for path in (ROOT / room).rglob("*")} | {"Driver", "DriverName", "b_from_a"}
+        gone += [f"{room}: {name}" for name in re.findall(r"`(\w+)`", row) if name not in there]
+    assert gone == []
 
 
 LINES_MOST, FUNCTION_MOST, PARAMETERS_MOST = 400, 60, 10
