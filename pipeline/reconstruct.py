@@ -19,9 +19,10 @@ from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.fitting.contour import finish, solve_contour
 from pipeline.fitting.fine.dense_points import dense_points
-from pipeline.fitting.fine.depth_offset import without_common_offset
+from pipeline.fitting.fine.depth_bias import without_window_bias
 from pipeline.fitting.fine.eyelids import look_at_eyes
 from pipeline.fitting.fine.refine import Displaced, refine_to_surface
+from pipeline.fitting.fine.surface_points import thinned
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.refine import refine_with_photographs
 from pipeline.fitting.posterior import vertex_deviation_mm, with_estimated_prior
@@ -341,8 +342,8 @@ def fine_head(
 ) -> tuple[Displaced | None, Detail]:
     """The fit's head drawn to what the dense stage knows, and why no deeper where that is too little."""
     mesh = fitted_mesh(model, fit)
-    surface = dense_points(depth, votes, mesh, settings.fine)
-    surface = without_common_offset(surface, mesh, model.levels["full"].face_region)
+    surface = thinned(dense_points(depth, votes, mesh, settings.fine), settings.fine.cell_mm)
+    surface = without_window_bias(surface, mesh, model.levels["full"].face_region)
     eyes = look_at_eyes(model, mesh.vertices, capture.images, rig)
     eigenheads = min(settings.fitting.modes, len(fit.coefficients))
     head = refine_to_surface(
