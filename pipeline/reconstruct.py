@@ -14,15 +14,16 @@ from pipeline.dense.estimate import estimate_depth
 from pipeline.dense.part_votes import PartVotes, vote_parts
 from pipeline.dense.parts import HAIR, PartMap, classify_parts
 from pipeline.dense.surface.signed_distance import NoSurface
+from pipeline.dense.window_bias import WindowBias
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_modes
 from pipeline.fitting.contour import finish, solve_contour
 from pipeline.fitting.fine.dense_points import dense_points
-from pipeline.fitting.fine.depth_bias import without_window_bias
+from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
 from pipeline.fitting.fine.eyelids import look_at_eyes
 from pipeline.fitting.fine.refine import Displaced, refine_to_surface
-from pipeline.fitting.fine.surface_points import thinned
+from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.refine import refine_with_photographs
 from pipeline.fitting.posterior import vertex_deviation_mm, with_estimated_prior
@@ -128,9 +129,13 @@ def reconstruct(
         told_depth = partial(_of_stage, clock.report, "depth")
         maps = estimate_depth(capture.images, silhouettes, rig, mesh, settings.dense, report=told_depth)
     votes = vote_parts(maps, parts, rig)
+    surface = dense_points(maps, votes, mesh, settings.fine)
+    on_face = points_on_face(surface, mesh, full.face_region)
+    bias = measure_bias(on_face)
     if fine:
         clock("fine")
-        finer, detail = fine_head(model, fit, quality, maps, votes, capture, rig, settings, report)
+        surface = without_window_bias(surface, on_face, bias)
+        finer, detail = fine_head(model, fit, quality, surface, capture, rig, settings, report)
         if finer is not None:
             mesh, quality = Mesh(finer.vertices, full.faces), finer.deviation_mm
     clock("texture")
@@ -138,7 +143,7 @@ def reconstruct(
     coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture)
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
-        bust, bust_warnings = find_bust(maps, votes, capture, silhouettes, rig, mesh, settings, clock)
+        bust, bust_warnings = find_bust(maps, votes, bias, capture, silhouettes, rig, mesh, settings, clock)
     atlas = None
     if settings.outputs.atlas:
         clock("atlas")
@@ -194,6 +199,7 @@ def reconstruct(
 def find_bust(
     maps: tuple[DepthMap, ...],
     votes: PartVotes | None,
+    bias: WindowBias,
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
@@ -204,7 +210,7 @@ def find_bust(
     """All that the cameras see, as one closed surface; a warning where the photographs do not tell it."""
     clock("bust")
     try:
-        bust = make_bust(maps, capture, silhouettes, rig, head_world, votes, settings, report=clock.report)
+        bust = make_bust(maps, capture, silhouettes, rig, head_world, votes, bias, settings, report=clock.report)
     except NoSurface as reason:
         return None, [ReportWarning("no-bust", str(reason))]
     return bust, list(bust.surface.warnings)
@@ -333,8 +339,7 @@ def fine_head(
     model: HeadModel,
     fit: Fit,
     deviation_mm: np.ndarray,
-    depth: tuple[DepthMap, ...],
-    votes: PartVotes | None,
+    surface: SurfacePoints,
     capture: Capture,
     rig: Rig,
     settings: Settings,
@@ -342,8 +347,6 @@ def fine_head(
 ) -> tuple[Displaced | None, Detail]:
     """The fit's head drawn to what the dense stage knows, and why no deeper where that is too little."""
     mesh = fitted_mesh(model, fit)
-    surface = thinned(dense_points(depth, votes, mesh, settings.fine), settings.fine.cell_mm)
-    surface = without_window_bias(surface, mesh, model.levels["full"].face_region)
     eyes = look_at_eyes(model, mesh.vertices, capture.images, rig)
     eigenheads = min(settings.fitting.modes, len(fit.coefficients))
     head = refine_to_surface(

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.part_votes import PartVotes
 from pipeline.dense.surface.fusion import BustSurface, fuse
+from pipeline.dense.window_bias import WindowBias
 from pipeline.imaging.cpu_raster import depth_maps as rastered_depths
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import Settings
@@ -43,6 +44,7 @@ def make_bust(
     rig: Rig,
     head_world: Mesh,
     votes: PartVotes | None,
+    bias: WindowBias,
     settings: Settings,
     *,
     report: Report,
@@ -51,7 +53,7 @@ def make_bust(
 
     Raises NoSurface where fewer than three views know any depth.
     """
-    surface = fuse(depth_maps, silhouettes, rig, head_world, votes, settings.bust, report=report)
+    surface = fuse(depth_maps, silhouettes, rig, head_world, votes, bias, settings.bust, report=report)
     mesh = surface.mesh_world
     normals = mesh.normals()
     depths = rastered_depths(rig, mesh)

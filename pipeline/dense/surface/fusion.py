@@ -21,6 +21,7 @@ from pipeline.dense.surface.quality import deviation_mm
 from pipeline.dense.surface.refinement import refine_vertices
 from pipeline.dense.surface.signed_distance import Level, NoSurface, solve
 from pipeline.dense.surface.view_stack import stack_views
+from pipeline.dense.window_bias import WindowBias, without_bias
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import BustSettings
@@ -56,6 +57,7 @@ def fuse(
     rig: Rig,
     head_world: Mesh | None,
     votes: PartVotes | None,
+    bias: WindowBias,
     settings: BustSettings,
     *,
     report: Report,
@@ -68,6 +70,7 @@ def fuse(
         rig: the cameras as calibrated, world frame.
         head_world: the fitted head, closed but for its neck (mm); None where there is none.
         votes: what the places show; without them all that is seen counts as skin.
+        bias: what the depth maps' windows err.
         settings: spacing of the vertices.
         report: called with the stage's progress.
 
@@ -86,7 +89,7 @@ def fuse(
     report("bust", 0.6)
     net, safe = closed_net(level)
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
-    mesh, _ = without_crossings(mesh, safe)
+    mesh, _ = without_crossings(without_bias(mesh, measured.views > 0, bias), safe)
     report("bust", 0.9)
     shown = np.full(len(mesh.vertices), SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
     part = np.where(measured.views > 0, shown, UNSEEN).astype(np.uint8)

@@ -1,6 +1,7 @@
 """The dense stage's depth maps as one cloud of oriented points, each with what it shows."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +9,7 @@ from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap, points_world
 from pipeline.dense.part_votes import HAIR, PartVotes, part_codes
-from pipeline.fitting.fine.surface_points import SurfacePoints
+from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.settings import FineSettings
 from rig.mesh import Mesh, vertex_normals
 
@@ -19,7 +20,7 @@ EVERY = 4  # vertices of the head stand for the others
 def dense_points(
     depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh, settings: FineSettings
 ) -> SurfacePoints:
-    """Every place that enough views agree on, as a point with its part.
+    """Every place that enough views agree on, as a point with its part; at most one for each side of a small cell.
 
     Args:
         depth_maps: one a view.
@@ -28,15 +29,17 @@ def dense_points(
         settings: how many views must agree, and how frontally.
 
     Returns:
-        The points, in the order of the maps; none where there are no maps or no votes.
+        The points, in the order of their cells; none where there are no maps or no votes.
     """
     clouds = [_cloud(each, settings) for each in depth_maps]
     if not clouds or votes is None:
         return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
     points, normals, deviation = (np.concatenate(column) for column in zip(*clouds, strict=True))
-    part = part_codes(votes, points)
-    part[_behind(points, head_world)] = HAIR  # it bounds nothing there and pulls nothing
-    return SurfacePoints(points, normals, deviation, part)
+    # A million pixels, a tenth of that in cells.
+    cells = thinned(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), settings.cell_mm)
+    part = part_codes(votes, cells.points)
+    part[_behind(cells.points, head_world)] = HAIR  # it bounds nothing there and pulls nothing
+    return replace(cells, part=part)
 
 
 def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:

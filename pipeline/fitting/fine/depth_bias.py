@@ -1,82 +1,70 @@
-"""What depth maps err alike, taken off before the head is drawn to them.
+"""How much windows of dense matching bias depth (``pipeline.dense.window_bias``), as the fitted face of the very
+capture tells: its cameras and shape were solved together, by patches that follow the surface.
 
-Two things, both measured on the very capture by its fitted face, whose cameras and shape were solved together and by
-patches that follow the surface. Windows that match two and two lie 0.07 to 0.15 mm too deep all over the face. And a
-window takes a curved surface for flatter than it is: it cuts off what stands out (the bridge of the nose, the lips) and
-fills what lies back. To first order that is ``share`` times the height of the surface's own mean, over a window of
-2.5 mm, above it. On captures of two renderers the share was 0.7 to 1.5, within 0.1 the same from the fitted face as
-from the true one.
+Seen on captures of two renderers: 0.0 to 0.15 mm too deep, and a share of 0.7 to 1.5, within 0.1 the same from the
+fitted face as from the true one.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
+from jaxtyping import Bool, Float, Int
 
 from pipeline.dense.part_votes import SKIN
+from pipeline.dense.window_bias import WindowBias, windowed_height
 from pipeline.estimation.robust import Cauchy
 from pipeline.fitting.fine.association import associate, interpolated
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from rig.mesh import Mesh
 
 REACH_MM, AGREEMENT, LEAST_POINTS = 2.0, 0.8, 300
-WINDOW_MM, NEIGHBOURS = 2.5, 48  # standard deviation of the window, and vertices within it
 ROBUST_MM, ROUNDS = 0.15, 10
 MOST_MM, SHARE_MOST = 0.3, 2.0  # of the common offset, and of the share: beyond, something else is wrong
 
 
-def without_window_bias(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> SurfacePoints:
-    """The points moved along the head's normals by what their windows make of its shape.
+@dataclass(frozen=True, slots=True, eq=False)
+class OnFace:
+    """Points of skin and the places of the fitted face that they show: how far (mm, along the ``normal`` there) they
+    lie off it, and how far its windowed mean does."""
 
-    Args:
-        surface: of depth maps, world frame, mm.
-        head_world: the fitted head.
-        face: its vertices that tell how large the share is, and where points are corrected by it.
+    row: Int[np.ndarray, " n"]  # of the points
+    normal: Float[np.ndarray, "n 3"]
+    off_mm: Float[np.ndarray, " n"]
+    windowed_mm: Float[np.ndarray, " n"]
 
-    Returns:
-        The points; unchanged where too few of them show the face.
-    """
+
+def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
+    """The points of skin near the fitted head's ``face`` (mm, world frame)."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
     skin = np.flatnonzero(surface.part == SKIN)
-    found = associate(
-        surface.points[skin],
-        surface.normals[skin],
-        vertices,
-        normals,
-        faces,
-        reach_mm=REACH_MM,
-        least_agreement=AGREEMENT,
-    )
-    corner = faces[found.triangle]
-    on_face = face[corner].all(axis=1)
-    if np.count_nonzero(on_face) < LEAST_POINTS:
-        return surface
-    row, corner, blend = skin[found.row[on_face]], corner[on_face], found.blend[on_face]
-    ahead = interpolated(normals[corner], blend)
-    off_mm = ((surface.points[row] - interpolated(vertices[corner], blend)) * ahead).sum(axis=1)
-    flatter_mm = (windowed_height(vertices, normals)[corner] * blend).sum(axis=1)
-    common_mm, share = _line(flatter_mm, off_mm)
-    points = surface.points - common_mm * surface.normals
-    points[row] = surface.points[row] - (common_mm + share * flatter_mm)[:, None] * ahead
-    return replace(surface, points=points)
+    if not len(skin):
+        return OnFace(skin, np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    given = (surface.points[skin], surface.normals[skin], vertices, normals, faces)
+    found = associate(*given, reach_mm=REACH_MM, least_agreement=AGREEMENT)
+    on_face = face[faces[found.triangle]].all(axis=1)
+    row, corner, blend = skin[found.row[on_face]], faces[found.triangle[on_face]], found.blend[on_face]
+    normal = interpolated(normals[corner], blend)
+    off_mm = ((surface.points[row] - interpolated(vertices[corner], blend)) * normal).sum(axis=1)
+    return OnFace(row, normal, off_mm, (windowed_height(vertices, normals)[corner] * blend).sum(axis=1))
 
 
-def windowed_height(vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-    """How far (mm, along the normal) the mean of the surface over a window lies above each vertex; sheets that face
-    another way do not count."""
-    distance, near = KDTree(vertices).query(vertices, k=min(NEIGHBOURS, len(vertices)), workers=-1)
-    weight = np.exp(-0.5 * (distance / WINDOW_MM) ** 2)
-    weight *= np.maximum(np.einsum("vkc,vc->vk", normals[near], normals), 0.0)
-    height = np.einsum("vkc,vc->vk", vertices[near], normals) - (vertices * normals).sum(axis=1)[:, None]
-    return (weight * height).sum(axis=1) / weight.sum(axis=1)
-
-
-def _line(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Offset and slope of a robust line, within what may be."""
-    columns = np.stack([np.ones(len(x)), x], axis=1)
-    line, loss = np.array([np.median(y), 0.0]), Cauchy(ROBUST_MM)
+def measure_bias(seen: OnFace) -> WindowBias:
+    """The robust line of what points and fit differ by, over the windowed height; none where too few points tell."""
+    if len(seen.row) < LEAST_POINTS:
+        return WindowBias()
+    columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)
+    line, loss = np.array([np.median(seen.off_mm), 0.0]), Cauchy(ROBUST_MM)
     for _ in range(ROUNDS):
-        weight = np.sqrt(loss.weight((y - columns @ line) ** 2))
-        line = np.linalg.lstsq(columns * weight[:, None], y * weight, rcond=None)[0]
-    return float(np.clip(line[0], -MOST_MM, MOST_MM)), float(np.clip(line[1], 0.0, SHARE_MOST))
+        weight = np.sqrt(loss.weight((seen.off_mm - columns @ line) ** 2))
+        line = np.linalg.lstsq(columns * weight[:, None], seen.off_mm * weight, rcond=None)[0]
+    return WindowBias(float(np.clip(line[0], -MOST_MM, MOST_MM)), float(np.clip(line[1], 0.0, SHARE_MOST)))
+
+
+def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
+    """The points where they would be without the windows: off the face, whose shape alone is known so well, by what all
+    err alike."""
+    points = surface.points - bias.common_mm * surface.normals
+    points[seen.row] = (
+        surface.points[seen.row] - (bias.common_mm + bias.share * seen.windowed_mm)[:, None] * seen.normal
+    )
+    return replace(surface, points=points)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from pipeline.dense.window_bias import WindowBias
 from pipeline.fitting.fit import Fit
 from pipeline.results.bust import Bust, make_bust
 from pipeline.results.reconstruction import Reconstruction
@@ -42,7 +43,7 @@ def photographed() -> tuple[Bust, Capture, dict]:
     head, capture = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32)), Capture(images)
     report = {"report": lambda stage, share: None}
     return (
-        make_bust(made.maps, capture, made.silhouettes, made.rig, head, None, SETTINGS, **report),
+        make_bust(made.maps, capture, made.silhouettes, made.rig, head, None, WindowBias(), SETTINGS, **report),
         capture,
         made.silhouettes,
     )

@@ -8,6 +8,7 @@ import trimesh
 
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.surface.fusion import BustSurface, NoSurface, fuse
+from pipeline.dense.window_bias import WindowBias
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import BustSettings
 from rig.mesh import Mesh, face_normals
@@ -21,7 +22,9 @@ SPACING = BustSettings(spacing_mm=3.0)
 
 
 def fused(made: Scene, head: Mesh | None = None, settings: BustSettings = SPACING) -> BustSurface:
-    return fuse(made.maps, made.silhouettes, made.rig, head, None, settings, report=lambda stage, share: None)
+    return fuse(
+        made.maps, made.silhouettes, made.rig, head, None, WindowBias(), settings, report=lambda stage, share: None
+    )
 
 
 def seen_errors(surface: BustSurface, made: Scene) -> np.ndarray:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.dense.part_votes import HAIR, SKIN
-from pipeline.fitting.fine.depth_bias import NEIGHBOURS, WINDOW_MM, windowed_height, without_window_bias
+from pipeline.dense.window_bias import NEIGHBOURS, WINDOW_MM, WindowBias, windowed_height, without_bias
+from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from rig.mesh import Mesh
 
@@ -44,7 +45,11 @@ def test_a_planted_bias_is_taken_off() -> None:
     wall = bumpy_wall()
     surface = seen_through_windows(wall, -0.12, 0.9)
     everywhere = np.ones(len(wall.vertices), bool)
-    found = without_window_bias(surface, wall, everywhere)
+    seen = points_on_face(surface, wall, everywhere)
+    bias = measure_bias(seen)
+    assert bias.common_mm == pytest.approx(-0.12, abs=0.02)
+    assert bias.share == pytest.approx(0.9, abs=0.05)
+    found = without_window_bias(surface, seen, bias)
     inside = (np.abs(surface.points[:, :2] - 40.0) < 30.0).all(axis=1)
     true, normals = wall.vertices[::2], wall.normals()[::2]
 
@@ -62,4 +67,20 @@ def test_without_enough_of_the_face_nothing_moves(part: int) -> None:
     seen = seen_through_windows(wall, 0.2, 0.5)
     surface = SurfacePoints(seen.points, seen.normals, seen.deviation_mm, np.full(len(seen.points), part, np.uint8))
     face = np.full(len(wall.vertices), part == HAIR)  # skin that is no face, or a face without skin
-    np.testing.assert_array_equal(without_window_bias(surface, wall, face).points, surface.points)
+    assert measure_bias(points_on_face(surface, wall, face)) == WindowBias()
+
+
+def test_a_surface_that_windows_flattened_stands_out_again() -> None:
+    """Its own mean tells the rest: half of a share of one half, of a quarter, and so on."""
+    wall = bumpy_wall()
+    normals, bias = wall.normals(), WindowBias(-0.1, 0.4)
+    flat = wall.vertices + (bias.common_mm + bias.share * windowed_height(wall.vertices, normals))[:, None] * normals
+    measured = wall.vertices[:, 0] > 20.0
+    found = without_bias(Mesh(flat, wall.faces), measured, bias)
+    inside = (np.abs(wall.vertices[:, :2] - 40.0) < 15.0).all(axis=1)
+
+    def off(points: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(((points - wall.vertices) * normals).sum(axis=1)[inside] ** 2)))
+
+    assert off(found.vertices) < 0.4 * off(flat)
+    np.testing.assert_array_equal(found.vertices[~measured], flat[~measured])
