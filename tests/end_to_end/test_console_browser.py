@@ -462,7 +462,7 @@ def test_pages_show_the_truth_after_the_service_was_killed_under_a_job(
     job = httpx.get(service.url + "/v1/jobs").json()["jobs"][0]["id"]
     assert httpx.post(f"{service.url}/v1/jobs/{job}/cancel").status_code < 300
     assert httpx.post(service.url + "/v1/jobs", json={"capture_id": capture}).status_code == 202
-    expect(page.locator("[data-state=cancelled]")).to_have_count(1, timeout=60_000)
+    expect(page.locator("[data-state=cancelled]")).to_have_count(1, timeout=150_000)
     expect(page.locator("[data-state=succeeded]")).to_have_count(1, timeout=60_000)
     expect(page.locator("#popup")).to_be_hidden()
     assert live_rate(rig, 3.0) > 0  # pictures again
