@@ -104,7 +104,10 @@ def type_from_text(text: str) -> types.Type:
     if named := _NAMED.fullmatch(text):
         module, name, inside = named.groups()
         kind = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
-        return types.BaseTuple.from_types([type_from_text(each) for each in _members(inside)], kind)
+        found = types.BaseTuple.from_types([type_from_text(each) for each in _members(inside)], kind)
+        if found is None:
+            raise ValueError(f"{text} is no tuple of a kernel's arguments")
+        return found
     return _scalar(text)
 
 
