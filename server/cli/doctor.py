@@ -103,7 +103,7 @@ def _cores(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _memory(settings: ServiceSettings) -> tuple[bool, str]:
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    with open("/proc/meminfo") as stream:  # noqa: PTH123
+    with Path("/proc/meminfo").open() as stream:
         lines = dict(line.split(":", 1) for line in stream)
     free = max(free, int(lines["MemAvailable"].split()[0]) * 1024)
     need = settings.concurrency * MEMORY_LEAST
