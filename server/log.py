@@ -25,8 +25,8 @@ def set_up(as_json: bool, level: str = "info") -> None:
     structlog.configure(
         processors=[*shared, structlog.processors.format_exc_info, renderer],
         wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
-        cache_logger_on_first_use=True,
+        logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),  # the one of this moment: it may be replaced
+        cache_logger_on_first_use=False,
     )
     of_libraries = logging.StreamHandler(sys.stderr)
     of_libraries.setFormatter(

@@ -60,7 +60,11 @@ def prepare(json_out: Json = False) -> None:
     with progress_bar() as report:
         compiled, known = prepare_kernels(report)
     seconds = round(monotonic() - began, 3)
-    told = f"{compiled} of {known} loops compiled in {seconds:.1f} s" if compiled else f"none of {known} loops compiled"
+    told = (
+        f"{compiled} of {known} loops compiled in {seconds:.1f} s"
+        if compiled
+        else f"all {known} loops were compiled before"
+    )
     document = {"compiled": compiled, "known": known, "seconds": seconds, "folder": str(cache_folder())}
     answer(document, json_out, [f"{cache_folder()}  {told}"])
 

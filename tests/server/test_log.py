@@ -1,7 +1,9 @@
 """Log lines: JSON throughout, and no traceback of a job that failed for a known reason."""
 
+import io
 import json
 import logging
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -43,3 +45,15 @@ def test_a_known_failure_leaves_no_traceback(capsys: pytest.CaptureFixture[str])
     for error in (InputError("capture", ["cam00 sees nobody"]), dbos_error.DBOSWorkflowCancelledError("cancelled")):
         logging.getLogger("dbos").error("Exception encountered in background workflow:", exc_info=error)
     assert capsys.readouterr().err == ""
+
+
+def test_a_standard_error_that_was_replaced_gets_the_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = io.StringIO(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", first)
+    set_up(as_json=True)
+    log = structlog.get_logger()
+    log.info("before")
+    monkeypatch.setattr(sys, "stderr", second)
+    first.close()
+    log.info("after")
+    assert json.loads(second.getvalue())["event"] == "after"
