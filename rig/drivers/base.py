@@ -35,7 +35,6 @@ class Frame:
 
 
 @runtime_checkable
-@runtime_checkable
 class Driver(Protocol):
     """One camera. Everything but ``close`` may raise DriverError; ``close`` never does and may be called twice."""
 
