@@ -155,13 +155,12 @@ def test_rim_equations_are_the_slope_of_the_cameras_errors(one_capture_of_a_head
     Tested along the three directions that the rims see best, where the head cannot follow."""
     rig, subject, model = one_capture_of_a_head
     heads = Heads(model, [subject.start])
-    matrix, _ = rim_equations(subject.seen, rig, heads, subject.start)
+    matrix, still = rim_equations(subject.seen, rig, heads, subject.start)
     values, vectors = np.linalg.eigh(matrix)
     for value, direction in zip(values[-3:], vectors.T[-3:], strict=True):
         step = 5.0 / np.sqrt(value) * direction
         off = Rig(tuple(moved(camera, part) for camera, part in zip(rig, step.reshape(-1, 6), strict=True)))
         _, gradient = rim_equations(subject.seen, off, heads, subject.start)
-        _, still = rim_equations(subject.seen, rig, heads, subject.start)
         assert direction @ (gradient - still) == pytest.approx(value * 5.0 / np.sqrt(value), rel=0.3)
 
 
