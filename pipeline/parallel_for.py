@@ -10,12 +10,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
 from rig.errors import InputError
 
 THREADS, THREADS_MOST = "EIGENHEAD_THREADS", 512
+Result = TypeVar("Result")
 SLICES = 8  # of a loop: enough that threads end together
 
 
@@ -57,6 +59,18 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
     for helper in helpers:
         if not helper.cancel():
             helper.result()
+
+
+def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
+    """``work(k)`` of every k below ``count``, in order; shared out as by ``in_threads``."""
+    found: dict[int, Result] = {}
+
+    def take(first: int, last: int) -> None:
+        for k in range(first, last):
+            found[k] = work(k)
+
+    in_threads(count, take)
+    return [found[k] for k in range(count)]
 
 
 @cache

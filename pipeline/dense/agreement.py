@@ -10,7 +10,7 @@ from pipeline.dense.crops import Crop
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.field import Field
 from pipeline.dense.stack import Stack
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import map_in_threads
 from pipeline.settings import DenseSettings
 from rig.camera import Camera
 
@@ -34,26 +34,23 @@ def depth_maps(
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
     depth = np.concatenate([field.depth.ravel() for field in fields])
     slopes = np.concatenate([field.slopes.reshape(-1, 2) for field in fields])
-    found: list[DepthMap] = [None] * len(crops)  # type: ignore[list-item]
 
-    def work(first: int, last: int) -> None:
-        for view in range(first, last):
-            others = np.array([k for k in range(len(crops)) if k != view], dtype=np.int64)
-            shape = fields[view].depth.shape
-            agreeing, before = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
-            apart = np.empty(shape, np.float32)
-            count_agreeing(
-                int(stack.offset[view]), stack.ways(view, others), stack.lens[others, :2].copy(), matched, depth,
-                slopes, (settings.agree_mm, settings.agree_deviations), agreeing, before, apart,
-            )  # fmt: skip
-            deviation = stated_deviation(crops[view].camera, fields[view], agreeing, apart)
-            clear = (deviation < settings.worst_mm) & (stack.image(matched, view) < settings.worst_mm)
-            inside = stack.image(stack.distance_px, view) < -settings.outline_px
-            known = inside & clear & (agreeing >= 1) & (MOST_AGAINST * agreeing >= before)
-            found[view] = _depth_map(crops[view], fields[view], known, deviation, agreeing)
+    def work(view: int) -> DepthMap:
+        others = np.array([k for k in range(len(crops)) if k != view], dtype=np.int64)
+        shape = fields[view].depth.shape
+        agreeing, before = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
+        apart = np.empty(shape, np.float32)
+        count_agreeing(
+            int(stack.offset[view]), stack.ways(view, others), stack.lens[others, :2].copy(), matched, depth,
+            slopes, (settings.agree_mm, settings.agree_deviations), agreeing, before, apart,
+        )  # fmt: skip
+        deviation = stated_deviation(crops[view].camera, fields[view], agreeing, apart)
+        clear = (deviation < settings.worst_mm) & (stack.image(matched, view) < settings.worst_mm)
+        inside = stack.image(stack.distance_px, view) < -settings.outline_px
+        known = inside & clear & (agreeing >= 1) & (MOST_AGAINST * agreeing >= before)
+        return _depth_map(crops[view], fields[view], known, deviation, agreeing)
 
-    in_threads(len(crops), work)
-    return tuple(found)
+    return tuple(map_in_threads(work, len(crops)))
 
 
 def stated_deviation(

@@ -15,7 +15,7 @@ from pipeline.dense.field import Field
 from pipeline.dense.field_kernels import double, fit_planes
 from pipeline.dense.refine_kernels import propagate, slide
 from pipeline.dense.stack import Stack
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import map_in_threads
 from pipeline.settings import DenseSettings
 
 STEEPEST = 3.0  # slope against the image plane: 72 degrees
@@ -26,22 +26,19 @@ MOST_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> list[Field]:
     """The fields at twice the size, the size of ``stack``."""
-    found: list[Field] = [None] * len(fields)  # type: ignore[list-item]
 
-    def work(first: int, last: int) -> None:
-        for view in range(first, last):
-            field, distance = fields[view], stack.image(stack.distance_px, view)
-            live = (distance < 0.5) & (distance > UNSEEN_MOST_PX)
-            depth, slopes = np.empty(live.shape, np.float32), np.empty((*live.shape, 2), np.float32)
-            double(field.depth, field.slopes, live, depth, slopes)
-            relief = (settings.relief_factor * field.relief_mm) ** 2
-            known = settings.carried * field.information / (1.0 + field.information * relief)
-            information = cv2.resize(known, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-            zero = np.zeros_like(depth)
-            found[view] = Field(depth, slopes, information, zero, zero)
+    def work(view: int) -> Field:
+        field, distance = fields[view], stack.image(stack.distance_px, view)
+        live = (distance < 0.5) & (distance > UNSEEN_MOST_PX)
+        depth, slopes = np.empty(live.shape, np.float32), np.empty((*live.shape, 2), np.float32)
+        double(field.depth, field.slopes, live, depth, slopes)
+        relief = (settings.relief_factor * field.relief_mm) ** 2
+        known = settings.carried * field.information / (1.0 + field.information * relief)
+        information = cv2.resize(known, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+        zero = np.zeros_like(depth)
+        return Field(depth, slopes, information, zero, zero)
 
-    in_threads(len(fields), work)
-    return found
+    return map_in_threads(work, len(fields))
 
 
 def refined(
@@ -55,14 +52,11 @@ def refined(
     rounds: int,
 ) -> list[Field]:
     """The fields after planes of neighbours ``steps_px`` away were tried (odd; empty: none), and ``rounds`` slides."""
-    found: list[Field] = [None] * len(fields)  # type: ignore[list-item]
 
-    def work(first: int, last: int) -> None:
-        for view in range(first, last):
-            found[view] = _refined(fields[view], stack, view, neighbours[view], pattern, settings, steps_px, rounds)
+    def work(view: int) -> Field:
+        return _refined(fields[view], stack, view, neighbours[view], pattern, settings, steps_px, rounds)
 
-    in_threads(len(fields), work)
-    return found
+    return map_in_threads(work, len(fields))
 
 
 def _refined(

@@ -16,7 +16,7 @@ from pipeline.dense.crops import UNSEEN_MOST_PX, Crop
 from pipeline.dense.room_kernels import find_room
 from pipeline.dense.stack import Stack
 from pipeline.imaging.cpu_raster import depth_map
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import map_in_threads
 from pipeline.settings import DenseSettings
 from rig.mesh import Mesh
 
@@ -51,15 +51,12 @@ def find_rooms(
         head_world: the fitted head, world frame, mm; without it the hull's back bounds the room.
         extent: middle (world) and edge (mm) of a cube that holds the subject.
     """
-    rooms: list[Room] = [None] * len(crops)  # type: ignore[list-item]
 
-    def work(first: int, last: int) -> None:
-        for view in range(first, last):
-            near, far = _bounds(crops[view], least, view, head_world, extent, settings)
-            rooms[view] = _enlarged(near, far, stack, view)
+    def work(view: int) -> Room:
+        near, far = _bounds(crops[view], least, view, head_world, extent, settings)
+        return _enlarged(near, far, stack, view)
 
-    in_threads(len(crops), work)
-    return rooms
+    return map_in_threads(work, len(crops))
 
 
 def _bounds(

@@ -9,7 +9,7 @@ from pipeline.dense.field import Field
 from pipeline.dense.room import Room
 from pipeline.dense.stack import Stack
 from pipeline.dense.sweep_kernels import aggregate, sweep_view
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import map_in_threads
 from pipeline.settings import DenseSettings
 
 # Costs are 1 minus a correlation. A step of one label is a slope that the room's bounds do not have; a wider step is an
@@ -30,17 +30,14 @@ def first_fields(
         neighbours: of each view, those that it is compared with.
         pattern: samples of a window, across and down from its middle, px.
     """
-    fields: list[Field] = [None] * len(stack)  # type: ignore[list-item]
 
-    def work(first: int, last: int) -> None:
-        for view in range(first, last):
-            cost = np.empty((*rooms[view].near.shape, settings.labels), np.float32)
-            sight = stack.sight(view, neighbours[view], pattern, settings.contrast_levels)
-            sweep_view(sight, rooms[view].near, rooms[view].far, rooms[view].slopes, cost)
-            fields[view] = _cheapest(cost, rooms[view])
+    def work(view: int) -> Field:
+        cost = np.empty((*rooms[view].near.shape, settings.labels), np.float32)
+        sight = stack.sight(view, neighbours[view], pattern, settings.contrast_levels)
+        sweep_view(sight, rooms[view].near, rooms[view].far, rooms[view].slopes, cost)
+        return _cheapest(cost, rooms[view])
 
-    in_threads(len(stack), work)
-    return fields
+    return map_in_threads(work, len(stack))
 
 
 def _cheapest(cost: Float32[np.ndarray, "h w d"], room: Room) -> Field:

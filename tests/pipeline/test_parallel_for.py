@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from pipeline.parallel_for import SLICES, in_threads, thread_count
+from pipeline.parallel_for import SLICES, in_threads, map_in_threads, thread_count
 from rig.errors import InputError
 
 
@@ -35,6 +35,13 @@ def test_as_many_threads_work_as_are_asked_for(threads: int, monkeypatch: pytest
 
     in_threads(SLICES, work)
     assert len(seen) == threads
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_what_is_mapped_comes_back_in_order(threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EIGENHEAD_THREADS", threads)
+    assert map_in_threads(lambda k: k * k, 29) == [k * k for k in range(29)]
+    assert map_in_threads(lambda k: k, 0) == []
 
 
 def test_without_the_variable_it_is_a_thread_for_each_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
