@@ -14,6 +14,9 @@ from rig.errors import InputError
 
 T = TypeVar("T")
 
+CLICK_NOISE_PX = 1.5  # a person's click; measured on captures rendered by another program
+LANDMARK_NOISE_MM = 2.0  # a landmark's place against the same landmark of another head
+
 
 @dataclass(frozen=True, slots=True)
 class SegmentationSettings:
@@ -51,8 +54,8 @@ class SegmentationSettings:
 class AlignmentSettings:
     """Section 4.2, and the search that replaces it when there are no feature points."""
 
-    feature_noise_px: float = 1.5  # a person's click, measured on ../shared captures
-    landmark_noise_mm: float = 1.5  # a model's landmark against the same point on another head
+    feature_noise_px: float = CLICK_NOISE_PX
+    landmark_noise_mm: float = LANDMARK_NOISE_MM
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +71,8 @@ class FittingSettings:
     contour_correlation_px: float | None = None  # of that noise along the contour; None: estimated
     calibration_px: float = 0.2  # prior of a camera without a covariance of its own (contract)
     scale_spread: float = 0.01  # prior of log scale: rigs are metric, size is a mode
-    feature_noise_px: float = 1.5  # a person's click
-    landmark_noise_mm: float = 2.0  # a landmark's place against the same landmark of another head
+    feature_noise_px: float = CLICK_NOISE_PX
+    landmark_noise_mm: float = LANDMARK_NOISE_MM
     bare_px: float = 2.0  # cranium, ears and neck agree with the input to this after a fit to the whole head ...
     bare_share: float = 0.8  # ... over this share of their outline: the head is bare, and all of its rim speaks
     bare_loss: float = 1.25  # and the rim of the face may lose no more than this factor by it
