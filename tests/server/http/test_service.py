@@ -8,6 +8,7 @@ import tarfile
 import time
 import zipfile
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import httpx
@@ -230,6 +231,15 @@ def test_events_tell_progress_and_resume(http: httpx.Client, client: Client, arc
     with http.stream("GET", f"/v1/jobs/{job}/events", headers={"Last-Event-ID": "1"}) as response:
         ids = [line for line in response.iter_lines() if line.startswith("id:")]
     assert ids[0] == "id: 2"
+
+
+def test_a_stage_that_reports_nothing_still_moves(http: httpx.Client, client: Client, archive: bytes) -> None:
+    job = client.submit(upload(http, archive).json()["id"], settings={"front": "quiet"})["id"]
+    told = [document for _, document in client.events(job) if document.get("stage") == "depth"]
+    assert len(told) >= 3
+    shares = [document["progress"] for document in told]
+    assert all(0 <= earlier < later < earlier + 0.5 for earlier, later in pairwise(shares))
+    assert all(document["eta_s"] > 0 for document in told)
 
 
 @pytest.mark.parametrize("mode", ["long", "deaf"])
