@@ -14,23 +14,24 @@ from rig.atomic_write import write_atomically
 from rig.cache_folder import cache_folder
 
 FIRST_S = {
-    "read": 1.0,
-    "segmentation": 1.2,
+    "read": 0.4,
+    "segmentation": 4.3,
     "alignment": 0.6,
-    "fit": 0.8,
-    "parts": 1.5,
-    "fit again": 2.7,
-    "depth": 4.0,
-    "fine": 3.0,
-    "texture": 1.0,
-    "bust": 3.0,
-    "atlas": 3.0,
-    "evidence": 0.5,
-    "write": 1.5,
+    "fit": 3.7,
+    "parts": 2.1,
+    "fit again": 7.1,
+    "depth": 40.0,
+    "fine": 9.0,
+    "texture": 1.4,
+    "bust": 24.0,
+    "atlas": 62.0,
+    "evidence": 0.8,
+    "write": 3.0,
 }
-"""Seconds of every stage, in their order, two cores."""
-SIMPLEX_S = 60.0  # of the simplex's fit
-LEARNING = 0.3  # weight of the newest job
+"""Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine --atlas` on two cores that four
+other processes share. On idle ones all are three to four times shorter, which a job's own pace soon tells."""
+SIMPLEX_S = 200.0  # of the simplex's fit, at the same pace: a minute on idle cores
+LEARNING = 0.3  # weight of the newest job; the first one of its kind counts alone
 LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
 
 PHOTO_DETAIL = (None, "photo", "fine")
@@ -79,9 +80,8 @@ class StageDurations:
     def learn(self, settings: Settings, seconds: Mapping[str, float]) -> None:
         """Takes in how long the stages of a job took."""
         learnt, before = self._read(), self.of(settings)
-        mixed = {
-            stage: (1 - LEARNING) * before[stage] + LEARNING * seconds[stage] for stage in before if stage in seconds
-        }
+        weight = LEARNING if kind_of(settings) in learnt else 1.0
+        mixed = {stage: (1 - weight) * before[stage] + weight * seconds[stage] for stage in before if stage in seconds}
         learnt[kind_of(settings)] = {stage: round(took, 3) for stage, took in (before | mixed).items()}
         self._learnt = learnt
         with suppress(OSError):
