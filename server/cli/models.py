@@ -1,4 +1,4 @@
-"""Commands about head models: model list, info, import, build, fetch, show."""
+"""Commands about head models: model list, info, import, build, fetch, show, remove."""
 
 from pathlib import Path
 from typing import Annotated
@@ -109,3 +109,16 @@ def model_show(
     with progress_bar() as report:
         drawn = [str(path) for path in show_model(load_model(name), out, modes=modes, report=report)]
     answer({"pictures": drawn}, json_out, drawn)
+
+
+@model_app.command("remove", epilog="Example: eigenhead model remove ict-facekit")
+def model_remove(
+    name: Annotated[str, typer.Argument(help="A model of the models folder.")],
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Remove a head model that was imported or fetched; the shipped one stays."""
+    from pipeline.eigenheads.model_names import remove_model
+
+    path = remove_model(name)
+    answer({"name": name, "file": str(path)}, json_out, [f"removed {path}"])
