@@ -409,6 +409,11 @@ def test_health_metrics_models(http: httpx.Client) -> None:
     assert any(model["default"] for model in http.get("/v1/models").json()["models"])
 
 
+def test_the_page_of_the_api_is_there(http: httpx.Client) -> None:
+    assert "openapi.json" in http.get("/docs").text
+    assert http.get("/openapi.json").json()["paths"]["/v1/jobs"]["post"]["operationId"] == "submit_job"
+
+
 def test_a_tar_made_elsewhere_with_one_enclosing_folder_works(http: httpx.Client, tmp_path: Path) -> None:
     folder, buffer = small_capture(tmp_path / "capture"), io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
