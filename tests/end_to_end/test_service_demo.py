@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import httpx
+import jsonschema_rs
 import pytest
 
 from pipeline.settings import Settings
@@ -77,5 +78,6 @@ def test_a_foreign_capture_through_the_service_and_the_command_line_gives_the_sa
     assert done.returncode == 0, done.stderr
     learnt.append(durations())
     assert learnt[0] != learnt[1] != learnt[2], "service and command line learn how long stages take"
-    assert json.loads(done.stdout)["format"] == "eigenhead-report/1"
+    schema = json.loads((ROOT / "docs" / "schemas" / "report.schema.json").read_text())
+    jsonschema_rs.validator_for(schema).validate(json.loads(done.stdout))
     assert (tmp_path / "local" / "head.ply").read_bytes() == (tmp_path / "service" / "head.ply").read_bytes()
