@@ -85,7 +85,9 @@ def model_fetch(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """Fetch a published head model, show its licence, and make it one of ours."""
+    """Fetch a published head model.
+
+    Its licence is shown, and it becomes one of ours."""
     from pipeline.eigenheads.sources.fetch import fetch_model
 
     with progress_bar() as report:
@@ -102,7 +104,9 @@ def model_show(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """Draw a model's modes, a correspondence, and how compact, general and specific it is (figures 2 and 3)."""
+    """Draw a model's modes and a correspondence (figures 2 and 3).
+
+    And how compact, general and specific it is."""
     from pipeline.eigenheads.model import load_model
     from pipeline.eigenheads.training.figures import show_model
 
@@ -117,7 +121,9 @@ def model_remove(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """Remove a head model that was imported or fetched; the shipped one stays."""
+    """Remove a head model.
+
+    One that was imported, built or fetched; the shipped one stays."""
     from pipeline.eigenheads.model_names import remove_model
 
     path = remove_model(name)

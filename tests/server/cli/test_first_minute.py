@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.eigenheads.data_folder import data_folder, models_folder
+from rig.studio.sensor.faults import KINDS
 from server.cli.main import main
 from tests.server.cli.test_main import run as run_apart
 from tests.support.services import small_capture
@@ -88,6 +89,18 @@ def test_a_model_of_the_users_own_is_removed_and_no_other_file(run: Run, tmp_pat
         assert (refused.status, word in refused.err) == (1, True)
     assert run("model", "remove", "mine", "--data", tmp_path / "heads").status == 0
     assert sorted(path.name for path in (tmp_path / "heads").rglob("*")) == ["models", "other.npz"]
+
+
+@pytest.mark.parametrize("group", [[], ["keys"], ["rig"], ["model"]])
+def test_no_summary_of_a_command_is_cut_off(run: Run, group: list[str]) -> None:
+    listed = run(*group, "--help").out.partition("Commands:")[2]
+    assert listed.strip()
+    assert "..." not in listed
+
+
+def test_help_names_every_fault(run: Run) -> None:
+    told = " ".join(run("simulate", "--help").out.split())
+    assert all(kind in told.replace("- ", "-") for kind in KINDS)
 
 
 def test_it_names_its_version_and_completes_words(run: Run) -> None:
