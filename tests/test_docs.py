@@ -64,6 +64,14 @@ def test_every_page_is_reached_from_the_quick_start_or_the_readme() -> None:
     assert {page.name for page in DOCS.glob("*.md")} - linked == {"trigger-protocol.md"}  # by the rig's page, as a path
 
 
+def test_the_readmes_figures_are_those_of_the_results() -> None:
+    table = prose(ROOT / "README.md").partition("## Results")[2].partition("\n## ")[0]
+    pairs = re.findall(r"\| ([\d.]+) \| ([\d.]+) \|$", table, re.MULTILINE)
+    measured = prose(DOCS / "results.md").replace("*", "")
+    assert len(pairs) == 8
+    assert [pair for pair in pairs if " / ".join(pair) not in measured] == []
+
+
 def schema(name: str) -> Any:
     return jsonschema_rs.validator_for(json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text()))
 

@@ -195,6 +195,12 @@ def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: byt
     assert all(word in told for word in ("'nobody' is not at hand", "metod", "fitting.modes")), told
 
 
+def test_a_session_without_captures_is_asked_as_much(http: httpx.Client) -> None:
+    session = http.post("/v1/sessions", json={}).json()["id"]
+    refused = http.post(f"/v1/sessions/{session}/jobs", json={"settings": {"detial": "fine"}})
+    assert (refused.status_code, "did you mean 'detail'" in refused.text) == (422, True)
+
+
 def test_a_job_says_that_nobody_serves_its_queue(http: httpx.Client, archive: bytes) -> None:
     capture = upload(http, archive).json()["id"]
     job = http.post("/v1/jobs", json={"capture_id": capture, "queue": "gpu"}).json()
