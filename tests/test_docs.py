@@ -20,6 +20,8 @@ from rig.formats.cameras_json import document_from_rig, rig_from_document
 from rig.formats.features_json import document_from_features, features_from_document
 from rig.geometry import RigidTransform
 from rig.rig import Rig
+from server.cli.doctor import OTHER_VARIABLES
+from server.settings import PREFIX, ServiceSettings
 from server.storage.store import FOLDERS
 from tests.support.report_schema import report_schema
 from tests.support.services import ROOT, running_service, small_capture
@@ -62,6 +64,14 @@ def test_every_path_that_is_named_is_there(page: Path) -> None:
 def test_every_page_is_reached_from_the_quick_start_or_the_readme() -> None:
     linked = {Path(link.partition("#")[0]).name for page in PAGES for link in LINK.findall(prose(page))}
     assert {page.name for page in DOCS.glob("*.md")} - linked == {"trigger-protocol.md"}  # by the rig's page, as a path
+
+
+def test_every_variable_that_is_named_is_read() -> None:
+    known = {PREFIX + name.upper() for name in ServiceSettings.model_fields} | OTHER_VARIABLES
+    of_tests = {"EIGENHEAD_SCREENSHOTS", "EIGENHEAD_CHROMIUM"}
+    named = {name for page in PAGES for name in re.findall(r"EIGENHEAD_[A-Z_]*[A-Z]", page.read_text(encoding="utf-8"))}
+    assert named - known <= of_tests
+    assert len(named & known) > 15
 
 
 def test_the_readmes_figures_are_those_of_the_results() -> None:
