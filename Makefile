@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup demo serve test test-slow check coverage format bench
+.PHONY: setup demo serve test test-slow check coverage format bench dependencies
 BIN := .venv/bin
 
 setup:       ## uv, the locked environment, an EGL; nothing where nothing is missing
@@ -35,3 +35,6 @@ format: setup
 
 bench: setup ## timings of inner loops
 	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/benchmarks
+
+dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
+	$(BIN)/python -m tests.support.dependencies

@@ -11,9 +11,10 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 UV_LEAST=0.9
 EGL_PACKAGES=(libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri)
-# cameras over GigE Vision, the trigger box's firmware in a simulator, pages in a browser, jobs on PostgreSQL
-TEST_PACKAGES=(gcc libc6-dev gcc-avr avr-libc simavr libsimavr-dev libelf-dev aravis-tools libaravis-0.8-0
-  gir1.2-aravis-0.8 chromium postgresql)
+# the proxies of deploy/, the walk with curl, cameras over GigE Vision, the trigger box's firmware in a simulator, pages in
+# a browser, jobs on PostgreSQL
+TEST_PACKAGES=(nginx-light caddy openssl curl gcc libc6-dev gcc-avr avr-libc simavr libsimavr-dev libelf-dev
+  aravis-tools libaravis-0.8-0 gir1.2-aravis-0.8 chromium postgresql)
 
 say() { echo "setup: $*" >&2; }
 fail() { say "$*"; exit 1; }

@@ -13,7 +13,6 @@ Numba has no public interface for that. What is used of its inside: ``Dispatcher
 
 import hashlib
 import logging
-import os
 import pickle
 import sys
 from collections.abc import Callable, Iterator
@@ -31,19 +30,11 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 
 from rig.atomic_write import write_atomically
+from rig.cache_folder import cache_folder
 
 DIGEST_BYTES = 32
 
 log = logging.getLogger("eigenhead")
-
-
-def cache_folder() -> Path:
-    """Where this machine keeps what can be made again: EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else
-    ~/.cache/eigenhead. It need not exist."""
-    given = os.environ.get("EIGENHEAD_CACHE")
-    if given:
-        return Path(given)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eigenhead"
 
 
 def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:

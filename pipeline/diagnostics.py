@@ -20,7 +20,7 @@ WARNING_CODES = (
     "view",
     "view-left-out",
 )
-"""Codes that a result's warnings may have; docs/results.md says what each means and what to do."""
+"""Codes that a result's warnings may have; docs/operator.md says what each means and what to do."""
 
 
 @dataclass(frozen=True, slots=True)

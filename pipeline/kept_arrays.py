@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from pipeline.compiled import cache_folder, machine, say_not_kept
+from pipeline.compiled import machine, say_not_kept
 from rig.atomic_write import write_atomically
+from rig.cache_folder import cache_folder
 
 ALIGNED = 64  # bytes: where arrays begin in a file, and where NumPy begins its own
 CHECKSUM = 4  # bytes

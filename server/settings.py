@@ -17,7 +17,7 @@ MOVED: dict[str, str] = {"server.work:reconstruct_capture": RECONSTRUCT}
 class ServiceSettings(BaseSettings):
     """What an operator may set; each field is also the variable ``EIGENHEAD_<FIELD>``."""
 
-    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
 
     data: Path = Field(default_factory=data_folder, description="folder of captures, results and the job database")
     database_url: str | None = Field(default=None, description="postgresql://...; without it SQLite in the data folder")

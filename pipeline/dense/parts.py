@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipeline.dense.part_cells import Cells, grey_of, head_guide, make_cells
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.parallel_for import thread_count
 from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.rig import Rig
@@ -101,7 +102,7 @@ def classify_parts(
         name = view.camera.name
         return PartMap(name, finished(view, mask, own, images[name], masks[name], settings))
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # OpenCV and numpy release the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # OpenCV and numpy release the interpreter lock
         found = list(pool.map(one, cells, inside, rows))
     report("parts", 1.0)
     return {each.camera: each for each in found}

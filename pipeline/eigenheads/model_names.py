@@ -21,6 +21,13 @@ class UnknownModel(EigenheadError):
         )
 
 
+class ShippedModel(EigenheadError):
+    """A model that comes with the program, where one of the user's own is meant."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"the head model {name!r} comes with the program and cannot be removed")
+
+
 def list_models() -> dict[str, Path]:
     """Models at hand by name: the shipped default and the files of the user's folder."""
     found = {DEFAULT: PACKS / _PACK_FILES[DEFAULT]}
@@ -42,3 +49,13 @@ def model_path(name_or_path: str | Path) -> Path:
     if path.is_file():
         return path
     raise UnknownModel(name)
+
+
+def remove_model(name: str) -> Path:
+    """Removes a model of the user's folder; returns where it was. Raises UnknownModel, and ShippedModel for those that
+    come with the program."""
+    path = models_folder() / f"{name}.npz"
+    if path.parent != models_folder() or not path.is_file():
+        raise ShippedModel(name) if name in _PACK_FILES else UnknownModel(name)
+    path.unlink()
+    return path

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
+from pipeline.parallel_for import thread_count
 from rig.camera import Camera
 from rig.mesh import Mesh
 from rig.rig import Rig
@@ -33,7 +34,7 @@ def depth_map(
 
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
     """What every camera of a rig sees of a mesh: camera z (mm) at each pixel, inf beside it."""
-    with ThreadPoolExecutor(max_workers=2) as pool:  # compiled code releases the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # compiled code releases the interpreter lock
         found = pool.map(lambda camera: depth_map(camera, mesh_world.vertices, mesh_world.faces)[0], rig)
         return dict(zip(rig.names, found, strict=True))
 

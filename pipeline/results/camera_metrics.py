@@ -13,6 +13,7 @@ from pipeline.fitting.rim import find_rim, make_topology, pack_views
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
+from pipeline.parallel_for import thread_count
 from pipeline.results.reconstruction import CameraFigures
 from rig.camera import Camera
 from rig.geometry import Similarity
@@ -59,7 +60,7 @@ def camera_figures(
             samples=int(here.sum()),
         )
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # distance transforms release the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # distance transforms release the interpreter lock
         return dict(zip(rig.names, pool.map(figures_of, range(len(rig)), rig), strict=True))
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float32, UInt8
 from pipeline.imaging.contour_distance import chamfer
 from pipeline.imaging.cpu_raster import picture
 from pipeline.imaging.masks import box_around
+from pipeline.parallel_for import thread_count
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.mesh import Mesh
@@ -95,7 +96,7 @@ def turntable(
         drawn = picture(camera, mesh_head.vertices, mesh_head.faces, colours, PAPER)
         return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # the rasteriser releases the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # the rasteriser releases the interpreter lock
         return list(pool.map(draw, np.radians(AZIMUTHS_DEG)))
 
 

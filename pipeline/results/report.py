@@ -55,17 +55,17 @@ class NamedModel(TypedDict):
 
 
 class Measured(TypedDict):
-    """In mm, with its standard deviation."""
+    """In mm, with its standard deviation where the solver tells one."""
 
     value: float
-    std: float
+    std: float | None
 
 
 class Placed(TypedDict):
-    """A landmark in the world (mm), with its standard deviation."""
+    """A landmark in the world (mm), with its standard deviations along the world's axes where the solver tells them."""
 
     position: list[float]
-    std: float
+    std: list[float] | None
 
 
 class SimilarityReport(TypedDict):

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.imaging.contour_distance import distance_to_level
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
+from pipeline.parallel_for import thread_count
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import Background
 from pipeline.silhouettes.cross_view import count_rejecting_cameras
@@ -44,7 +45,7 @@ def segment(
             "capture", [f"{name} has neither a clean plate nor a mask: record one of them" for name in blind]
         )
     silhouettes: dict[str, Silhouette] = {}
-    with ThreadPoolExecutor(max_workers=2) as pool:  # cv2 and the compiled kernels release the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # cv2 and the compiled kernels release the interpreter lock
         given = {
             name: pool.submit(_operators, capture.masks[name], settings) for name in rig.names & capture.masks.keys()
         }

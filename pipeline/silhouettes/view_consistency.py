@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import depth_of, hull_extent
+from pipeline.parallel_for import thread_count
 from pipeline.settings import SegmentationSettings
 from rig.camera import Camera
 from rig.rig import Rig
@@ -58,7 +59,7 @@ def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRI
         depth = np.where(inside, silhouettes[camera.name].distance[at[:, 1], at[:, 0]], -np.inf)
         return where, radius, inside, depth > radius, depth
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # NumPy releases the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # NumPy releases the interpreter lock
         return Votes(*(np.array(values) for values in zip(*pool.map(vote, rig), strict=True)))
 
 
@@ -72,7 +73,7 @@ def judge_agreement(
     believed = rig.subset(trusted)
     votes = cast_votes(silhouettes, believed)
     judged = dict(silhouettes)
-    with ThreadPoolExecutor(max_workers=2) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         shares = pool.map(lambda k: _shares(votes, k, silhouettes[trusted[k]].mask), range(len(trusted)))
         for name, (strange, missing) in zip(trusted, shares, strict=True):
             judged[name] = _judged(silhouettes[name], strange, missing, settings)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.parallel_for import thread_count
 from pipeline.settings import TextureSettings
 from pipeline.texture.uv_unwrap import Atlas, Layout
 from pipeline.texture.vertex_colours import Texture, blend, usable_views
@@ -69,7 +70,7 @@ def paint_atlas(
             linear = np.where(count[:, None] > 0, found, linear)
         image[row : row + BLOCK_ROWS][faces >= 0] = np.rint(255 * srgb_from_linear(linear))
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # the compiled kernels release the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
         list(pool.map(paint, range(0, size, BLOCK_ROWS)))
     return Atlas(layout, _padded(image, shown))
 

@@ -22,6 +22,7 @@ from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.parallel_for import thread_count
 from pipeline.settings import TextureSettings
 from pipeline.texture.inpaint import fill_unknown
 from pipeline.texture.vertex_colours_kernels import blend_views
@@ -74,7 +75,7 @@ def texture(
         given = image, silhouettes[name], depths[name]
         return see_points(camera, *given, mesh_world.vertices, normals, settings)
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # the compiled kernels release the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
         sights = list(pool.map(look, views))
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:

@@ -19,7 +19,9 @@ def board(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Write a calibration board at true scale, with a ruler to check the print."""
+    """Write a calibration board at true scale.
+
+    A ruler beside it checks the print."""
     from calibration.board.board import board_from_document, write_board, write_board_pdf
 
     columns, _, rows = squares.partition("x")
@@ -81,7 +83,9 @@ def refine(
     model: Annotated[str | None, typer.Option(help="A head model whose rims speak as well: a name or file.")] = None,
     json_out: Json = False,
 ) -> None:
-    """Refine a calibration by the silhouettes of several captures; kept only if each agrees with the others."""
+    """Refine a calibration by silhouettes of captures.
+
+    The change is kept only if each capture agrees with the others."""
     prepare_file(out)
     from calibration.silhouette_refinement.report import refinement_page
     from rig.atomic_write import write_atomically
@@ -105,7 +109,7 @@ def convert(
     to: Annotated[str, typer.Option(help="eigenhead, colmap, colmap-text, caliscope or aniposelib.")] = "eigenhead",
     json_out: Json = False,
 ) -> None:
-    """Turn a calibration into another program's format, or another program's into ours."""
+    """Convert calibrations to and from other programs."""
     from rig.errors import InputError
     from rig.formats.cameras_file import FORMATS, find_rig_file, read_rig_file, write_rig_file
 

@@ -21,7 +21,7 @@ import httpx
 
 from rig.errors import EigenheadError
 from rig.formats.archive import is_archive, pack_folder
-from server.cli.documents import CaptureDocument, ErrorDocument, JobDocument
+from server.services.documents import CaptureDocument, ErrorDocument, JobDocument
 from server.storage.result_folder import fresh_folder
 
 if TYPE_CHECKING:

@@ -15,13 +15,14 @@ from urllib.parse import quote
 from pipeline.eigenheads.data_folder import MODELS, models_folder
 from pipeline.eigenheads.model_names import model_path
 from pipeline.parallel_for import THREADS, thread_count
+from rig.cache_folder import CACHE, cache_folder
 from rig.errors import EigenheadError
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_egl
 
-OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", PREFIX + "CACHE"})  # not read in ServiceSettings
+OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", CACHE})  # not read in ServiceSettings
 # The tables of server.storage.database in words of the databases' own: SQLAlchemy takes longer to load than all checks.
 TABLES = {
     "sqlite": "SELECT name FROM sqlite_master WHERE name = 'eigenhead_workers'",
@@ -57,6 +58,7 @@ def examine(settings: ServiceSettings) -> dict[str, Finding]:
         "memory": _memory,
         "data": _data,
         "models": _models,
+        "cache": _cache,
         "database": _database,
         "variables": _variables,
         "rig": _rig,
@@ -124,6 +126,14 @@ def _data(settings: ServiceSettings) -> tuple[bool, str]:
 def _models(settings: ServiceSettings) -> tuple[bool, str]:
     count = len(list(models_folder().glob("*.npz")))
     return True, f"{models_folder()}, {count} of your own beside the default" if count else f"{models_folder()}, empty"
+
+
+def _cache(settings: ServiceSettings) -> tuple[bool, str]:
+    folder = cache_folder().resolve()
+    there = next(place for place in (folder, *folder.parents) if place.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK)):
+        return False, f"{folder} cannot be written: every start compiles anew; {CACHE} names another folder"
+    return True, f"{folder}, what can be made again" + ("" if there == folder else "; not made yet")
 
 
 def _database(settings: ServiceSettings) -> tuple[bool, str]:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 
+from rig.studio.sensor.faults import KINDS
 from server.cli.answers import (
     Data,
     Json,
@@ -98,7 +99,9 @@ def simulate(
         typer.Option(help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, glasses."),
     ] = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
-    fault: Annotated[list[str] | None, typer.Option(help="KIND[:CAMERA][=AMOUNT]; may be repeated.")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
+    ] = None,
     serve: Annotated[
         bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
     ] = False,
@@ -107,7 +110,9 @@ def simulate(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Take a capture with the simulated studio, and write the truth beside it; or serve the studio as real devices.
+    """Take a capture with the simulated studio.
+
+    The truth is written beside it.
 
     --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
     given) with which the rig commands and the service work as with a real rig."""
@@ -173,7 +178,9 @@ def demo(
     compare: Annotated[bool, typer.Option("--compare", help="Solve by the paper's simplex too: minutes more.")] = False,
     json_out: Json = False,
 ) -> None:
-    """The main job end to end: simulated rig, capture, service, head."""
+    """Run the main job end to end.
+
+    Simulated rig, capture, service, head."""
     from server.cli.demo import run_demo
 
     with progress_bar() as report:

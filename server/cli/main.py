@@ -2,6 +2,7 @@
 
 import os
 import sys
+from typing import Annotated
 
 import typer
 
@@ -11,9 +12,7 @@ from server.cli.answers import fail
 
 app = typer.Typer(
     name="eigenhead",
-    help="One shot of a calibrated camera rig in, a textured 3D head with its uncertainty out.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -22,6 +21,23 @@ for room in (service, heads, cameras):
     app.add_typer(room.app)
 for group, name in ((service.keys_app, "keys"), (rig.rig_app, "rig"), (models.model_app, "model")):
     app.add_typer(group, name=name)
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print(f"eigenhead {version('eigenhead')}")
+        raise typer.Exit
+
+
+@app.callback()
+def of_all(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and leave.", callback=_show_version, is_eager=True)
+    ] = False,
+) -> None:
+    """One shot of a calibrated camera rig in, a textured 3D head with its uncertainty out."""
 
 
 def main() -> None:

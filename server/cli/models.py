@@ -1,4 +1,4 @@
-"""Commands about head models: model list, info, import, build, fetch, show."""
+"""Commands about head models: model list, info, import, build, fetch, show, remove."""
 
 from pathlib import Path
 from typing import Annotated
@@ -85,7 +85,9 @@ def model_fetch(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """Fetch a published head model, show its licence, and make it one of ours."""
+    """Fetch a published head model.
+
+    Its licence is shown, and it becomes one of ours."""
     from pipeline.eigenheads.sources.fetch import fetch_model
 
     with progress_bar() as report:
@@ -102,10 +104,27 @@ def model_show(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """Draw a model's modes, a correspondence, and how compact, general and specific it is (figures 2 and 3)."""
+    """Draw a model's modes and a correspondence (figures 2 and 3).
+
+    And how compact, general and specific it is."""
     from pipeline.eigenheads.model import load_model
     from pipeline.eigenheads.training.figures import show_model
 
     with progress_bar() as report:
         drawn = [str(path) for path in show_model(load_model(name), out, modes=modes, report=report)]
     answer({"pictures": drawn}, json_out, drawn)
+
+
+@model_app.command("remove", epilog="Example: eigenhead model remove ict-facekit")
+def model_remove(
+    name: Annotated[str, typer.Argument(help="A model of the models folder.")],
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Remove a head model.
+
+    One that was imported, built or fetched; the shipped one stays."""
+    from pipeline.eigenheads.model_names import remove_model
+
+    path = remove_model(name)
+    answer({"name": name, "file": str(path)}, json_out, [f"removed {path}"])

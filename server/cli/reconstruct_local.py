@@ -13,7 +13,7 @@ from rig.formats.archive import extract_archive
 from server.cli.answers import CannotWrite
 from server.storage.result_folder import fresh_folder
 from server.tasks.prepare import prepare_kernels
-from server.tasks.progress import JobProgress, StageDurations
+from server.tasks.progress import JobProgress
 
 if TYPE_CHECKING:
     from pipeline.results.report import Report as ReportDocument
@@ -63,8 +63,10 @@ def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
     from rig.render.renderer import Renderer
+    from server.tasks.stage_durations import StageDurations
 
-    progress = JobProgress(StageDurations().of(chosen.method))
+    durations = StageDurations()
+    progress = JobProgress(durations.of(chosen))
 
     def tell(stage: str, fraction: float) -> None:
         progress.report(stage, fraction)
@@ -76,6 +78,7 @@ def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "
         done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell)
     tell("write", 0.0)
     write_result(out, done, shot)
+    durations.learn(chosen, progress.finish())
 
 
 @contextmanager

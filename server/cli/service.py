@@ -52,8 +52,10 @@ def worker(
 
 @app.command(epilog="Example: eigenhead prepare")
 def prepare(json_out: Json = False) -> None:
-    """Compile the loops of a job ahead, and keep them for every later process; the first job does it otherwise."""
-    from pipeline.compiled import cache_folder
+    """Compile the loops of a job ahead.
+
+    They are kept for every later process; the first job does it otherwise."""
+    from rig.cache_folder import cache_folder
     from server.tasks.prepare import prepare_kernels
 
     began = monotonic()

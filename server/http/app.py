@@ -12,13 +12,13 @@ from fastapi.middleware.cors import CORSMiddleware
 from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.http.openapi import describe, operation_name
 from server.http.routes import calibrations, captures, jobs, operations, rig, sessions, uploads
 from server.metrics import Metrics
 from server.services.health import check_egl
 from server.services.retention import sweep
 from server.services.service import Service, open_service
 from server.settings import ServiceSettings
-from server.storage.records import JsonObject
 from server.storage.store import new_id
 from server.wire import problems
 
@@ -56,6 +56,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
+        generate_unique_id_function=operation_name,
     )
     routers = [module.router for module in (captures, calibrations, jobs, sessions, uploads, rig, operations)]
     for router in routers:
@@ -72,7 +73,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
             expose_headers=EXPOSED,
         )
     app.add_middleware(Watch, metrics=metrics)
-    _name_problem(app)
+    describe(app)
     return app
 
 
@@ -126,23 +127,3 @@ async def _measure_lag(metrics: Metrics) -> None:
         began = loop.time()
         await asyncio.sleep(LAG_EVERY_S)
         metrics.lag.observe(max(0.0, loop.time() - began - LAG_EVERY_S))
-
-
-def _name_problem(app: FastAPI) -> None:
-    """Puts the problem document into the OpenAPI description, in place of the framework's own error."""
-    original = app.openapi
-
-    def openapi() -> JsonObject:
-        document = original()
-        schemas = document.setdefault("components", {}).setdefault("schemas", {})
-        schemas["Problem"] = problems.PROBLEM_SCHEMA
-        for unused in ("HTTPValidationError", "ValidationError"):
-            schemas.pop(unused, None)
-        for path in document["paths"].values():
-            for call in path.values():
-                for status, answer in call.get("responses", {}).items():
-                    if status[0] in "45" and problems.MEDIA_TYPE in answer.get("content", {}):
-                        answer["content"] = {problems.MEDIA_TYPE: answer["content"][problems.MEDIA_TYPE]}
-        return document
-
-    app.openapi = openapi

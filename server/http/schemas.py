@@ -2,14 +2,20 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
+from server.http.openapi import SETTINGS
 from server.services.service import Check
 from server.storage.records import JsonObject
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
 Text = Annotated[str, Field(max_length=500)]
+Moment = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
+JobSettings = Annotated[JsonObject, WithJsonSchema(SETTINGS)]
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
+
+EXAMPLE_ID = "0198c0de" + 20 * "0"
 
 
 class Received(BaseModel):
@@ -25,11 +31,17 @@ class Answer(BaseModel):
 
 
 class NewSession(Received):
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"label": "Anna", "consent": "signed 2026-03-01, for research"}]}
+    )
+
     label: Text = ""
     consent: Text = Field("", description="note on the subject's consent")
 
 
 class NewCapture(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna", "expression": "neutral"}]})
+
     session: Id | None = None
     label: Text = ""
     expression: Text = ""
@@ -40,6 +52,8 @@ class NewCapture(Received):
 class SessionEdit(Received):
     """What is not given stays as it is."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna B."}]})
+
     label: Text | None = None
     consent: Text | None = None
 
@@ -47,42 +61,64 @@ class SessionEdit(Received):
 class CaptureEdit(Received):
     """What is not given stays as it is; ``"session": null`` takes the capture out of its session."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"expression": "smile"}]})
+
     session: Id | None = None
     label: Text | None = None
     expression: Text | None = None
 
 
 class NewFeatures(Received):
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"points": {"pronasale": {"cam00": [511.2, 402.7], "cam03": [433.0, 398.1]}}}]}
+    )
+
     format: Literal["eigenhead-features/1"] = "eigenhead-features/1"
     points: dict[str, dict[str, list[float]]]
 
 
 class NewJob(Received):
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"capture_id": EXAMPLE_ID, "settings": {"detail": "fine", "outputs": {"atlas": True}}}]
+        }
+    )
+
     capture_id: Id
     model: str | None = Field(None, max_length=200)
-    settings: JsonObject | None = Field(None, description="see pipeline.settings; unknown keys are refused")
+    settings: JobSettings | None = Field(None, description="of the pipeline; what is not given has its default")
     queue: str | None = Field(None, max_length=32)
     priority: int = Field(100, ge=1, le=1000, description="lower goes first")
 
 
 class NewSessionJobs(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"detail": "fine"}}]})
+
     model: str | None = Field(None, max_length=200)
-    settings: JsonObject | None = None
+    settings: JobSettings | None = None
     priority: int = Field(100, ge=1, le=1000)
 
 
 class Restart(Received):
     """What is not given is as in the old job."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"method": "simplex"}}]})
+
     model: str | None = Field(None, max_length=200)
-    settings: JsonObject | None = None
+    settings: JobSettings | None = None
 
 
 class NewWebhook(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://lab.example/hooks/heads"}]})
+
     url: str = Field(pattern="^https?://", max_length=2000)
 
 
 class NewKey(Received):
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"name": "console", "scopes": ["read", "capture", "submit"]}]}
+    )
+
     name: str = Field(min_length=1, max_length=200)
     scopes: list[Literal["read", "capture", "submit", "admin"]] = Field(min_length=1, max_length=4)
 
@@ -95,7 +131,7 @@ class Size(Answer):
 
 class CaptureOut(Answer):
     id: str
-    created: str
+    created: Moment
     source: Literal["upload", "rig"]
     session: str | None
     label: str
@@ -115,7 +151,7 @@ class CaptureList(Answer):
 
 class SessionOut(Answer):
     id: str
-    created: str
+    created: Moment
     label: str
     consent: str
     captures: list[str]
@@ -158,13 +194,13 @@ class JobOut(Answer):
     capture_id: str | None
     session: str | None
     model: str | None
-    settings: JsonObject
+    settings: JobSettings
     restart_of: str | None
     queue: str | None
     priority: int
-    created: str | None
-    started: str | None
-    finished: str | None
+    created: Moment | None
+    started: Moment | None
+    finished: Moment | None
     files: dict[str, FileOut]
 
 
@@ -224,18 +260,31 @@ class Ready(Answer):
 class NewCalibration(Received):
     """Shots that the rig took of the board."""
 
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "board": {"kind": "checkerboard", "columns": 9, "rows": 6, "square_mm": 25.0},
+                    "captures": [EXAMPLE_ID],
+                }
+            ]
+        }
+    )
+
     board: JsonObject = Field(description="as board.toml: kind, columns, rows, square_mm, ...")
     captures: list[Id] = Field(min_length=1, max_length=500)
     label: Text = ""
 
 
 class UseCalibration(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"calibration_id": EXAMPLE_ID}]})
+
     calibration_id: Id
 
 
 class CalibrationOut(Answer):
     id: str
-    created: str
+    created: Moment
     source: Literal["upload", "rig"]
     label: str
     pictures: dict[str, int] = Field(description="number of pictures by camera")

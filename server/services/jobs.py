@@ -142,6 +142,7 @@ class Jobs:
 
     def submit_session(self, session: str, wanted: Work, *, key: str, priority: int) -> list[Job]:
         """Queues a reconstruction of every capture of a session. Raises as ``submit`` does."""
+        wanted.check()  # a session without captures asks no job to
         self._store.session(session)
         heads = [c.id for c in self._store.captures() if c.session == session and not c.board]
         return [self.submit(capture, wanted, key=key, priority=priority) for capture in heads]

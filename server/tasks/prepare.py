@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from typing import TYPE_CHECKING
 
+from rig.cache_folder import cache_folder
 from server.tasks.child import Bench, Child
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class _Work:
 
 def _can_keep() -> bool:
     """Whether the cache folder can be written; where not, a line in the log says so."""
-    from pipeline.compiled import cache_folder, say_not_kept
+    from pipeline.compiled import say_not_kept
 
     try:
         folder = cache_folder() / "kernels"

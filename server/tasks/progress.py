@@ -1,83 +1,105 @@
 """From the stages of a reconstruction to one progress and one remaining time.
 
-The pipeline reports (stage, fraction of that stage). How long each stage takes is learnt from the jobs that went
-before, by method; the first job goes by the shares measured on two cores.
+The pipeline reports (stage, fraction of that stage); some stages report no fraction. A stage that another one has
+interrupted ("fit", by "parts") is a stage of its own when it goes on: "fit again". How long each should take is given
+(``server.tasks.stage_durations``).
 """
 
 import time
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from server.storage.events import EventLog
 
-FIRST_S = {
-    method: {"read": 0.4, "segmentation": 1.2, "alignment": 0.6, "fit": fit, "texture": 1.0, "depth": 4.0, "bust": 3.0}
-    | {"evidence": 0.5}
-    for method, fit in (("contour", 0.8), ("simplex", 60.0))
-}
-WRITE_S = 1.5
+AGAIN = " again"
 EVERY_S = 0.25  # the shortest time between two progress events of one stage
-LEARNING = 0.3  # weight of the newest job
+OVERTIME = 0.1  # of a stage's expected time: what is left of one that has taken longer
+PACE_S = 2.0  # of work, before a machine's pace counts as much as the expectation
+FRACTION_LEAST = 0.05  # below it a stage's own fraction says little of its end
 
-
-class StageDurations:
-    """Seconds that each stage is expected to take, by method."""
-
-    def __init__(self) -> None:
-        self._seconds = {method: stages | {"write": WRITE_S} for method, stages in FIRST_S.items()}
-
-    def of(self, method: str) -> dict[str, float]:
-        return self._seconds.setdefault(method, dict(self._seconds["contour"]))
-
-    def learn(self, method: str, seconds: dict[str, float]) -> None:
-        known = self.of(method)
-        for stage, took in seconds.items():
-            known[stage] = (1 - LEARNING) * known.get(stage, took) + LEARNING * took
+Clock = Callable[[], float]
 
 
 class JobProgress:
-    """One job on its way: feed it reports, ask for progress and remaining seconds."""
+    """One job on its way: feed it reports, ask for progress and remaining seconds.
 
-    def __init__(self, expected: dict[str, float]) -> None:
-        self._expected = dict(expected)
+    Args:
+        expected: seconds of each stage, in the order in which they come.
+        clock: seconds that only grow.
+    """
+
+    def __init__(self, expected: Mapping[str, float], clock: Clock = time.monotonic) -> None:
+        self._expected, self._clock = dict(expected), clock
         self.seconds: dict[str, float] = {}
-        self._began = self._since = time.monotonic()
-        self._stage, self._fraction, self._progress = "", 0.0, 0.0
+        self.stage = ""
+        self._visit, self._since = "", clock()
+        self._fraction, self._progress = 0.0, 0.0
 
     def report(self, stage: str, fraction: float) -> None:
-        now = time.monotonic()
-        if stage != self._stage:
-            self._close(now)
-            self._stage, self._since = stage, now
+        if stage != self.stage:
+            self._close()
+            self.stage, self._since = stage, self._clock()
+            self._visit = stage + AGAIN if stage in self.seconds else stage
+            self._leave_out_before(self._visit)
+            self._expected.setdefault(self._visit, 0.0)
         self._fraction = min(1.0, max(0.0, fraction))
 
     def finish(self) -> dict[str, float]:
         """Seconds of every stage."""
-        self._close(time.monotonic())
+        self._close()
+        self.stage = self._visit = ""
         return self.seconds
 
     def remaining_s(self) -> float:
-        now = time.monotonic()
-        later = sum(s for stage, s in self._expected.items() if stage not in self.seconds and stage != self._stage)
-        spent, usual = now - self._since, self._expected.get(self._stage, 0.0)
-        if self._fraction > 0.05:
-            return spent * (1 - self._fraction) / self._fraction + later
-        return max(0.0, usual - spent) + later
+        """Of this stage and all that come, at the pace of those that are done."""
+        return (self._rest_of_stage() + self._to_come()) * self._pace()
 
     def progress(self) -> float:
-        """0 to 1, never falling."""
-        elapsed = time.monotonic() - self._began
-        share = elapsed / max(elapsed + self.remaining_s(), 1e-9)
-        self._progress = max(self._progress, min(0.99, share))
+        """0 to 1, never falling: each stage counts by its expected time."""
+        done = sum(took for stage, took in self._expected.items() if stage in self.seconds and stage != self._visit)
+        own, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
+        now = done + own * spent / max(spent + self._rest_of_stage(), 1e-9)
+        self._progress = max(self._progress, min(0.99, now / max(done + own + self._to_come(), 1e-9)))
         return self._progress
 
-    def _close(self, now: float) -> None:
-        if self._stage:
-            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+    def _rest_of_stage(self) -> float:
+        """Expected seconds: what is left of the usual ones, or what the stage's own fraction says, if that is more."""
+        spent, usual = self._spent_s() / self._pace(), self._expected.get(self._visit, 0.0)
+        rest = max(usual - spent, OVERTIME * usual)
+        if FRACTION_LEAST < self._fraction < 1:
+            rest = max(rest, spent * (1 - self._fraction) / self._fraction)
+        return rest
+
+    def _to_come(self) -> float:
+        """Expected seconds of the stages that have not begun."""
+        return sum(took for stage, took in self._expected.items() if stage not in self.seconds and stage != self._visit)
+
+    def _pace(self) -> float:
+        """Seconds that a second of the expectation takes here, by the stages that are done."""
+        done = [stage for stage in self.seconds if stage != self._visit]
+        took = sum(self.seconds[stage] for stage in done)
+        return (took + PACE_S) / (sum(self._expected.get(stage, 0.0) for stage in done) + PACE_S)
+
+    def _spent_s(self) -> float:
+        return self.seconds.get(self._visit, 0.0) + self._clock() - self._since
+
+    def _leave_out_before(self, visit: str) -> None:
+        """Stages that this job has passed over will not come."""
+        order = list(self._expected)
+        if visit in order:
+            for earlier in order[: order.index(visit)]:
+                if earlier not in self.seconds:
+                    del self._expected[earlier]
+
+    def _close(self) -> None:
+        if self.stage:
+            self.seconds[self._visit] = self._spent_s()
 
 
 class ProgressMeter:
-    """Turns the reports of a job into events: at most one in ``EVERY_S`` within a stage, with the remaining time."""
+    """Turns the reports of a job into events, with the remaining time: at most one in ``EVERY_S`` within a stage, and
+    one in ``EVERY_S`` where a stage reports nothing but is asked by ``tick``."""
 
     def __init__(self, log: "EventLog", job_id: str, progress: JobProgress) -> None:
         self._log, self._job_id, self._progress = log, job_id, progress
@@ -85,8 +107,11 @@ class ProgressMeter:
 
     def report(self, stage: str, fraction: float) -> None:
         self._progress.report(stage, fraction)
-        now = time.monotonic()
-        if stage == self._last[0] and now - self._last[1] < EVERY_S:
+        self.tick()
+
+    def tick(self) -> None:
+        stage, now = self._progress.stage, time.monotonic()
+        if not stage or (stage == self._last[0] and now - self._last[1] < EVERY_S):
             return
         self._last = (stage, now)
         share, left_s = round(self._progress.progress(), 4), round(self._progress.remaining_s(), 1)

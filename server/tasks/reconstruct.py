@@ -41,6 +41,7 @@ def reconstruct_capture(
     Raises InputError for an input that cannot be used, any EigenheadError that the pipeline raises, OSError for a full
     disk, Cancelled out of ``report``.
     """
+    report("read", 0.0)  # a fresh child loads for seconds what this takes
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
@@ -49,7 +50,6 @@ def reconstruct_capture(
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
 
-    report("read", 0.0)
     name = model or "default"
     head_model = bench.keep(f"model {name}", lambda: load_model(name))
     renderer = bench.keep("renderer", Renderer.create)

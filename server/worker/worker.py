@@ -31,6 +31,7 @@ from dbos import DBOS, WorkflowStatus
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
+from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
 from server.errors import Refused, unusable_input
 from server.services import calibrations
@@ -43,8 +44,9 @@ from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, We
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
-from server.tasks.progress import JobProgress, ProgressMeter, StageDurations
-from server.tasks.reconstruct import CaptureWork
+from server.tasks.progress import JobProgress, ProgressMeter
+from server.tasks.reconstruct import CaptureWork, reconstruct_capture
+from server.tasks.stage_durations import StageDurations
 from server.worker.engine import take_over
 from server.worker.heartbeat import dead_workers, process_identity
 
@@ -169,11 +171,15 @@ class Worker:
         settings = request.get("settings") or {}
         try:
             folder.mkdir(parents=True)
-            method = str(settings.get("method", "contour"))
-            progress = JobProgress(self._durations.of(method))
+            chosen = settings_from_document(settings)
+            progress = JobProgress(self._durations.of(chosen))
             meter = ProgressMeter(self.events, job_id, progress)
+
+            def cancelled() -> bool:
+                meter.tick()  # asked many times a second, also where a stage reports nothing
+                return not self._states.runs(job_id)
+
             with self._children.one() as child:
-                cancelled = lambda: not self._states.runs(job_id)  # noqa: E731
                 child.remote(self._work, report=meter.report, cancelled=cancelled)(
                     capture=str(self.store.folder("captures", request["capture_id"]) / "files"),
                     result=str(folder),
@@ -181,7 +187,8 @@ class Worker:
                     model=request.get("model"),
                     settings=settings,
                 )
-            self._durations.learn(method, progress.finish())
+            if self._work is reconstruct_capture:  # how long another work takes says nothing of this one
+                self._durations.learn(chosen, progress.finish())
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
             raise self._failure(error) from error

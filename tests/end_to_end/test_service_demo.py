@@ -6,17 +6,24 @@ import sys
 from pathlib import Path
 
 import httpx
+import jsonschema_rs
 import pytest
 
+from pipeline.settings import Settings
 from rig.formats.archive import pack_folder
 from server.cli.client import Client
 from server.services.truth import error_mm
+from server.tasks.stage_durations import StageDurations
 from tests.support.services import ROOT, running_service
 from tests.support.shared_data import shared
 
 # A visual hull from perfect silhouettes of these captures is 1.3 mm off in the median (README beside them); a head that
 # explains the silhouettes must be closer than that.
 HULL_MEDIAN_MM = 1.32
+
+
+def durations() -> dict[str, float]:
+    return StageDurations().of(Settings())
 
 
 @pytest.mark.slow
@@ -45,6 +52,7 @@ def test_a_foreign_capture_through_the_service_and_the_command_line_gives_the_sa
     """scan-a was rendered by a ray tracer that shares no code with the project."""
     folder, truth = shared("data/captures/scan-a"), shared("data/captures/scan-a.truth")
     pack_folder(folder, tmp_path / "scan-a.tar")
+    learnt = [durations()]
     with running_service(tmp_path / "data", work="server.tasks.reconstruct:reconstruct_capture") as service:
         with (tmp_path / "scan-a.tar").open("rb") as stream:
             accepted = httpx.post(service.url + "/v1/reconstructions", files={"file": stream}, timeout=120)
@@ -53,6 +61,7 @@ def test_a_foreign_capture_through_the_service_and_the_command_line_gives_the_sa
             stages: list[str] = []
             job = client.wait(accepted.json()["id"], report=lambda stage, fraction: stages.append(stage))
             client.download(job["id"], tmp_path / "service")
+    learnt.append(durations())
     assert {"segmentation", "fit", "texture"} <= set(stages)
     assert error_mm(truth, tmp_path / "service" / "head.ply")["median"] < HULL_MEDIAN_MM
     command = [
@@ -67,5 +76,8 @@ def test_a_foreign_capture_through_the_service_and_the_command_line_gives_the_sa
     ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["format"] == "eigenhead-report/1"
+    learnt.append(durations())
+    assert learnt[0] != learnt[1] != learnt[2], "service and command line learn how long stages take"
+    schema = json.loads((ROOT / "docs" / "schemas" / "report.schema.json").read_text())
+    jsonschema_rs.validator_for(schema).validate(json.loads(done.stdout))
     assert (tmp_path / "local" / "head.ply").read_bytes() == (tmp_path / "service" / "head.ply").read_bytes()

@@ -18,3 +18,10 @@ def test_the_work_of_an_older_version_is_found(address: str, monkeypatch: pytest
 def test_a_public_url_is_a_scheme_and_a_host(url: str) -> None:
     with pytest.raises(ValidationError):
         ServiceSettings(public_url=url)
+
+
+def test_an_empty_variable_is_as_good_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose files pass variables on that nobody has set."""
+    monkeypatch.setenv("EIGENHEAD_PUBLIC_URL", "")
+    monkeypatch.setenv("EIGENHEAD_PORT", "")
+    assert (ServiceSettings().public_url, ServiceSettings().port) == (None, 8600)

@@ -14,6 +14,7 @@ from rig.errors import InputError
 from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.pages.rig import read_report
 from server.console.removal import removals
+from server.services.documents import JobLine
 from server.services.jobs import FINISHED, Work
 from server.services.records import Job
 from server.services.service import Service
@@ -56,32 +57,15 @@ class JobDetail(TypedDict):
     pictures: bool
 
 
-class JobLine(TypedDict):
-    """A job in the list: all but its files, and the label and time of its capture."""
+class ShownJob(JobLine):
+    """A job in the list, with the label and time of its capture."""
 
-    id: str
-    state: str
-    stage: str
-    progress: float
-    eta_s: float | None
-    error: dict[str, object] | None
-    notice: str | None
-    capture_id: str | None
-    session: str | None
-    model: str | None
-    settings: dict[str, object]
-    restart_of: str | None
-    queue: str | None
-    priority: int
-    created: str | None
-    started: str | None
-    finished: str | None
     capture: str
     captured: str | None
 
 
 class JobsState(TypedDict):
-    jobs: list[JobLine]
+    jobs: list[ShownJob]
     models: list[str]
 
 
@@ -139,9 +123,9 @@ def jobs_list(service: Service) -> list[ListedJob]:
     return found
 
 
-def job_line(listed: ListedJob) -> JobLine:
+def job_line(listed: ListedJob) -> ShownJob:
     job = {key: value for key, value in asdict(listed.job).items() if key != "files"}
-    return cast(JobLine, {**job, "capture": listed.capture, "captured": listed.captured})
+    return cast(ShownJob, {**job, "capture": listed.capture, "captured": listed.captured})
 
 
 def job_detail(service: Service, job_id: str) -> JobDetail:

@@ -45,12 +45,13 @@ def list_calibrations(service: ServiceOf, caller: Reader) -> CalibrationList:
 
 @router.get("/{calibration_id}", responses=documented(404))
 def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> CalibrationOut:
+    """A calibration: its state and, once it succeeded, figures and checks."""
     return CalibrationOut.model_validate(service.calibrations.get(calibration_id))
 
 
 FILE: Responses = {
     200: {"content": {"application/json": {}}},
-    206: {"description": "Partial Content"},
+    206: {"description": "Partial Content", "content": {"application/json": {}}},
     304: {"description": "Not Modified"},
     **documented(404, 409, 416),
 }
@@ -59,12 +60,13 @@ FILE: Responses = {
 @router.head("/{calibration_id}/cameras.json", include_in_schema=False)
 @router.get("/{calibration_id}/cameras.json", responses=FILE, response_class=FileResponse)
 def get_cameras(service: ServiceOf, caller: Reader, request: Request, calibration_id: str) -> Response:
+    """The calibrated cameras, as a capture folder has them."""
     return send_file(request, service.calibrations.file(calibration_id, "cameras.json"))
 
 
 @router.get(
     "/{calibration_id}/report.html",
-    responses=FILE | {200: {"content": {"text/html": {}}}},
+    responses=FILE | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
     response_class=FileResponse,
 )
 def get_report(service: ServiceOf, caller: Reader, request: Request, calibration_id: str) -> Response:

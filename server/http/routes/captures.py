@@ -61,6 +61,7 @@ def list_captures(
 
 @router.get("/captures/{capture_id}", responses=documented(404))
 def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureOut:
+    """A capture: its cameras, its files with their sha256, and the rig's certificate of the shot."""
     return CaptureOut.model_validate(service.store.capture(capture_id))
 
 
@@ -85,6 +86,7 @@ IMAGE_RESPONSES: Responses = {
 @router.head("/captures/{capture_id}/images/{camera}", include_in_schema=False)
 @router.get("/captures/{capture_id}/images/{camera}", responses=IMAGE_RESPONSES, response_class=FileResponse)
 def get_image(service: ServiceOf, caller: Reader, request: Request, capture_id: str, camera: str) -> Response:
+    """A camera's photograph as it came."""
     return send_file(request, service.captures.image(capture_id, "images", camera))
 
 
@@ -103,6 +105,7 @@ def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: N
 
 @router.get("/captures/{capture_id}/features", responses=documented(404))
 def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeatures:
+    """The feature points that are stored."""
     return NewFeatures(points=service.captures.features(capture_id))
 
 

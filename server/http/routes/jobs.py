@@ -65,6 +65,7 @@ def list_jobs(
 
 @router.get("/jobs/{job_id}", responses=documented(404))
 def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
+    """A job: its state, stage, progress, remaining seconds, and once it succeeded its files."""
     return JobOut.model_validate(service.jobs.get(job_id))
 
 
@@ -123,11 +124,10 @@ ARCHIVE: Responses = {
     304: {"description": "Not Modified"},
     **documented(404, 409),
 }
-RESULT = {
-    200: {
-        "content": {"application/octet-stream": {}, "model/gltf-binary": {}, "application/json": {}, "image/png": {}}
-    },
-    206: {"description": "Partial Content"},
+FILES = {kind: {} for kind in ("application/octet-stream", "model/gltf-binary", "application/json", "image/png")}
+RESULT: Responses = {
+    200: {"content": FILES},
+    206: {"description": "Partial Content", "content": FILES},
     304: {"description": "Not Modified"},
     **documented(404, 409, 416),
 }

@@ -1,9 +1,11 @@
-"""Health, readiness, metrics, models, keys, webhooks."""
+"""Health, readiness, metrics, models, keys, webhooks; the page that shows the API."""
 
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Response
+from fastapi.responses import FileResponse
 
 from server.http.auth import ServiceOf, require
 from server.http.schemas import (
@@ -27,6 +29,13 @@ from server.wire.problems import Problem, documented
 router = APIRouter()
 Reader = Annotated[Caller, Depends(require("read"))]
 Admin = Annotated[Caller, Depends(require("admin"))]
+DOCS = Path(__file__).parents[1] / "static" / "docs.html"
+
+
+@router.get("/docs", include_in_schema=False)
+def docs() -> FileResponse:
+    """The API for people, made in the browser from openapi.json; nothing comes from elsewhere."""
+    return FileResponse(DOCS, media_type="text/html")
 
 
 @router.get("/healthz", tags=["operations"])
@@ -57,6 +66,7 @@ def metrics(service: ServiceOf, caller: Reader) -> Response:
 
 @router.get("/v1/models", tags=["models"], responses=documented())
 def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
+    """The head models that a job may name."""
     from pipeline.eigenheads.model_names import list_models, model_path
 
     default = model_path("default").resolve()
@@ -69,12 +79,14 @@ def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
 
 @router.post("/v1/keys", status_code=201, tags=["access"], responses=documented(400, 413, 415, 507))
 def add_key(service: ServiceOf, caller: Admin, wanted: NewKey) -> NewKeyOut:
+    """Makes an API key, which is shown this once."""
     key = service.keys.add(wanted.name, tuple(wanted.scopes))
     return NewKeyOut(id=key.split("_")[1], key=key)
 
 
 @router.get("/v1/keys", tags=["access"], responses=documented())
 def list_keys(service: ServiceOf, caller: Admin) -> KeyList:
+    """The API keys, without their secrets."""
     return KeyList(keys=[KeyOut(id=key.id, name=key.name, scopes=list(key.scopes)) for key in service.keys.all()])
 
 
@@ -94,9 +106,11 @@ def add_webhook(service: ServiceOf, caller: Admin, wanted: NewWebhook) -> NewWeb
 
 @router.get("/v1/webhooks", tags=["webhooks"], responses=documented())
 def list_webhooks(service: ServiceOf, caller: Admin) -> WebhookList:
+    """The addresses that are told when a job ends."""
     return WebhookList(webhooks=[WebhookOut.model_validate(hook) for hook in service.webhooks.all()])
 
 
 @router.delete("/v1/webhooks/{webhook_id}", status_code=204, tags=["webhooks"], responses=documented(404))
 def remove_webhook(service: ServiceOf, caller: Admin, webhook_id: str) -> None:
+    """Tells that address no more."""
     service.webhooks.remove(webhook_id)

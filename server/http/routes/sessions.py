@@ -16,6 +16,7 @@ Taker = Annotated[Caller, Depends(require("capture"))]
 
 @router.post("/sessions", status_code=201, responses=documented(400, 413, 415, 507))
 def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response: Response) -> SessionOut:
+    """Begins a session of one subject."""
     made = service.sessions.add(wanted.label, wanted.consent)
     response.headers["Location"] = f"/v1/sessions/{made.id}"
     return SessionOut.model_validate(made)
@@ -29,6 +30,7 @@ def list_sessions(service: ServiceOf, caller: Reader) -> SessionList:
 
 @router.get("/sessions/{session_id}", responses=documented(404))
 def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionOut:
+    """A session with the ids of its captures."""
     return SessionOut.model_validate(service.sessions.get(session_id))
 
 

@@ -32,6 +32,7 @@ COMMON = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
 @router.options("", status_code=204, responses=documented())
 def tus_options(service: ServiceOf) -> Response:
+    """What this server of resumable uploads can do."""
     headers = {
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,termination,checksum,expiration",

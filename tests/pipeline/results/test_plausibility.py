@@ -72,5 +72,5 @@ def test_every_code_of_a_warning_is_listed_and_documented():
                 first = node.args[0]
                 used |= {first.value} if isinstance(first, ast.Constant) else {"view", "view-left-out"}
     assert used <= set(WARNING_CODES)
-    documented = (Path(__file__).parents[3] / "docs" / "results.md").read_text(encoding="utf-8")
+    documented = (Path(__file__).parents[3] / "docs" / "operator.md").read_text(encoding="utf-8")
     assert all(f"`{code}`" in documented for code in WARNING_CODES)

@@ -67,7 +67,10 @@ def test_it_shows_where_data_models_and_keys_live(
 ) -> None:
     monkeypatch.delenv("EIGENHEAD_MODELS", raising=False)
     monkeypatch.setenv("EIGENHEAD_DATA", str(tmp_path))
+    monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path / "cache"))
     found = examine()
+    assert found["cache"]["detail"].startswith(str(tmp_path / "cache"))
+    assert not (tmp_path / "cache").exists()
     assert found["data"]["detail"].startswith(str(tmp_path))
     assert found["models"]["detail"].startswith(str(tmp_path / "models"))
     assert found["database"]["detail"].startswith(str(tmp_path / "eigenhead.sqlite"))

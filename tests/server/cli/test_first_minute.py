@@ -1,15 +1,19 @@
 """What a new user meets first: one rule for data and keys, clear refusals before the work, nothing overwritten."""
 
 import json
+import os
 import socket
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from pipeline.eigenheads.data_folder import data_folder, models_folder
+from rig.studio.sensor.faults import KINDS
 from server.cli.main import main
 from tests.server.cli.test_main import run as run_apart
 from tests.support.services import small_capture
@@ -73,6 +77,38 @@ def test_models_lie_in_the_data_folder_that_is_named(run: Run, tmp_path: Path) -
     found = json.loads(run("model", "list", "--data", tmp_path / "heads", "--json").out)["models"]
     assert found["mine"] == str(tmp_path / "heads" / "models" / "mine.npz")
     assert "mine" not in json.loads(run("model", "list", "--data", tmp_path / "others", "--json").out)["models"]
+
+
+def test_a_model_of_the_users_own_is_removed_and_no_other_file(run: Run, tmp_path: Path) -> None:
+    models = tmp_path / "heads" / "models"
+    models.mkdir(parents=True)
+    (models / "mine.npz").touch()
+    (tmp_path / "heads" / "other.npz").touch()
+    for name, word in (("default", "comes with the program"), ("nobody", "no head model"), ("../other", "no head")):
+        refused = run("model", "remove", name, "--data", tmp_path / "heads")
+        assert (refused.status, word in refused.err) == (1, True)
+    assert run("model", "remove", "mine", "--data", tmp_path / "heads").status == 0
+    assert sorted(path.name for path in (tmp_path / "heads").rglob("*")) == ["models", "other.npz"]
+
+
+@pytest.mark.parametrize("group", [[], ["keys"], ["rig"], ["model"]])
+def test_no_summary_of_a_command_is_cut_off(run: Run, group: list[str]) -> None:
+    listed = run(*group, "--help").out.partition("Commands:")[2]
+    assert listed.strip()
+    assert "..." not in listed
+
+
+def test_help_names_every_fault(run: Run) -> None:
+    told = " ".join(run("simulate", "--help").out.split())
+    assert all(kind in told.replace("- ", "-") for kind in KINDS)
+
+
+def test_it_names_its_version_and_completes_words(run: Run) -> None:
+    assert run("--version").out == f"eigenhead {version('eigenhead')}\n"
+    words = {"_EIGENHEAD_COMPLETE": "complete_bash", "COMP_WORDS": "eigenhead mod", "COMP_CWORD": "1"}
+    command = [str(Path(sys.executable).with_name("eigenhead"))]
+    completed = subprocess.run(command, env=os.environ | words, capture_output=True, text=True, timeout=60, check=False)
+    assert completed.stdout.split() == ["model"]
 
 
 def test_serve_says_in_one_line_that_its_rig_file_is_missing(run: Run, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tests.support.services import ROOT, small_capture
 COMMANDS = [
     *("serve", "worker", "reconstruct", "simulate", "demo", "prepare", "doctor", "board", "calibrate"),
     *("keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
-    *("model list", "model info", "model import"),
+    *("model list", "model info", "model import", "model remove"),
 ]
 
 

@@ -8,6 +8,7 @@ import tarfile
 import time
 import zipfile
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import httpx
@@ -194,6 +195,12 @@ def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: byt
     assert all(word in told for word in ("'nobody' is not at hand", "metod", "fitting.modes")), told
 
 
+def test_a_session_without_captures_is_asked_as_much(http: httpx.Client) -> None:
+    session = http.post("/v1/sessions", json={}).json()["id"]
+    refused = http.post(f"/v1/sessions/{session}/jobs", json={"settings": {"detial": "fine"}})
+    assert (refused.status_code, "did you mean 'detail'" in refused.text) == (422, True)
+
+
 def test_a_job_says_that_nobody_serves_its_queue(http: httpx.Client, archive: bytes) -> None:
     capture = upload(http, archive).json()["id"]
     job = http.post("/v1/jobs", json={"capture_id": capture, "queue": "gpu"}).json()
@@ -230,6 +237,15 @@ def test_events_tell_progress_and_resume(http: httpx.Client, client: Client, arc
     with http.stream("GET", f"/v1/jobs/{job}/events", headers={"Last-Event-ID": "1"}) as response:
         ids = [line for line in response.iter_lines() if line.startswith("id:")]
     assert ids[0] == "id: 2"
+
+
+def test_a_stage_that_reports_nothing_still_moves(http: httpx.Client, client: Client, archive: bytes) -> None:
+    job = client.submit(upload(http, archive).json()["id"], settings={"front": "quiet"})["id"]
+    told = [document for _, document in client.events(job) if document.get("stage") == "depth"]
+    assert len(told) >= 3
+    shares = [document["progress"] for document in told]
+    assert all(0 <= earlier < later < earlier + 0.5 for earlier, later in pairwise(shares))
+    assert all(document["eta_s"] > 0 for document in told)
 
 
 @pytest.mark.parametrize("mode", ["long", "deaf"])
@@ -397,6 +413,11 @@ def test_health_metrics_models(http: httpx.Client) -> None:
     assert {"egl", "disk", "database", "rig", "worker"} <= set(ready.json()["checks"])
     assert "eigenhead_requests_total" in http.get("/metrics").text
     assert any(model["default"] for model in http.get("/v1/models").json()["models"])
+
+
+def test_the_page_of_the_api_is_there(http: httpx.Client) -> None:
+    assert "openapi.json" in http.get("/docs").text
+    assert http.get("/openapi.json").json()["paths"]["/v1/jobs"]["post"]["operationId"] == "submit_job"
 
 
 def test_a_tar_made_elsewhere_with_one_enclosing_folder_works(http: httpx.Client, tmp_path: Path) -> None:

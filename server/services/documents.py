@@ -1,6 +1,6 @@
-"""Documents of the service as the command line's client gets them."""
+"""Documents of the service as its clients get them: the command line's, and the pages' components."""
 
-from typing import NotRequired, TypedDict
+from typing import TypedDict
 
 
 class SizeDocument(TypedDict):
@@ -36,14 +36,16 @@ class FileDocument(TypedDict):
     sha256: str
 
 
-class JobDocument(TypedDict):
+class JobLine(TypedDict):
+    """A job without its files, as a list shows it."""
+
     id: str
     state: str
     stage: str
     progress: float
     eta_s: float | None
     error: ErrorDocument | None
-    notice: NotRequired[str | None]
+    notice: str | None
     capture_id: str | None
     session: str | None
     model: str | None
@@ -54,4 +56,9 @@ class JobDocument(TypedDict):
     created: str | None
     started: str | None
     finished: str | None
+
+
+class JobDocument(JobLine):
+    """A job with the files of its result, by name."""
+
     files: dict[str, FileDocument]

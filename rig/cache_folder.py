@@ -1,0 +1,14 @@
+"""Where this machine keeps what can be made again: compiled loops, arrays of models, how long stages take."""
+
+import os
+from pathlib import Path
+
+CACHE = "EIGENHEAD_CACHE"
+
+
+def cache_folder() -> Path:
+    """EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. It need not exist."""
+    given = os.environ.get(CACHE)
+    if given:
+        return Path(given)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eigenhead"

@@ -1,0 +1,83 @@
+"""The service's own description: names that generators of clients use, the pipeline's settings by type, files as bytes,
+problems in place of the framework's errors."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.routing import APIRoute
+from pydantic import TypeAdapter
+
+from pipeline.diagnostics import WARNING_CODES
+from pipeline.settings import SPACING_RANGE_MM, Settings
+from server.storage.records import JsonObject
+from server.wire import problems
+
+SETTINGS = {"type": "object", "title": "Settings"}  # stands where a document of settings does, until all are named
+REFERENCE = "#/components/schemas/{model}"
+TEXTUAL = ("application/json", problems.MEDIA_TYPE, "text/")
+
+
+def operation_name(route: APIRoute) -> str:
+    """The operation's id: its function's name, which a client's method will have."""
+    return route.name
+
+
+def describe(app: FastAPI) -> None:
+    """Makes ``app.openapi`` the finished description."""
+    original = app.openapi
+
+    def openapi() -> JsonObject:
+        if app.openapi_schema is None:
+            document = original()
+            _name_problems(document)
+            _name_settings(document)
+            _mark_files(document)
+        return app.openapi_schema or {}
+
+    app.openapi = openapi
+
+
+def _responses(document: JsonObject) -> Iterator[tuple[str, dict[str, Any]]]:
+    for path in document["paths"].values():
+        for call in path.values():
+            yield from call.get("responses", {}).items()
+
+
+def _name_problems(document: JsonObject) -> None:
+    """Puts the problem document in place of the framework's own error."""
+    schemas = document.setdefault("components", {}).setdefault("schemas", {})
+    schemas["Problem"] = problems.PROBLEM_SCHEMA
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)
+    for status, answer in _responses(document):
+        if status[0] in "45" and problems.MEDIA_TYPE in answer.get("content", {}):
+            answer["content"] = {problems.MEDIA_TYPE: answer["content"][problems.MEDIA_TYPE]}
+
+
+def _name_settings(document: JsonObject) -> None:
+    """The pipeline's settings as schemas of their own; every key may be left out, and no other may be there."""
+    described = TypeAdapter(Settings).json_schema(ref_template=REFERENCE)
+    named = described.pop("$defs") | {"Settings": described}
+    for schema in named.values():
+        schema["additionalProperties"] = False
+    named["Settings"]["properties"]["fail_on"]["items"] = {"type": "string", "enum": list(WARNING_CODES)}
+    least, most = SPACING_RANGE_MM
+    named["BustSettings"]["properties"]["spacing_mm"] |= {"minimum": least, "maximum": most}
+    _replace(document, SETTINGS, {"$ref": REFERENCE.format(model="Settings")})
+    document["components"]["schemas"] |= named
+
+
+def _replace(node: Any, old: JsonObject, new: JsonObject) -> None:
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ():
+        if isinstance(value, dict) and old.items() <= value.items():
+            node[key] = {**{k: v for k, v in value.items() if k not in old}, **new}
+        else:
+            _replace(value, old, new)
+
+
+def _mark_files(document: JsonObject) -> None:
+    for _, answer in _responses(document):
+        for media, content in answer.get("content", {}).items():
+            if not media.startswith(TEXTUAL):
+                content["schema"] = {"type": "string", "format": "binary"}

@@ -1,0 +1,99 @@
+"""How long each stage of a reconstruction takes on this machine: learnt from every job, by what the job makes.
+
+The service's workers and the command line learn into one file, ``cache_folder()/durations.json``. The first job of a
+kind goes by ``FIRST_S``.
+"""
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from pipeline.settings import Settings
+from rig.atomic_write import write_atomically
+from rig.cache_folder import cache_folder
+
+FIRST_S = {
+    "read": 0.4,
+    "segmentation": 4.3,
+    "alignment": 0.6,
+    "fit": 3.7,
+    "parts": 2.1,
+    "fit again": 7.1,
+    "depth": 40.0,
+    "fine": 9.0,
+    "texture": 1.4,
+    "bust": 24.0,
+    "atlas": 62.0,
+    "evidence": 0.8,
+    "write": 3.0,
+}
+"""Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine --atlas` on two cores that four
+other processes share. On idle ones all are three to four times shorter, which a job's own pace soon tells."""
+SIMPLEX_S = 200.0  # of the simplex's fit, at the same pace: a minute on idle cores
+LEARNING = 0.3  # weight of the newest job; the first one of its kind counts alone
+LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
+
+PHOTO_DETAIL = (None, "photo", "fine")
+
+
+def kind_of(settings: Settings) -> str:
+    """What decides which stages a job has and how long they are: "contour photo both", say."""
+    atlas = " atlas" if settings.outputs.atlas else ""
+    return f"{settings.method} {settings.detail or 'photo'} {settings.outputs.surface}{atlas}"
+
+
+def first_guess(settings: Settings) -> dict[str, float]:
+    """Seconds of the stages that a job with these settings has, before one was seen."""
+    photographs = settings.method == "contour" and settings.detail in PHOTO_DETAIL
+    fine, bust = photographs and settings.detail == "fine", settings.outputs.surface != "head"
+    parts = settings.detail in PHOTO_DETAIL or bust
+    left_out = {
+        "parts": not parts,
+        "fit again": not parts,
+        "depth": not (fine or bust),
+        "fine": not fine,
+        "bust": not bust,
+        "atlas": not settings.outputs.atlas,
+    }
+    seconds = {stage: took for stage, took in FIRST_S.items() if not left_out.get(stage)}
+    if settings.method == "simplex":
+        seconds["fit"] = SIMPLEX_S
+    if parts and not photographs:
+        seconds["fit again"] = 0.0
+    return seconds
+
+
+class StageDurations:
+    """Seconds that each stage is expected to take. ``file`` need not exist; where it cannot be written, only this
+    process learns."""
+
+    def __init__(self, file: Path | None = None) -> None:
+        self._file = file or cache_folder() / "durations.json"
+        self._learnt: dict[str, dict[str, float]] = {}
+
+    def of(self, settings: Settings) -> dict[str, float]:
+        """Seconds by stage, in their order."""
+        known = self._read().get(kind_of(settings), {})
+        return {stage: known.get(stage, seconds) for stage, seconds in first_guess(settings).items()}
+
+    def learn(self, settings: Settings, seconds: Mapping[str, float]) -> None:
+        """Takes in how long the stages of a job took."""
+        learnt, before = self._read(), self.of(settings)
+        weight = LEARNING if kind_of(settings) in learnt else 1.0
+        mixed = {stage: (1 - weight) * before[stage] + weight * seconds[stage] for stage in before if stage in seconds}
+        learnt[kind_of(settings)] = {stage: round(took, 3) for stage, took in (before | mixed).items()}
+        self._learnt = learnt
+        with suppress(OSError):
+            write_atomically(self._file, json.dumps(learnt, indent=1).encode())
+
+    def _read(self) -> dict[str, dict[str, float]]:
+        """What the file says, and where there is none, what this process has learnt."""
+        try:
+            document = json.loads(self._file.read_bytes())
+            return {
+                str(kind): {stage: float(stages[stage]) for stage in FIRST_S if 0 <= stages.get(stage, -1) <= LONGEST_S}
+                for kind, stages in document.items()
+            }
+        except (OSError, ValueError, TypeError, AttributeError):
+            return dict(self._learnt)

@@ -1,0 +1,56 @@
+"""How long stages take: what settings make, what is learnt, and who finds it."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.settings import Settings, settings_from_document
+from server.tasks.stage_durations import FIRST_S, LEARNING, StageDurations, first_guess, kind_of
+
+
+@pytest.mark.parametrize(
+    ("document", "extra", "missing"),
+    [
+        ({}, {"parts", "depth", "bust"}, {"fine", "atlas"}),
+        ({"detail": "fine"}, {"fine"}, {"atlas"}),
+        ({"outputs": {"atlas": True}}, {"atlas"}, {"fine"}),
+        ({"detail": "span", "outputs": {"surface": "head"}}, set(), {"parts", "depth", "fine", "bust", "atlas"}),
+        ({"detail": "span"}, {"parts", "depth", "bust"}, {"fine"}),
+    ],
+)
+def test_the_settings_decide_which_stages_come(document: dict[str, object], extra: set[str], missing: set[str]) -> None:
+    stages = first_guess(settings_from_document(document))
+    assert extra <= stages.keys()
+    assert not missing & stages.keys()
+    assert [stage for stage in FIRST_S if stage in stages] == list(stages)
+
+
+def test_what_one_process_learns_every_other_finds(tmp_path: Path) -> None:
+    file, settings = tmp_path / "cache" / "durations.json", Settings()
+    before = StageDurations(file).of(settings)
+    StageDurations(file).learn(settings, {"depth": 14.0, "polish": 1.0})
+    after = StageDurations(file).of(settings)
+    assert after["depth"] == 14.0
+    assert after.keys() == before.keys()
+    assert {stage for stage in after if after[stage] != before[stage]} == {"depth"}
+    StageDurations(file).learn(settings, {"depth": 24.0})
+    assert StageDurations(file).of(settings)["depth"] == pytest.approx((1 - LEARNING) * 14.0 + LEARNING * 24.0)
+    span = settings_from_document({"detail": "span"})
+    assert kind_of(span) != kind_of(settings)
+    assert StageDurations(file).of(span) == first_guess(span)
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"contour photo both": 3}', '{"contour photo both": {"depth": "long"}}'])
+def test_a_damaged_file_is_no_harm(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "durations.json"
+    file.write_text(text)
+    assert StageDurations(file).of(Settings()) == first_guess(Settings())
+    StageDurations(file).learn(Settings(), {"depth": 14.0})
+    assert StageDurations(file).of(Settings())["depth"] == 14.0
+
+
+def test_where_nothing_can_be_written_this_process_still_learns(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    durations = StageDurations(tmp_path / "file" / "durations.json")
+    durations.learn(Settings(), {"depth": 14.0})
+    assert durations.of(Settings())["depth"] == 14.0

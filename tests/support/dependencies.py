@@ -1,0 +1,59 @@
+"""docs/dependencies.md from uv.lock, docs/dependencies.toml and the installed packages: `make dependencies`."""
+
+import tomllib
+from importlib.metadata import PackageNotFoundError, metadata
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE, REASONS = ROOT / "docs" / "dependencies.md", ROOT / "docs" / "dependencies.toml"
+LICENCE_MOST = 60  # characters; some packages give the whole text
+ABSENT = "not installed where this was written"
+HEAD = """# Dependencies
+
+`make dependencies` writes this page from `uv.lock`, `docs/dependencies.toml` and the licences that the installed
+packages state.
+
+| package | licence | why |
+|---|---|---|
+"""
+
+
+def locked() -> list[dict[str, Any]]:
+    """The packages of uv.lock, but for this project."""
+    packages = tomllib.loads((ROOT / "uv.lock").read_text(encoding="utf-8"))["package"]
+    return [package for package in packages if package["name"] != "eigenhead"]
+
+
+def reasons() -> dict[str, str]:
+    return tomllib.loads(REASONS.read_text(encoding="utf-8"))
+
+
+def licence(name: str) -> str:
+    """As the installed package states it."""
+    try:
+        told = metadata(name)
+    except PackageNotFoundError:
+        return ABSENT
+    classified = [c.rpartition(" :: ")[2] for c in told.get_all("Classifier") or [] if c.startswith("License :: ")]
+    stated = {field: text for field in ("License-Expression", "License") for text in told.get_all(field) or []}
+    given = [stated.get("License-Expression"), " or ".join(dict.fromkeys(classified)), stated.get("License")]
+    return next((" ".join(text.split()) for text in given if text and len(text) <= LICENCE_MOST), "see its files")
+
+
+def page() -> str:
+    packages, why = locked(), reasons()
+    needed_by: dict[str, list[str]] = {}
+    for package in packages:
+        for needed in package.get("dependencies", []):
+            needed_by.setdefault(needed["name"], []).append(package["name"])
+    rows = []
+    for name in sorted({package["name"] for package in packages}):
+        others = sorted(set(needed_by.get(name, [])))
+        told = why.get(name) or "for " + ", ".join(others[:4]) + (" and others" if len(others) > 4 else "")
+        rows.append(f"| {name} | {licence(name)} | {told} |\n")
+    return HEAD + "".join(rows)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

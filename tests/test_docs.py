@@ -1,0 +1,203 @@
+"""The documents: links and anchors lead somewhere, formats fit their schemas, what they tell to type works."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import numpy as np
+import pytest
+
+from rig.camera import Camera, Intrinsics
+from rig.errors import InputError
+from rig.formats.cameras_json import document_from_rig, rig_from_document
+from rig.formats.features_json import document_from_features, features_from_document
+from rig.geometry import RigidTransform
+from rig.rig import Rig
+from server.cli.doctor import OTHER_VARIABLES
+from server.settings import PREFIX, ServiceSettings
+from server.storage.store import FOLDERS
+from tests.support.report_schema import report_schema
+from tests.support.services import ROOT, running_service, small_capture
+
+DOCS = ROOT / "docs"
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.glob("*.md"))]
+LINK = re.compile(r"(?<!!)\[[^\]]+\]\(([^)\s]+)\)")
+CAN_BE_MADE_AGAIN = {"cache", "incoming", "uploads", "trash", "set-aside"}
+
+
+def prose(page: Path) -> str:
+    return re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """As the usual renderers of Markdown make them of headings."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
+    for link in LINK.findall(prose(page)):
+        if link.startswith(("http://", "https://")):
+            continue
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file).resolve() if file else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_path_that_is_named_is_there(page: Path) -> None:
+    rooms = r"(?:rig|pipeline|calibration|server|tests|deploy|docs)"
+    named = set(re.findall(rf"`({rooms}/[\w./-]+\.\w+)`|\b(docs/\w+\.md)", prose(page)))
+    gone = {path for pair in named for path in pair if path and not (ROOT / path).exists()}
+    assert gone <= {"rig/cameras.json"}  # of the data folder
+
+
+def test_every_page_is_reached_from_the_quick_start_or_the_readme() -> None:
+    linked = {Path(link.partition("#")[0]).name for page in PAGES for link in LINK.findall(prose(page))}
+    assert {page.name for page in DOCS.glob("*.md")} - linked == {"trigger-protocol.md"}  # by the rig's page, as a path
+
+
+def test_every_variable_that_is_named_is_read() -> None:
+    known = {PREFIX + name.upper() for name in ServiceSettings.model_fields} | OTHER_VARIABLES
+    of_tests = {"EIGENHEAD_SCREENSHOTS", "EIGENHEAD_CHROMIUM"}
+    named = {name for page in PAGES for name in re.findall(r"EIGENHEAD_[A-Z_]*[A-Z]", page.read_text(encoding="utf-8"))}
+    assert named - known <= of_tests
+    assert len(named & known) > 15
+
+
+def test_the_readmes_figures_are_those_of_the_results() -> None:
+    table = prose(ROOT / "README.md").partition("## Results")[2].partition("\n## ")[0]
+    pairs = re.findall(r"\| ([\d.]+) \| ([\d.]+) \|$", table, re.MULTILINE)
+    measured = prose(DOCS / "results.md").replace("*", "")
+    assert len(pairs) == 8
+    assert [pair for pair in pairs if " / ".join(pair) not in measured] == []
+
+
+def schema(name: str) -> Any:
+    return jsonschema_rs.validator_for(json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text()))
+
+
+@pytest.fixture
+def rig() -> Rig:
+    pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, 1200.0]))
+    lens = Intrinsics(1024, 768, 1500.0, 1500.0, 511.5, 383.5)
+    return Rig(tuple(Camera(f"cam{i:02}", lens, pose, np.eye(6) * 1e-6) for i in range(3)))
+
+
+def test_what_is_written_fits_its_schema(rig: Rig) -> None:
+    schema("cameras").validate(json.loads(json.dumps(document_from_rig(rig))))
+    schema("features").validate(document_from_features({"pronasale": {"cam00": np.array([511.2, 402.7])}}))
+    blocks = re.findall(r"```json\n(.*?)```", (DOCS / "capture-format.md").read_text(encoding="utf-8"), re.DOTALL)
+    cameras, features = (json.loads(block) for block in blocks)
+    schema("cameras").validate(cameras | {"cameras": cameras["cameras"] * 3})
+    schema("features").validate(features)
+
+
+SPOILT: list[tuple[tuple[str | int, ...], Any]] = [
+    (("format",), "eigenhead-cameras/2"),
+    (("unit",), "m"),
+    (("cameras",), []),
+    (("cameras", 0, "name"), "../up"),
+    (("cameras", 0, "name"), ".hidden"),
+    (("cameras", 0, "width"), 3),
+    (("cameras", 0, "height"), "768"),
+    (("cameras", 0, "intrinsics", "fx"), 0),
+    (("cameras", 0, "intrinsics"), None),
+    (("cameras", 0, "distortion", "model"), "fisheye"),
+    (("cameras", 0, "distortion", "k1"), "0"),
+    (("cameras", 0, "camera_from_world", "rotation"), [[1, 0], [0, 1]]),
+    (("cameras", 0, "camera_from_world", "translation"), [0, 0]),
+    (("cameras", 0, "covariance"), [[1]]),
+]
+
+
+@pytest.mark.parametrize(("place", "value"), SPOILT, ids=lambda entry: str(entry)[:60])
+def test_reader_and_schema_refuse_the_same_cameras(rig: Rig, place: tuple[str | int, ...], value: Any) -> None:
+    document = json.loads(json.dumps(document_from_rig(rig)))
+    assert schema("cameras").is_valid(document)
+    node = document
+    for key in place[:-1]:
+        node = node[key]
+    node[place[-1]] = value
+    assert not schema("cameras").is_valid(document)
+    with pytest.raises(InputError):
+        rig_from_document(document)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"points": {}},
+        {"format": "eigenhead-features/1", "points": []},
+        {"format": "eigenhead-features/1", "points": {"pronasale": [1, 2]}},
+        {"format": "eigenhead-features/1", "points": {"pronasale": {"cam00": [1]}}},
+        {"format": "eigenhead-features/1", "points": {"pronasale": {"cam00": ["1", "2"]}}},
+    ],
+)
+def test_reader_and_schema_refuse_the_same_features(rig: Rig, document: Any) -> None:
+    faults: list[str] = []
+    features_from_document(document, rig, faults)
+    assert faults
+    assert not schema("features").is_valid(document)
+
+
+def test_the_reports_schema_is_that_of_its_type() -> None:
+    """`.venv/bin/python -m tests.support.report_schema` writes it anew."""
+    kept = json.loads((DOCS / "schemas" / "report.schema.json").read_text())
+    assert kept == report_schema()
+
+
+def block(name: str) -> str:
+    text = (DOCS / "service.md").read_text(encoding="utf-8")
+    (code,) = re.findall(rf"```sh {name}\n(.*?)```", text, re.DOTALL)
+    return code
+
+
+def test_the_backup_names_every_folder_that_cannot_be_made_again() -> None:
+    (named,) = re.findall(r"for folder in (.*);", block("backup"))
+    assert set(FOLDERS) - CAN_BE_MADE_AGAIN <= set(named.split())
+    assert {"models", "console"} <= set(named.split())
+
+
+@pytest.fixture
+def shell(tmp_path: Path) -> Callable[..., str]:
+    if shutil.which("curl") is None:
+        pytest.skip("curl is not installed (apt-get install curl)")
+
+    def run(code: str, **variables: str) -> str:
+        environment = os.environ | variables | {"no_proxy": "127.0.0.1"}
+        command = ["bash", "-euo", "pipefail", "-c", code]
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+@pytest.mark.slow
+def test_the_walk_with_curl_and_a_backup_elsewhere(shell: Callable[..., str], tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "anna.tar", "w") as archive:
+        archive.add(small_capture(tmp_path / "capture"), ".")
+    data, copy = tmp_path / "data", tmp_path / "copy"
+    key = shell(f"cd {ROOT} && .venv/bin/eigenhead keys add lab --data {data}").strip()
+    with running_service(data) as service:
+        shell("until curl -fsS $URL/readyz; do sleep 0.5; done", URL=service.url)
+        told = shell(block("walk-through"), URL=service.url, KEY=key)
+        assert "event: end" in told
+        shell(block("backup"), DATA=str(data), BACKUP=str(copy))
+    with running_service(copy) as restored:
+        (job,) = (folder.name for folder in (copy / "jobs").iterdir())
+        fetch = f'curl -fsS -H "Authorization: Bearer $KEY" -o again.ply "$URL/v1/jobs/{job}/result/head.ply"'
+        shell(fetch, URL=restored.url, KEY=key)
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "anna" / "head.ply").read_bytes()
