@@ -1,1 +1,1 @@
-"""Is a result right, and does it repeat? Meshes and landmarks in, judgements out; how heads are made is not known here."""
+"""Is a result right, and does it repeat? Meshes and landmarks enter, judgements leave, whoever made the heads."""
