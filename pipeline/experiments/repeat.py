@@ -1,8 +1,9 @@
 """Does a shot repeat? One studio subject, the same skin, hair and set each time, shot ten times:
 
-- ``noise``: it holds still; sensor noise, light drift and clicks are other ones;
+- ``noise``: it holds still; sensor noise and light drift are other ones;
 - ``reposed``: it sits down anew as a subject of the studio does, and lamps are moved and dimmed;
-- ``drift``: the same shots by cameras that have wandered from their calibration, farther with each shot.
+- ``drift``: the same shots by cameras that have wandered from their calibration, farther with each shot;
+- ``clicked``: as ``noise``, with the feature points that an operator clicks anew in each shot. The others have none.
 
 Each shot is reconstructed from its photographs; the heads are laid on each other rigidly over the face
 (``pipeline.verification.repeatability``). Beside the scatter: the deviation that the results state, and the error that
@@ -30,6 +31,7 @@ from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
 from pipeline.verification import repeatability
 from pipeline.verification.repeatability import scatter
+from rig.capture import Capture
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
@@ -44,7 +46,8 @@ SEED = 17
 DRIFT_PX = 0.05  # a shot, of each camera; after ten shots 0.16, near the 0.2 px that an unstated rig is trusted to
 LAMP_SHIFT = 0.15  # of ``Lamp.towards``: some 8 degrees
 LAMP_DIMMING = 0.1  # standard deviation of log brightness, of each lamp by itself
-CONDITIONS = ("noise", "reposed", "drift")
+CONDITIONS = ("noise", "reposed", "drift", "clicked")
+STILL = ("noise", "clicked")
 
 Report = Callable[[str, float], None]
 
@@ -57,6 +60,7 @@ class Shot:
     stated_mm: Float[np.ndarray, " v"]
     truth: Mesh  # world frame
     photographed: Bool[np.ndarray, " v"]  # of the truth: seen by a camera, not under hair
+    warnings: frozenset[str]  # codes
 
 
 def repeat(
@@ -72,15 +76,16 @@ def repeat(
         compute = partial(_row, model, condition, max(2, subjects), renderer, told)
         rows.append({"condition": condition} | records.row(condition, compute))
     figures = {f"{row['condition']}_{name}": row[name] for row in rows for name in row if name != "condition"}
-    columns = ("rms_mm", "seen_rms_mm", "normal_rms_mm", "stated_mm", "scatter_over_stated", "repeated_mm")
+    columns = ("rms_mm", "median_mm", "seen_rms_mm", "normal_rms_mm", "stated_mm", "stated_median_mm", "repeated_mm")
     header = (
         "shots differ by",
         "RMS, mm",
+        "median",
         "seen skin",
         "along the normal",
         "stated",
-        "scatter / stated",
-        "error of all",
+        "median",
+        "repeated error",
     )
     table = [[row["condition"], *(row[column] for column in columns)] for row in rows]
     return {"figures": figures, "rows": rows, "markdown": markdown.table(header, table)}
@@ -94,7 +99,9 @@ def _row(model: HeadModel, condition: str, count: int, renderer: Renderer, repor
     shots = []
     for i, (scene, rng) in enumerate(scenes(model, condition, count, renderer)):
         report(f"shot {i + 1}", i / count)
-        shots.append(reconstructed(scene, model, rng, renderer))
+        capture = shoot(scene, rng)
+        capture = capture if condition == "clicked" else replace(capture, features={})
+        shots.append(reconstructed(scene, capture, model, renderer))
     return judged(model, shots)
 
 
@@ -113,7 +120,7 @@ def scenes(
     calibrated, kept = rig, None
     for i in range(count):
         light_rng, pose_rng, drift_rng, shot_rng = np.random.default_rng([SEED, i]).spawn(4)
-        if kept is None or condition != "noise":
+        if kept is None or condition not in STILL:
             pose = random_pose(rig.centre_world(), PRESET.pose_spread_deg, PRESET.pose_spread_mm, pose_rng)
             given = (subject, rig, PRESET, np.random.default_rng(SEED))
             kept = build_scene(*given, renderer=renderer, look=look, world_from_head=pose, lamps=moved(light_rng))
@@ -131,11 +138,11 @@ def moved(rng: np.random.Generator) -> tuple[Lamp, ...]:
     return tuple(lamps)
 
 
-def reconstructed(scene: Scene, model: HeadModel, rng: np.random.Generator, renderer: Renderer) -> Shot:
+def reconstructed(scene: Scene, capture: Capture, model: HeadModel, renderer: Renderer) -> Shot:
     settings = Settings(outputs=OutputSettings(surface="head"))
-    capture = shoot(scene, rng)
     done = reconstruct(capture, scene.rig, model, settings, renderer=renderer, report=lambda stage, fraction: None)
-    return Shot(done.mesh_world.vertices, done.quality_mm, scene.head, scene.photographed)
+    codes = frozenset(warning.code for warning in done.warnings)
+    return Shot(done.mesh_world.vertices, done.quality_mm, scene.head, scene.photographed, codes)
 
 
 def judged(model: HeadModel, shots: list[Shot]) -> Row:
@@ -150,5 +157,7 @@ def judged(model: HeadModel, shots: list[Shot]) -> Row:
     true = shots[0].truth
     place = rigid_fit(found.mean[face], true.vertices[face])
     distances = SurfaceIndex(true.vertices, true.faces, 1.0).closest(place.apply(found.mean[face])).distances
+    row["warned"] = sum(bool(shot.warnings) for shot in shots)
+    row["camera_moved"] = sum("camera-moved" in shot.warnings for shot in shots)
     row["repeated_mm"] = float(np.sqrt(np.average(distances**2, weights=areas[face])))
     return row

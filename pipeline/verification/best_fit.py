@@ -31,8 +31,8 @@ TURN_MM = 30.0  # distance that a difference of one between unit normals counts 
 FEW = 300  # of these points, for telling starts apart
 LEAST_MARKS = 3
 LEAST_TOLD = 0.3  # share of the face that must not lie at the scan's rim
-STEPS = 50
-STILL_MM = 1e-5  # a step whose points move by less is the last
+STEPS = 30
+STILL_MM = 3e-4  # a step whose points move by less is the last
 NOT_THIS_MM = 5.0  # RMS over the face after the best fit: beyond any fault of a rig, and near any two heads' difference
 
 

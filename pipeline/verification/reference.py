@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.eigenheads.correspondence.closest import Hits, SurfaceIndex
-from pipeline.eigenheads.correspondence.scans import LANDMARK_SUFFIXES, read_landmarks, welded
+from pipeline.eigenheads.correspondence.scans import landmark_file, read_landmarks, welded
 from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh, boundary_edges
@@ -23,7 +23,7 @@ LEAST_TRIANGLES = 1000  # of a head; scan_checks asks the same of scans
 SIZE_MM = (150.0, 1500.0)  # diagonal: from a bare face to a life-size figure down to the waist
 OFF_SURFACE_MM = 5.0  # a landmark marked on this mesh lies on it; the rest is the marking program's rounding
 TURNED_EDGES = 0.002  # share of edges whose triangles face opposite ways: more is no scan's noise
-SPACING_MM = 1.0  # of the samples by which closest points are found
+SPACING_MM = 2.0  # of the samples by which closest points are found
 ON_EDGE = 1e-9  # a corner's share of a closest point that lies on the edge across it
 
 
@@ -65,7 +65,7 @@ def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
     Raises InputError naming every fault.
     """
     vertices, faces = welded(read_mesh(path))
-    given = landmarks or next((p for p in map(path.with_suffix, LANDMARK_SUFFIXES) if p.is_file()), None)
+    given = landmarks or landmark_file(path)
     marks = {} if given is None else read_landmarks(given)
     return Reference.of(Mesh(vertices, faces), marks, path.name, hashlib.sha256(path.read_bytes()).hexdigest())
 

@@ -40,9 +40,12 @@ class Scatter:
         varied = min(float(np.ptp(values)) for values in (normal, stated)) > 0
         return {
             "rms_mm": rms,
+            "median_mm": float(np.median(position)),
             "p95_mm": float(np.percentile(position, 95)),
             "normal_rms_mm": along,
+            "normal_median_mm": float(np.median(normal)),
             "stated_mm": said,
+            "stated_median_mm": float(np.median(stated)),
             "scatter_over_stated": along / said if said else 0.0,
             "rank_correlation": float(np.corrcoef(rankdata(normal), rankdata(stated))[0, 1]) if varied else 0.0,
         }

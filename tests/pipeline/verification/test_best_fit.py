@@ -26,9 +26,9 @@ def test_landmarks_start_it_and_the_surface_ends_it() -> None:
     truth = SOMEWHERE @ WORLD_FROM_HEAD.inverse()
     assert fit.start == "landmarks"
     assert fit.rms_mm < 1e-3
-    assert fit.scale == pytest.approx(1.0, abs=1e-5)
-    np.testing.assert_allclose(fit.reference_from_world.rotation, truth.rotation, atol=1e-5)
-    np.testing.assert_allclose(fit.reference_from_world.translation, truth.translation, atol=1e-2)
+    assert fit.scale == pytest.approx(1.0, abs=3e-5)
+    np.testing.assert_allclose(fit.reference_from_world.rotation, truth.rotation, atol=3e-5)
+    np.testing.assert_allclose(fit.reference_from_world.translation, truth.translation, atol=3e-2)
 
 
 def test_a_search_finds_it_without_landmarks_on_a_pedestal() -> None:
@@ -43,12 +43,16 @@ def test_a_search_finds_it_without_landmarks_on_a_pedestal() -> None:
 
 def test_a_size_is_reported_and_takes_no_part() -> None:
     """The reference is 1 % larger: the head is 1 / 1.01 of it, and what no motion takes away is left."""
-    fit = best_fit(measured_head(), Reference.of(elsewhere(1.01), {}))
-    assert fit.scale == pytest.approx(1 / 1.01, abs=1e-5)
+    larger = {name: SOMEWHERE.apply(1.01 * point) for name, point in marks().items()}
+    fit = best_fit(measured_head(), Reference.of(elsewhere(1.01), larger))
+    assert fit.scale == pytest.approx(1 / 1.01, abs=3e-5)
     assert 0.2 < fit.rms_mm < 1.0
 
 
 def test_another_object_is_refused() -> None:
     ball = ellipsoid(4)
-    with pytest.raises(InputError, match="is no scan of the head in shot"):
-        best_fit(measured_head(), Reference.of(ball, {}, "ball.ply"))
+    poles = ball.vertices[np.argsort(ball.vertices[:, 1])[[0, 600, 1200]]]
+    names: tuple[str, ...] = ("gnathion", "pronasale", "glabella")
+    named = dict(zip(names, poles, strict=True))
+    with pytest.raises(InputError, match=r"ball\.ply: is no scan of the head in shot"):
+        best_fit(measured_head(), Reference.of(ball, named, "ball.ply"))

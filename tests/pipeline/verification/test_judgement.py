@@ -13,6 +13,8 @@ from rig.mesh import Mesh
 from tests.support.measured_heads import mannequin, marks, measured_head
 
 SCAN = Reference.of(mannequin(), marks(), "scan.ply")
+SHIFT_MM = np.array([3.0, -40.0, 8.0])
+SHIFTED = {name: point + SHIFT_MM for name, point in marks().items()}
 
 
 def bumped(height_mm: float, radius_mm: float = 12.0) -> np.ndarray:
@@ -49,7 +51,7 @@ def test_a_reference_one_percent_larger_is_a_size_error_and_fails() -> None:
 
 
 def test_a_shift_is_no_error() -> None:
-    shifted = Reference.of(replace(mannequin(), vertices=mannequin().vertices + (3.0, -40.0, 8.0)), {})
+    shifted = Reference.of(replace(mannequin(), vertices=mannequin().vertices + SHIFT_MM), SHIFTED)
     assert judge_one(measured_head(), shifted).regions["face"].p95_mm < 1e-2
 
 
@@ -79,7 +81,8 @@ def test_what_every_capture_repeats_is_told_from_what_scatters() -> None:
 
 def test_half_a_scan_covers_half_a_face() -> None:
     kept = mannequin().vertices[mannequin().faces].mean(axis=1)[:, 0] > -5.0
-    half = Reference.of(Mesh(mannequin().vertices, mannequin().faces[kept]), {})
+    left = {name: marks()[name] for name in ("pronasale", "cheilion_left", "exocanthion_left")}
+    half = Reference.of(Mesh(mannequin().vertices, mannequin().faces[kept]), left)
     found = judge([measured_head()], half, Limits())
     covered = found.captures[0].regions["face"].covered
     assert 0.4 < covered < 0.7
@@ -89,7 +92,7 @@ def test_half_a_scan_covers_half_a_face() -> None:
 
 
 def test_a_scan_that_faces_inwards_is_named() -> None:
-    inside_out = Reference.of(Mesh(mannequin().vertices, mannequin().faces[:, ::-1].copy()), {}, "scan.obj")
+    inside_out = Reference.of(Mesh(mannequin().vertices, mannequin().faces[:, ::-1].copy()), marks(), "scan.obj")
     with pytest.raises(InputError, match=r"scan\.obj: faces inwards"):
         judge_one(measured_head(), inside_out)
 
