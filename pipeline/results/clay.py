@@ -26,6 +26,7 @@ def clay(
     panel: tuple[int, int] = PANEL,
     box: Box | None = None,
     paper: tuple[int, int, int] = PAPER,
+    darkest: float = DARKEST,
 ) -> Resized:
     """A mesh (head frame, mm) seen from ``azimuth_deg`` towards its left, twice supersampled; ``panel`` is width and
     height in pixels. ``box``: the corners of what fills the panel, so that several meshes are shown at one scale."""
@@ -37,12 +38,14 @@ def clay(
     focal = 0.5 * min(width * 1.25, height) * distance / (0.85 * radius)
     lens = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     camera = Camera("figure", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
-    drawn = picture(camera, mesh.vertices, mesh.faces, lit(mesh, colours), paper)
+    drawn = picture(camera, mesh.vertices, mesh.faces, lit(mesh, colours, darkest), paper)
     return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def lit(mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None) -> UInt8[np.ndarray, "v 3"]:
+def lit(
+    mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None, darkest: float = DARKEST
+) -> UInt8[np.ndarray, "v 3"]:
     """Colours (clay by default) as the lamp shows them."""
     cosine: Float[np.ndarray, " v"] = np.clip(mesh.normals() @ (LAMP / np.linalg.norm(LAMP)), 0.0, 1.0)
     base = SKIN if colours is None else colours.astype(float)
-    return np.clip(base * (DARKEST + (1.0 - DARKEST) * cosine[:, None]), 0, 255).astype(np.uint8)
+    return np.clip(base * (darkest + (1.0 - darkest) * cosine[:, None]), 0, 255).astype(np.uint8)

@@ -81,7 +81,8 @@ def certificate_pdf(report: VerificationReport, judgement: Judgement, pictures: 
 
 def _figures_page(pdf: _Page, report: VerificationReport, judgement: Judgement) -> None:
     pdf.line_of("Verification of a studio against a reference scan", size=16, bold=True)
-    verdict = "PASSED" if judgement.passed else "NOT PASSED"
+    open_ = sum(check.passed is None for check in judgement.checks)
+    verdict = ("PASSED" if judgement.passed else "NOT PASSED") + (f", {open_} figure(s) not judged" if open_ else "")
     pdf.line_of(verdict, size=14, bold=True, ink=GOOD if judgement.passed else BAD)
     scan, model = report["reference"], report["model"]
     pdf.line_of(f"{report['date']}   eigenhead {report['version']}   {len(report['captures'])} capture(s)")

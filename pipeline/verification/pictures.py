@@ -1,6 +1,7 @@
 """Pictures of a certificate: the reference and the result in clay, and the error on the result in colours."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,8 @@ from pipeline.verification.reference import Reference
 from rig.mesh import Mesh
 
 AZIMUTHS_DEG = (-50.0, 0.0, 50.0)
-PANEL = (420, 500)
+PANEL = (420, 460)
+HEAT_DARKEST = 0.7  # of a colour, so that shading leaves the scale readable
 PAPER = (255, 255, 255)
 UNTOLD = (190, 190, 190)  # grey: nothing is said there
 # Blue, white, red: ColorBrewer's RdBu (https://colorbrewer2.org), which the colour-blind can read.
@@ -43,11 +45,10 @@ def draw(first: Measured, reference: Reference, judgement: Judgement) -> Picture
     end_mm = scale_end(judgement.repeated_mm[first.regions["face"]])
     heat = heat_colours(judgement.repeated_mm, end_mm)
 
-    def views(mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None) -> tuple[Resized, ...]:
-        given = {"panel": PANEL, "box": box, "paper": PAPER}
-        return tuple(clay(mesh, colours=colours, azimuth_deg=azimuth, **given) for azimuth in AZIMUTHS_DEG)
+    def views(mesh: Mesh, **colour: Any) -> tuple[Resized, ...]:
+        return tuple(clay(mesh, azimuth_deg=of, panel=PANEL, box=box, paper=PAPER, **colour) for of in AZIMUTHS_DEG)
 
-    return Pictures(views(scan), views(own), views(own, heat), end_mm)
+    return Pictures(views(scan), views(own), views(own, colours=heat, darkest=HEAT_DARKEST), end_mm)
 
 
 def scale_end(deviation_mm: Float[np.ndarray, " n"]) -> float:

@@ -52,7 +52,6 @@ def test_a_size_is_reported_and_takes_no_part() -> None:
 def test_another_object_is_refused() -> None:
     ball = ellipsoid(4)
     poles = ball.vertices[np.argsort(ball.vertices[:, 1])[[0, 600, 1200]]]
-    names: tuple[str, ...] = ("gnathion", "pronasale", "glabella")
-    named = dict(zip(names, poles, strict=True))
+    named: dict[str, np.ndarray] = dict(zip(["gnathion", "pronasale", "glabella"], poles, strict=True))
     with pytest.raises(InputError, match=r"ball\.ply: is no scan of the head in shot"):
         best_fit(measured_head(), Reference.of(ball, named, "ball.ply"))
