@@ -23,7 +23,7 @@ FIGURES = {  # name of the limit: (words, digits, unit)
     "probing_form_mm": ("Probing error, form: range of the face's deviations", 2, "mm"),
     "size_error_percent": ("Probing error, size: scale against the reference", 3, "%"),
     "distance_mm": ("Distance error of the landmarks, RMS, worst capture", 2, "mm"),
-    "repeatability_mm": ("Repeatability: scatter of the face over the captures, RMS", 3, "mm"),
+    "repeatability_mm": ("Repeatability: scatter of the face along its normal, RMS", 3, "mm"),
     "least_covered": ("Share of the face that the reference covers (at least)", 3, ""),
 }
 NOTES = (
@@ -32,8 +32,9 @@ NOTES = (
     "reference, positive outside; places at the rim of the scan or farther than 10 mm are not judged.",
     f"Probing error, form: range of the deviations of {FORM_SHARE:.1%} of the face's area. Size: a best fit with a "
     "free scale, afterwards. Distance error: distances between anthropometric landmarks less those of the reference; "
-    "the placing of the landmarks on both is part of it. Repeatability: standard deviation of every vertex over the "
-    "captures, all three directions, after rigid alignment on each other. Stated: along the normal.",
+    "the placing of the landmarks on both is part of it. Scatter: standard deviation of every vertex over the captures "
+    "in all three directions, after rigid alignment on each other; by normal: its part across the surface, which is "
+    "the repeatability; stated: the deviation across the surface that the results state, shared errors included.",
     "After the kinds of figures of VDI/VDE 2634 part 3, with a mannequin in place of its spheres; this is no test by "
     "an accredited laboratory, and no uncertainty of the reference scan is taken off.",
 )
@@ -50,7 +51,7 @@ class _Page(FPDF):
     def line_of(self, text: str, *, size: float = 9, bold: bool = False, ink: tuple[int, int, int] = INK) -> None:
         self.set_font("Helvetica", style="B" if bold else "", size=size)
         self.set_text_color(*ink)
-        self.multi_cell(WIDTH_MM, LINE_MM * size / 9, latin(text), new_x="LMARGIN", new_y="NEXT")
+        self.multi_cell(WIDTH_MM, LINE_MM * size / 9, latin(text), align="L", new_x="LMARGIN", new_y="NEXT")
 
     def table_of(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], widths_mm: Sequence[float], inks: dict[int, tuple]
@@ -87,7 +88,8 @@ def _figures_page(pdf: _Page, report: VerificationReport, judgement: Judgement) 
     scan, model = report["reference"], report["model"]
     pdf.line_of(f"{report['date']}   eigenhead {report['version']}   {len(report['captures'])} capture(s)")
     pdf.line_of(f"Reference {scan['name']}: {scan['triangles']:,} triangles, {len(scan['landmarks'])} landmarks, "
-                f"sha256 {scan['sha256'][:16]}   Model {model['name']}, sha256 {model['sha256'][:16]}")  # fmt: skip
+                f"sha256 {scan['sha256'][:16]}")  # fmt: skip
+    pdf.line_of(f"Head model {model['name']}, sha256 {model['sha256'][:16]}")
     pdf.ln(2)
     pdf.line_of("Figures and limits", size=11, bold=True)
     rows = [_check_row(check) for check in judgement.checks]
@@ -110,12 +112,12 @@ def _regions_table(pdf: _Page, report: VerificationReport) -> None:
     rows = []
     for name, of in report["repeated"].items():
         scattered = report["repeatability"].get(name)
-        around = "-" if scattered is None else f"{scattered['rms_mm']:.3f}"
-        said = "-" if scattered is None else f"{scattered['stated_mm']:.3f}"
+        spread = ("rms_mm", "normal_rms_mm", "stated_mm")
+        around = ("-" if scattered is None else f"{scattered[key]:.3f}" for key in spread)
         errors = (of["mean_mm"], of["rms_mm"], of["median_mm"], of["p95_mm"])
-        rows.append((name, f"{of['covered']:.0%}", *(f"{value:.3f}" for value in errors), around, said))
-    header = ("region", "covered", "mean", "RMS", "median", "95 %", "scatter", "stated")
-    pdf.table_of(header, rows, (24, 22, 22, 22, 22, 22, 22, 22), {})
+        rows.append((name, f"{of['covered']:.0%}", *(f"{value:.3f}" for value in errors), *around))
+    header = ("region", "covered", "mean", "RMS", "median", "95 %", "scatter", "by normal", "stated")
+    pdf.table_of(header, rows, (22, 19.5, 19.5, 19.5, 19.5, 19.5, 19.5, 19.5, 19.5), {})
 
 
 def _captures_table(pdf: _Page, report: VerificationReport) -> None:

@@ -7,7 +7,8 @@ farther than 10 mm, are not judged, and the share that is left is told.
 - probing error, form: the range of the deviations of 99.7 % of the face's area;
 - probing error, size: the scale of the best fit with a scale, by 1, in percent;
 - distance error: distances between landmarks, measured less those of the reference. They need no alignment;
-- repeatability: scatter of the heads over the captures (``repeatability``);
+- repeatability: scatter of the heads over the captures (``repeatability``); the limit is for that along the normal,
+  the surface's own, since which vertex lies where on it is no one's concern here;
 - error by region: mean, RMS, median and 95th percentile, and what all captures have in common (``repeated``).
 """
 
@@ -178,6 +179,6 @@ def _values(captures: Sequence[Judged], repeatability: Mapping[str, Mapping[str,
         "probing_form_mm": max(one.probing_form_mm for one in captures),
         "size_error_percent": max(abs(one.size_error_percent) for one in captures),
         "distance_mm": max(distances, default=None),
-        "repeatability_mm": repeatability["face"]["rms_mm"] if repeatability else None,
+        "repeatability_mm": repeatability["face"]["normal_rms_mm"] if repeatability else None,
         "least_covered": min(face.covered if face else 0.0 for face in faces),
     }

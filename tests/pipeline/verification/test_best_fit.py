@@ -31,6 +31,7 @@ def test_landmarks_start_it_and_the_surface_ends_it() -> None:
     np.testing.assert_allclose(fit.reference_from_world.translation, truth.translation, atol=3e-2)
 
 
+@pytest.mark.slow
 def test_a_search_finds_it_without_landmarks_on_a_pedestal() -> None:
     stand = ellipsoid(4)
     stand = replace(stand, vertices=0.9 * (stand.vertices - stand.vertices.mean(axis=0)) + (0.0, -240.0, 0.0))

@@ -88,7 +88,7 @@ def test_results_are_judged_as_they_are_and_a_missed_limit_is_status_1(tmp_path:
     assert json.loads(good.stdout) == json.loads((tmp_path / "out" / "report.json").read_text())
     bad = command(str(right), str(wrong), *given)
     assert bad.returncode == 1
-    assert "size_error_percent is 1, the limit is 0.5" in bad.stderr
+    assert "size_error_percent is 1, the limit is 0.3" in bad.stderr
     assert bad.stderr.count("\n") == 1
     found = json.loads(bad.stdout)
     assert found["captures"]["wrong"]["size_error_percent"] == pytest.approx(1.0, abs=1e-2)
