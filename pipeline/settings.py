@@ -224,6 +224,15 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
     return settings
 
 
+def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
+    """A frozen table of settings (a dataclass) from decoded JSON or TOML. Raises InputError as above."""
+    faults: list[str] = []
+    found = _read(kind, document, "", faults)
+    if faults:
+        raise InputError(subject, faults)
+    return found
+
+
 def document_from_settings(settings: Settings) -> dict[str, object]:
     return dataclasses.asdict(settings)
 

@@ -18,6 +18,7 @@ from pipeline.experiments.levels import levels
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.posterior_check import posterior_check
+from pipeline.experiments.repeat import repeat
 from pipeline.experiments.robustness import robustness
 from pipeline.experiments.views import views
 from rig.atomic_write import write_atomically
@@ -152,6 +153,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "alignment": _drawn(alignment),
     "posterior": _drawn(posterior_check),
     "views": _drawn(views),
+    "repeat": _drawn(repeat),
     "span": _span,
     "detail": _detail,
 }

@@ -2,6 +2,7 @@
 bytes in
 every version."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from rig.atomic_write import write_atomically
+from rig.errors import InputError
 from rig.mesh import Mesh
 
 PLY_VERTEX = np.dtype(
@@ -67,3 +69,27 @@ def ply_bytes(
 def write_ply(path: Path, mesh: Mesh, **properties: Any) -> None:
     """``ply_bytes`` to a file, under a temporary name first."""
     write_atomically(path, ply_bytes(mesh, **properties))
+
+
+def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
+    """A head.ply of ours: the mesh (mm, world frame), and every vertex's standard deviation (mm) along its normal.
+
+    Raises InputError for a file that is cut short, or another program's."""
+    try:
+        header, end, body = path.read_bytes().partition(b"end_header\n")
+    except OSError as error:
+        raise InputError(path.name, [f"cannot be read ({error.strerror or error})"]) from error
+    lines = header.decode("ascii", "replace").splitlines()
+    counts = [int(line.split()[2]) for line in lines if re.fullmatch(r"element (vertex|face) \d{1,9}", line)]
+    names = [line.split()[-1] for line in lines if line.startswith("property") and "list" not in line]
+    ours = end and "format binary_little_endian 1.0" in lines and names == list(PLY_VERTEX.names or ())
+    if not ours or len(counts) != 2:
+        raise InputError(path.name, ["is no head.ply of ours"])
+    wanted = counts[0] * PLY_VERTEX.itemsize + counts[1] * PLY_FACE.itemsize
+    if len(body) != wanted:
+        raise InputError(path.name, [f"has {len(body)} bytes of vertices and faces where {wanted} are said"])
+    vertices = np.frombuffer(body, PLY_VERTEX, counts[0])
+    faces = np.frombuffer(body, PLY_FACE, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
+    places = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)
+    colours = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
+    return Mesh(places, faces.astype(np.int32), colours), vertices["quality"].astype(float)

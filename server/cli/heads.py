@@ -1,4 +1,4 @@
-"""Commands that make heads: reconstruct, simulate, demo, experiments."""
+"""Commands that make and judge heads: reconstruct, verify, simulate, demo, experiments."""
 
 import shutil
 import sys
@@ -77,6 +77,44 @@ def reconstruct(
         warn(f"{warning['code']}: {warning['message']}")
     made = [out / name for name in ("head.ply", "bust.ply") if (out / name).is_file()]
     answer(written, json_out, [str(path) for path in made])
+
+
+@app.command(epilog="Example: eigenhead verify shots/m1 shots/m2 shots/m3 --reference mannequin.ply --out acceptance")
+def verify(
+    captures: Annotated[
+        list[Path], typer.Argument(help="Captures of the mannequin, or folders of their results.", exists=True)
+    ],
+    reference: Annotated[
+        Path, typer.Option(help="Its scan: .ply, .obj or .glb in mm, in any frame.", exists=True, dir_okay=False)
+    ],
+    out: Annotated[Path, typer.Option(help="Where report.json and certificate.pdf go.", file_okay=False)] = Path(
+        "out/verify"
+    ),
+    landmarks: Annotated[
+        Path | None, typer.Option(help="Of the scan, in its frame; by default the file beside it.", exists=True)
+    ] = None,
+    limits: Annotated[Path | None, typer.Option(help="Limits, a TOML or JSON file.", exists=True)] = None,
+    model: Annotated[str | None, typer.Option(help="A model's name or file.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="Of the reconstructions, TOML or JSON.", exists=True)] = None,
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """A studio's acceptance test: is a mannequin of known shape measured right, and twice the same?
+
+    Status 1 where a limit is missed."""
+    from server.cli.reconstruct_local import settings_document
+    from server.cli.verify import LimitsMissed, lines, read_limits, verify_captures
+
+    wanted, chosen = read_limits(limits), settings_document(settings)
+    prepare_file(out / "report.json")
+    with progress_bar() as report:
+        found = verify_captures(
+            captures, out, reference=reference, landmarks=landmarks, model=model, settings=chosen, limits=wanted,
+            report=report,
+        )  # fmt: skip
+    answer(found, json_out, lines(found, out))
+    if not found["passed"]:
+        raise LimitsMissed(found, out)
 
 
 @app.command(
@@ -208,7 +246,7 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, posterior, "
-            "views, span or detail."
+            "views, repeat, span or detail."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",

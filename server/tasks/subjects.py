@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.eigenheads.correspondence.scans import landmark_file, read_landmarks
 from pipeline.eigenheads.model import HeadModel, load_model
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh
@@ -29,12 +30,16 @@ def model_subject(model: HeadModel, coefficients: np.ndarray, name: str) -> Subj
 
 
 def subject_of(text: str, model: HeadModel, rng: np.random.Generator) -> Subject:
-    """``random``, ``mean``, or a mesh file in the head frame (mm). Raises InputError."""
+    """``random``, ``mean``, or a mesh file in the head frame (mm) with its landmarks beside it, where it has some.
+
+    Raises InputError."""
     if text == "random":
         return drawn_subject(model, rng)
     if text == "mean":
         return model_subject(model, np.zeros(0), f"mean of {model.name}")
-    return Subject(read_mesh(Path(text)), name=Path(text).name)
+    path = Path(text)
+    marks = landmark_file(path)
+    return Subject(read_mesh(path), {} if marks is None else read_landmarks(marks), name=path.name)
 
 
 def simulate_folder(

@@ -49,11 +49,17 @@ def find_scans(folder: Path) -> list[Path]:
 def read_scan(path: Path) -> Scan:
     """A scan with its landmarks. Raises InputError."""
     vertices, faces = welded(read_mesh(path))
-    beside = [path.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES]
-    given = next((p for p in beside if p.is_file()), None)
+    given = landmark_file(path)
     if given is None:
-        raise InputError(path.name, [f"has no landmarks beside it ({', '.join(p.name for p in beside)})"])
+        beside = ", ".join(path.with_suffix(suffix).name for suffix in LANDMARK_SUFFIXES)
+        raise InputError(path.name, [f"has no landmarks beside it ({beside})"])
     return Scan(path.stem, vertices, faces, read_landmarks(given))
+
+
+def landmark_file(mesh: Path) -> Path | None:
+    """The landmarks that lie beside a mesh file, if any do."""
+    beside = (mesh.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES)
+    return next((path for path in beside if path.is_file()), None)
 
 
 def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:

@@ -38,12 +38,12 @@ LAMPS = (
 AMBIENT = (0.34, 0.34, 0.35)
 
 
-def lamp_directions() -> Float[np.ndarray, "l 3"]:
-    towards = np.array([lamp.towards for lamp in LAMPS])
+def lamp_directions(lamps: Sequence[Lamp] = LAMPS) -> Float[np.ndarray, "l 3"]:
+    towards = np.array([lamp.towards for lamp in lamps])
     return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
-def dome() -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
+def dome(lamps: Sequence[Lamp] = LAMPS) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
     """Directions, spread evenly over the sphere above -45 degrees, and the linear RGB that each sends."""
     index = np.arange(DIRECTIONS) + 0.5
     y = 1.0 - index / DIRECTIONS * 1.7
@@ -51,7 +51,7 @@ def dome() -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
     ring = np.sqrt(1.0 - y**2)
     directions = np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], axis=1)
     sent = np.tile(np.array(AMBIENT) / DIRECTIONS * 2.4, (DIRECTIONS, 1))
-    for lamp, towards in zip(LAMPS, lamp_directions(), strict=True):
+    for lamp, towards in zip(lamps, lamp_directions(lamps), strict=True):
         lobe = np.maximum(directions @ towards, 0.0) ** lamp.sharpness
         sent += lobe[:, None] / lobe.sum() * np.array(lamp.colour)
     return directions, sent
@@ -61,9 +61,10 @@ def irradiance(
     renderer: Renderer,
     receivers: Sequence[tuple[Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"]]],
     casters: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]],
+    lamps: Sequence[Lamp] = LAMPS,
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Linear RGB at each receiver's (vertices, unit normals), shaded by the ``casters``' triangles; world frame."""
-    directions, sent = dome()
+    directions, sent = dome(lamps)
     vertices, faces = casters
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())

@@ -22,6 +22,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.backdrop import backdrop, chair
 from rig.studio.scene.hairstyles import restyled
+from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.subject import Look, Subject, dress, random_look, random_pose
 from rig.studio.scene.visible import VisiblePoints, part_masks, visible_points
 from rig.studio.sensor.faults import Fault
@@ -112,12 +113,14 @@ def build_scene(
     look: Look | None = None,
     world_from_head: Similarity | None = None,
     faults: Sequence[Fault] = (),
+    lamps: Sequence[Lamp] = LAMPS,
 ) -> Scene:
-    """Dresses, lights and draws the subject, and paints the backdrops."""
+    """Dresses, lights and draws the subject, and paints the backdrops. The same ``rng`` makes the same skin, hair and
+    set for another pose or other ``lamps``."""
     look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
     look = _worn(look or random_look(look_rng), preset, faults)
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
-    dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng)
+    dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng, lamps=lamps)
     true_rig = Rig(tuple(_knocked(camera, faults, set_rng) for camera in rig))
     light = renderer.photograph(true_rig, (*dressed.worn, dressed.head), dressed.gallery, samples=preset.samples)
     if preset.rolling_ms > 0:

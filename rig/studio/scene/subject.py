@@ -1,6 +1,6 @@
 """Who sits in the studio: a head that the caller brings, and the looks drawn for it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from rig.studio.scene.beard import grow_beard
 from rig.studio.scene.clothes import shirt
 from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow
 from rig.studio.scene.headwear import cap, glasses
-from rig.studio.scene.lights import LAMPS, irradiance, lamp_directions
+from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.long_hair import hang, knot
 from rig.studio.scene.skin_texture import skin_paint
 from rig.studio.sensor.noise import volume
@@ -136,6 +136,7 @@ def dress(
     *,
     clothes: bool,
     rng: np.random.Generator,
+    lamps: Sequence[Lamp] = LAMPS,
 ) -> Dressed:
     """Hair, clothes, paint and light for a head, in the world frame."""
     hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng = rng.spawn(5)
@@ -151,7 +152,7 @@ def dress(
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
     solid = _joined(placed)
-    light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid)
+    light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid, lamps)
     parts = [
         Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided)
         for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light, strict=True)
@@ -162,7 +163,7 @@ def dress(
         if len(hair.strands)
     ]
     gallery = Gallery(
-        volume(noise_rng, NOISE_CELLS), lamp_directions()[:2], np.array([lamp.colour for lamp in LAMPS[:2]])
+        volume(noise_rng, NOISE_CELLS), lamp_directions(lamps)[:2], np.array([lamp.colour for lamp in lamps[:2]])
     )
     shown = [piece.shows for piece in pieces]
     surfaces = {

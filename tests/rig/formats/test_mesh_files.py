@@ -15,7 +15,7 @@ from rig.errors import InputError
 from rig.formats.glb import glb_bytes, write_glb
 from rig.formats.mesh_file import read_mesh
 from rig.formats.obj import obj_bytes
-from rig.formats.ply import ply_bytes, write_ply
+from rig.formats.ply import ply_bytes, read_head_ply, write_ply
 from rig.mesh import Mesh, boundary_edges, face_normals
 
 RNG = np.random.default_rng(0)
@@ -160,3 +160,19 @@ def test_srgb_of_the_standard() -> None:
     # mid-grey: 18 % linear light is 46.1 % of the sRGB scale
     assert float(srgb_from_linear(np.array(0.18))) == pytest.approx(0.4613, abs=1e-3)
     np.testing.assert_allclose(linear_from_srgb(np.array([0.0, 1.0])), [0.0, 1.0])
+
+
+def test_our_reader_gives_what_was_written_and_names_half_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "head.ply"
+    write_ply(path, MESH, normals=MESH.normals(), colours=COLOURS, quality=QUALITY, views=VIEWS)
+    mesh, quality = read_head_ply(path)
+    np.testing.assert_array_equal(mesh.vertices, MESH.vertices.astype(np.float32))
+    np.testing.assert_array_equal(mesh.faces, MESH.faces)
+    np.testing.assert_array_equal(mesh.colours, COLOURS)
+    np.testing.assert_array_equal(quality, QUALITY.astype(np.float32))
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match="bytes of vertices and faces"):
+        read_head_ply(path)
+    path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match=r"no head\.ply of ours"):
+        read_head_ply(path)

@@ -1,0 +1,49 @@
+"""What a studio must reach: limits, each of which a user may set, and their verdicts.
+
+The default limits are near one and a half times what the simulated studio reaches with a bare mannequin of another
+population than the model's (docs/results.md), so that a sound rig passes and one with a lasting fault does not.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from pipeline.settings import read_table
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The most that each figure of a verification may be; ``least_covered`` is the least."""
+
+    face_rms_mm: float = 0.45  # deviation from the reference, of any capture
+    features_rms_mm: float = 1.0  # the same of eyes, nose and mouth, the worst of them
+    probing_form_mm: float = 5.5  # range of the deviations of 99.7 % of the face
+    size_error_percent: float = 0.3
+    distance_mm: float = 5.5  # RMS of the landmark distances: what nothing fixes along the surface slides
+    repeatability_mm: float = 0.2  # scatter over the face along its normal, RMS
+    least_covered: float = 0.9  # share of the face that the reference covers
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A figure beside its limit; ``value`` None: the captures or the reference do not carry it."""
+
+    name: str
+    value: float | None
+    limit: float
+    passed: bool | None  # None: not judged
+
+
+def limits_from_document(document: Mapping[str, Any], subject: str = "limits") -> Limits:
+    """Limits from decoded JSON or TOML. Raises InputError naming every unknown key and every wrong value."""
+    return read_table(Limits, document, subject)
+
+
+def checks(limits: Limits, values: Mapping[str, float | None]) -> tuple[Check, ...]:
+    """Every limit with its verdict; ``values`` by the limits' names."""
+    found = []
+    for field in fields(limits):
+        limit, value = getattr(limits, field.name), values[field.name]
+        passed = None if value is None else value >= limit if field.name.startswith("least") else value <= limit
+        found.append(Check(field.name, value, limit, passed))
+    return tuple(found)

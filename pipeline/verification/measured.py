@@ -1,0 +1,88 @@
+"""A result folder as it is judged: the head, what it states of itself, and its landmarks."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.regions import head_regions
+from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.results.report import Report as ReportDocument
+from rig.errors import InputError
+from rig.formats.ply import read_head_ply
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """One reconstructed head. ``stated_mm`` is the standard deviation that it states along its normals."""
+
+    name: str
+    mesh_world: Mesh
+    stated_mm: Float[np.ndarray, " v"]
+    areas: Float[np.ndarray, " v"]  # mm2 that each vertex stands for
+    regions: Mapping[str, Bool[np.ndarray, " v"]]
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]]  # world
+    head_from_world: RigidTransform
+    warnings: tuple[str, ...] = ()  # codes
+
+
+@dataclass(frozen=True, slots=True)
+class ResultIdentity:
+    """Which model made a result; what it is called there and the digest of its file."""
+
+    model: str
+    sha256: str
+
+
+def is_result(folder: Path) -> bool:
+    return (folder / "report.json").is_file() and (folder / "head.ply").is_file()
+
+
+def identity_of(folder: Path) -> ResultIdentity:
+    """Raises InputError where report.json is none."""
+    try:
+        model = _report(folder)["model"]
+        return ResultIdentity(str(model["name"]), str(model["sha256"]))
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{folder.name}/report.json", [f"lacks {error}"]) from error
+
+
+def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
+    """A result folder made with ``model``. Raises InputError naming what does not fit."""
+    report = _report(folder)
+    mesh, stated_mm = read_head_ply(folder / "head.ply")
+    full = model.levels["full"]
+    if len(mesh.vertices) != full.count or not np.array_equal(mesh.faces, full.faces):
+        raise InputError(f"{name}/head.ply", [f"has not the vertices of the model {model.name}; name its --model"])
+    try:
+        marks = {key: np.array(of["position"], float) for key, of in report["landmarks"].items()}
+        place = report["world_from_head"]
+        rotation = np.array(place["rotation"], float)
+        translation = place["scale"] * np.array(place["translation"], float)
+        codes = tuple(str(warning["code"]) for warning in report["warnings"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{name}/report.json", [f"is no report that can be read ({error!r})"]) from error
+    return Measured(
+        name=name,
+        mesh_world=mesh,
+        stated_mm=stated_mm,
+        areas=vertex_areas(mesh.vertices, mesh.faces),
+        regions=head_regions(model),
+        landmarks=marks,
+        head_from_world=RigidTransform(rotation, translation).inverse(),
+        warnings=codes,
+    )
+
+
+def _report(folder: Path) -> ReportDocument:
+    """Decoded only: what is missing shows where it is read."""
+    try:
+        return json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder.name}/report.json", [f"cannot be read ({error})"]) from error

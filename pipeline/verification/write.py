@@ -1,0 +1,27 @@
+"""The folder of a verification: report.json, certificate.pdf, and the certificate's pictures in one."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.verification.certificate import certificate_pdf
+from pipeline.verification.judgement import Judgement
+from pipeline.verification.measured import Measured
+from pipeline.verification.pictures import draw
+from pipeline.verification.reference import Reference
+from pipeline.verification.report import Occasion, VerificationReport, report_document
+from rig.atomic_write import write_atomically
+from rig.formats.images import write_image
+
+
+def write_verification(
+    folder: Path, first: Measured, reference: Reference, judgement: Judgement, occasion: Occasion
+) -> VerificationReport:
+    """Writes the files, report.json last, and returns what it holds. ``first``: the head of the first capture."""
+    document, pictures = report_document(judgement, reference, occasion), draw(first, reference, judgement)
+    rows = [np.hstack(row) for row in (pictures.reference, pictures.result, pictures.error)]
+    write_image(folder / "error.png", np.vstack(rows))
+    write_atomically(folder / "certificate.pdf", certificate_pdf(document, judgement, pictures))
+    write_atomically(folder / "report.json", json.dumps(document, indent=1, allow_nan=False).encode())
+    return document

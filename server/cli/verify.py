@@ -1,0 +1,110 @@
+"""``eigenhead verify``: captures of a mannequin, or their results, judged against its scan."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rig.errors import EigenheadError, InputError
+from server.cli.reconstruct_local import reconstruct_locally
+
+if TYPE_CHECKING:
+    from pipeline.verification.limits import Limits
+    from pipeline.verification.report import VerificationReport
+
+Report = Callable[[str, float], None]
+
+
+class LimitsMissed(EigenheadError):
+    """The studio does not reach what was asked; the papers are written."""
+
+    def __init__(self, document: "VerificationReport", out: Path) -> None:
+        missed = [
+            f"{name} is {check['value']:.3g}, the limit is {check['limit']:g}"
+            for name, check in document["checks"].items()
+            if check["passed"] is False and check["value"] is not None
+        ]
+        super().__init__(f"not passed: {'; '.join(missed)} ({out / 'certificate.pdf'} says where)")
+
+
+def verify_captures(
+    captures: Sequence[Path],
+    out: Path,
+    *,
+    reference: Path,
+    landmarks: Path | None,
+    model: str | None,
+    settings: Mapping[str, object],
+    limits: "Limits",
+    report: Report,
+) -> "VerificationReport":
+    """Writes report.json and certificate.pdf into ``out``, and the results of captures into ``out/results``.
+
+    What can be wrong with the reference is found before anything is reconstructed. Raises InputError."""
+    from pipeline.eigenheads.model import load_model
+    from pipeline.verification.judgement import judge
+    from pipeline.verification.measured import identity_of, is_result, read_measured
+    from pipeline.verification.reference import read_reference
+    from pipeline.verification.report import Occasion
+    from pipeline.verification.write import write_verification
+
+    names = _names(captures)
+    scan = read_reference(reference, landmarks)
+    folders: list[Path] = []
+    for i, (capture, name) in enumerate(zip(captures, names, strict=True)):
+        folder = capture
+        if not is_result(capture):
+            folder = out / "results" / name
+
+            def told(stage: str, fraction: float, i: int = i) -> None:
+                report(f"{names[i]}: {stage}", (i + fraction) / len(captures))
+
+            told("read", 0.0)
+            reconstruct_locally(capture, folder, model=model, settings=_head_alone(settings), report=told)
+        folders.append(folder)
+    report("judge", 1.0)
+    identities = {name: identity_of(folder) for name, folder in zip(names, folders, strict=True)}
+    identity = identities[names[0]]
+    others = [name for name, of in identities.items() if of != identity]
+    if others:
+        raise InputError("captures", [f"{name} was made with another model than {names[0]}" for name in others])
+    chosen = load_model(model or identity.model)
+    measured = [read_measured(folder, chosen, name) for folder, name in zip(folders, names, strict=True)]
+    judgement = judge(measured, scan, limits)
+    occasion = Occasion(date.today().isoformat(), identity, limits)
+    return write_verification(out, measured[0], scan, judgement, occasion)
+
+
+def read_limits(path: Path | None) -> "Limits":
+    """Limits of a TOML or JSON file over the defaults. Raises InputError."""
+    from pipeline.verification.limits import limits_from_document
+    from server.cli.reconstruct_local import settings_document
+
+    return limits_from_document(settings_document(path), path.name if path else "limits")
+
+
+def lines(document: "VerificationReport", out: Path) -> list[str]:
+    """For people: each figure beside its limit, then where the papers are."""
+    verdicts = {None: "not judged", True: "met", False: "missed"}
+    found = [
+        f"{name:<20} {'-' if check['value'] is None else format(check['value'], '.4g'):>8}   "
+        f"limit {check['limit']:<6g} {verdicts[check['passed']]}"
+        for name, check in document["checks"].items()
+    ]
+    return [*found, str(out / "report.json"), str(out / "certificate.pdf")]
+
+
+def _names(captures: Sequence[Path]) -> list[str]:
+    """The captures' own names, each once. Raises InputError."""
+    names = [path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".zip") for path in captures]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError("captures", [f"more than one is called {name}: rename one" for name in twice])
+    return names
+
+
+def _head_alone(settings: Mapping[str, object]) -> dict[str, object]:
+    """The head is all that is judged: without the bust a capture takes ten seconds less."""
+    outputs = settings.get("outputs")
+    return {**settings, "outputs": {"surface": "head", **(outputs if isinstance(outputs, Mapping) else {})}}

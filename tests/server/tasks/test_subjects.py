@@ -1,0 +1,20 @@
+"""Who sits in the studio: a mesh of the user's brings the landmarks that lie beside it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.eigenheads.correspondence.scans import write_landmarks
+from rig.formats.obj import obj_bytes
+from server.tasks.subjects import subject_of
+from tests.support.measured_heads import mannequin, marks, model
+
+
+def test_landmarks_beside_a_mesh_come_with_it(tmp_path: Path) -> None:
+    path, rng = tmp_path / "mannequin.obj", np.random.default_rng(0)
+    path.write_bytes(obj_bytes(mannequin()))
+    assert subject_of(str(path), model(), rng).landmarks == {}
+    write_landmarks(path.with_suffix(".json"), marks())
+    found = subject_of(str(path), model(), rng)
+    np.testing.assert_allclose(found.landmarks["pronasale"], marks()["pronasale"], atol=1e-3)
+    assert (found.name, len(found.landmarks)) == ("mannequin.obj", len(marks()))
