@@ -14,6 +14,7 @@ from pipeline.experiments import detail, markdown, span, tables
 from pipeline.experiments.alignment import alignment
 from pipeline.experiments.convergence import convergence
 from pipeline.experiments.cost import cost
+from pipeline.experiments.drift import drift
 from pipeline.experiments.levels import levels
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
@@ -150,6 +151,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "robustness": _drawn(robustness),
     "convergence": _drawn(convergence),
     "alignment": _drawn(alignment),
+    "drift": _drawn(drift),
     "posterior": _drawn(posterior_check),
     "views": _drawn(views),
     "span": _span,

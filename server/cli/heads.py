@@ -200,8 +200,8 @@ def experiments(
     name: Annotated[
         str,
         typer.Argument(
-            help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, posterior, "
-            "views, span or detail."
+            help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
+            "posterior, views, span or detail."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
