@@ -201,7 +201,7 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "posterior, views, span or detail."
+            "exchanges, false-alarms, posterior, views, span or detail."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
