@@ -11,6 +11,7 @@ WARNING_CODES = (
     "eyes-closed",
     "features",
     "mask-contradicted",
+    "mask-loose",
     "no-bust",
     "no-texture",
     "picture-duplicated",

@@ -223,12 +223,14 @@ def _of_stage(report: Report, stage: str, _: str, fraction: float) -> None:
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], list[ReportWarning]]:
-    """Views of cameras that no longer stand where they were calibrated take no part; each is named."""
+    """Views of cameras that no longer stand where they were calibrated take no part; each is named, and so are those
+    whose mask may be loose instead."""
     kept, warnings = dict(silhouettes), []
     for drift in find_drift(silhouettes, rig):
-        quality = replace(silhouettes[drift.camera].quality, usable=False)
-        kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
-        warnings.append(ReportWarning("camera-moved", str(drift)))
+        if drift.moved:
+            quality = replace(silhouettes[drift.camera].quality, usable=False)
+            kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
+        warnings.append(ReportWarning(drift.code, str(drift)))
     return kept, warnings
 
 

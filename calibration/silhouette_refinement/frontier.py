@@ -96,7 +96,7 @@ def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
             continue
         names, pixels = (one.camera.name, two.camera.name), (first.pixels[i], second.pixels[j])
         difference = float(first.angle[i] - second.angle[j])
-        found.append(tangency(names, pixels, (first.slopes[i], second.slopes[j]), difference))
+        found.append(tangency(names, pixels, (first.slopes[i], second.slopes[j]), difference, float(first.side[i])))
     return found
 
 

@@ -14,6 +14,8 @@ from pipeline.experiments import detail, markdown, span, tables
 from pipeline.experiments.alignment import alignment
 from pipeline.experiments.convergence import convergence
 from pipeline.experiments.cost import cost
+from pipeline.experiments.drift import drift
+from pipeline.experiments.exchanges import exchanges, false_alarms
 from pipeline.experiments.levels import levels
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
@@ -151,6 +153,9 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "robustness": _drawn(robustness),
     "convergence": _drawn(convergence),
     "alignment": _drawn(alignment),
+    "drift": _drawn(drift),
+    "exchanges": _drawn(exchanges),
+    "false-alarms": _drawn(false_alarms),
     "posterior": _drawn(posterior_check),
     "views": _drawn(views),
     "repeat": _drawn(repeat),

@@ -115,13 +115,16 @@ def mean_error_mm(model: HeadModel, fit: Fit, subject: Planted) -> float:
 
 
 def worn_silhouettes(
-    model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, style: HairStyle, rng: np.random.Generator
-) -> dict[str, Silhouette]:
-    """Masks of the head with hair, strands and all, and a shirt, as the studio dresses a subject."""
+    model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, style: HairStyle, rng: np.random.Generator,
+    *, strands: bool = True,
+) -> dict[str, Silhouette]:  # fmt: skip
+    """Masks of the head with hair, strands and all, and a shirt, as the studio dresses a subject. Without ``strands``
+    they are as masks that ask for half of a pixel: most strands are thinner."""
     head, full = model.vertices(subject.coefficients), model.levels["full"]
     body = anatomy(head, {name: head[row] for name, row in model.landmarks.items()})
     hair, worn = grow(head, body, style, rng), shirt(Mesh(head, full.faces), body, rng)
-    pieces = [(head, full.faces), (hair.shell, hair.shell_faces), (hair.strands, hair.strand_faces)]
+    pieces = [(head, full.faces), (hair.shell, hair.shell_faces)]
+    pieces += [(hair.strands, hair.strand_faces)] if strands else []
     pieces += [worn] if worn is not None else []
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in pieces])
     faces = np.concatenate([faces + start for (_, faces), start in zip(pieces, starts[:-1], strict=True)])

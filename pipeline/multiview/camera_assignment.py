@@ -67,7 +67,7 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
     Returns:
         An empty assignment where every camera holds its own picture, or where no exchange explains what is wrong.
     """
-    seen = _with_masks(silhouettes, rig)
+    seen = with_masks(silhouettes, rig)
     if len(seen) < CAMERAS_LEAST:
         return NOTHING
     hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
@@ -80,11 +80,11 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
 def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, float]:
     """How much each camera's picture contradicts the others where it is filed: 0.2 for its own, 0.5 and more for
     another's (mean robust misfit of its tangent planes)."""
-    seen = _with_masks(silhouettes, rig)
+    seen = with_masks(silhouettes, rig)
     if len(seen) < CAMERAS_LEAST:
         return dict.fromkeys(seen.names, CUT_OFF_MISFIT)
-    misses = _own_misses([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
-    return dict(zip(seen.names, _mean_misfit(misses, CUT_OFF_MISFIT).tolist(), strict=True))
+    misses = own_misses([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
+    return dict(zip(seen.names, mean_misfit(misses, CUT_OFF_MISFIT).tolist(), strict=True))
 
 
 def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
@@ -113,7 +113,7 @@ def _ring_text(ring: tuple[str, ...], what: str) -> str:
     return f"{told} ({', '.join(filed)})"
 
 
-def _with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
+def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
     return rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )
@@ -121,10 +121,10 @@ def _with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
 
 def _any_suspect(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> bool:
     """Whether any camera's planes contradict the others more than good masks do."""
-    return bool((_mean_misfit(_own_misses(hulls, rig)) > SUSPECT_MISFIT).any())
+    return bool((mean_misfit(own_misses(hulls, rig)) > SUSPECT_MISFIT).any())
 
 
-def _own_misses(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
+def own_misses(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
     """Misses (px of both images together) while every camera holds the picture that is filed under it."""
     cameras = list(rig)
     touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
@@ -132,7 +132,7 @@ def _own_misses(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np
     return (angle - angle.swapaxes(0, 1)) / np.hypot(step, step.swapaxes(0, 1))
 
 
-def _mean_misfit(misses: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
+def mean_misfit(misses: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
     """Robust misfit of each camera, the mean of its planes; of those that the border hides ``cut_off``, or nothing."""
     there = np.isfinite(misses)
     of_each = np.where(there, _robust(misses, ROBUST_SIGMAS * _noise_px(misses[there])), cut_off or 0.0)
@@ -176,7 +176,7 @@ def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float
     for i, camera in enumerate(cameras):
         held = [a for a in range(count) if _size(cameras[a]) == _size(camera)]
         angle[i, held], step[i, held] = _touches(camera, [hulls[a] for a in held], i, cameras)
-    misses = _own_misses(hulls, rig)
+    misses = own_misses(hulls, rig)
     scale = ROBUST_SIGMAS * _noise_px(misses[np.isfinite(misses)])
     misfit = np.zeros((count,) * 4, np.float32)
     for i, j in permutations(range(count), 2):

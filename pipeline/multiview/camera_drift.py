@@ -6,15 +6,21 @@ shoulders are as good as skin, since the subject is rigid within a shot. Eleven 
 good to 0.2 px. A camera that was turned by a small angle shifts its whole image; its equations then agree on one shift,
 and only its own do.
 
+A loose mask reaches too far on every side, a shifted image on one side only: tangencies on opposite sides tell them
+apart. A close-up has most of them on one side and twice the pixels a millimetre; there both explain what is seen, the
+camera is named with both, and its view is kept. Strands of hair that one camera resolves and another does not would be
+misses of several pixels: planes touch a line inside the outline, which no strand reaches, equally deep in space for
+every camera.
+
 Enters: silhouettes and the rig. Leaves: the cameras that have moved, how far, how sure.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import fdtrc
 
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.robust import GemanMcClure
@@ -24,41 +30,58 @@ from pipeline.multiview.tangency import Tangency, find_tangencies
 from rig.camera import Camera
 from rig.rig import Rig
 
-NOISE_FLOOR_PX = 0.4  # of one tangency: two contours of 0.25 px, never less however well they agree by chance
+INSET_MM = 2.2  # four pixels of the usual rig: a strand under a mask that is 2 px loose is 5 px wide
+NOISE_FLOOR_PX = 0.28  # of one contour, in its own pixels, never less however well they agree by chance
 ROBUST_SIGMAS = 3.0
+_LOSS = GemanMcClure(ROBUST_SIGMAS)
 EQUATIONS_LEAST = 5  # of a camera: two unknowns, and enough left over to judge them
 INDEPENDENT_LEAST = 0.3  # sine of the angle between two normals whose crossing is proposed
 NO_SHIFT_INFORMATION = 1e-6  # px^-2: keeps a shift that no normal sees at zero
-SIGMAS_LEAST, SHIFT_LEAST_PX = 6.0, 1.5  # docs/results.md: false alarms against misses
+SIGMAS_LEAST, SHIFT_LEAST_PX = 8.0, 1.5  # good cameras reach 4, cameras turned by 0.2 degrees 14 and more
 GAIN_LEAST = 0.4  # share of the camera's own robust misfit that its shift must explain, and of all but one of them
+LOOSE_PX = 1.5  # standard deviation of how loose a mask is: 1 to 2 px in real photographs
+MOVED_SIGMAS_LEAST = 4.0  # by which a shift explains the planes better than loose masks do, or both explain them
+CHANCE = 0.01  # that a good camera disagrees so much with the rest (F test)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """A camera that has moved: its image's shift (px) and standard deviation, the turn that explains it, and how many
-    standard deviations that is."""
+    """A camera whose image does not stand where its calibration says: its shift (px) and standard deviation, the turn
+    that explains it, and how many standard deviations that is, all as if the mask were tight. ``moved``: a loose mask
+    cannot explain it, and the other cameras agree better without this one."""
 
     camera: str
     shift_px: Float[np.ndarray, " 2"]
     deviation_px: float
     turn_deg: float
     sigmas: float
+    moved: bool
+
+    @property
+    def code(self) -> str:
+        """Of the warning that says it."""
+        return "camera-moved" if self.moved else "mask-loose"
 
     def __str__(self) -> str:
+        told = f"by {np.linalg.norm(self.shift_px):.1f} px in its image (a turn of {self.turn_deg:.2f} degrees"
+        if self.moved:
+            return (
+                f"{self.camera} has moved {told}, {self.sigmas:.0f} standard deviations) and is left out: "
+                "fasten it and calibrate again"
+            )
         return (
-            f"{self.camera} has moved by {np.linalg.norm(self.shift_px):.1f} px in its image "
-            f"(a turn of {self.turn_deg:.2f} degrees, {self.sigmas:.0f} standard deviations) and is left out: "
-            "fasten it and calibrate again"
+            f"{self.camera}: the mask is loose, or the camera moved {told}); the view is kept: "
+            "look at its overlay, and fasten the camera and calibrate again if the mask is tight"
         )
 
 
 def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, ...]:
-    """Cameras that no longer stand where their calibration says, the farthest moved first.
+    """Cameras that no longer stand where their calibration says, or seem so by a loose mask, the farthest moved first.
 
     One after the other: what the worst camera does to its neighbours' equations goes with it.
     """
     usable = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
-    tangencies = find_tangencies(silhouettes, usable)
+    tangencies = find_tangencies(silhouettes, usable, INSET_MM)
     found: list[Drift] = []
     names = list(usable.names)
     while len(names) > 3 and len(found) < len(usable) // 4 + 1:
@@ -74,58 +97,110 @@ def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, 
 
 def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | None:
     """The shift that the camera's own equations agree on, if there is one worth an alarm."""
-    rows, excess = _equations(name, tangencies)
-    if len(rows) < EQUATIONS_LEAST:
+    rest = _normalised([t for t in tangencies if name not in t.cameras])
+    scale = max(1.0, 1.4826 * float(np.median(np.abs(rest)))) if len(rest) else 1.0
+    own = ShiftEquations.of(name, tangencies, scale * NOISE_FLOOR_PX)
+    if len(own.excess_px) < EQUATIONS_LEAST:
         return None
-    others = [t.excess_px[0] for t in tangencies if name not in t.cameras]
-    noise = max(NOISE_FLOOR_PX, 1.4826 * float(np.median(np.abs(others)))) if others else NOISE_FLOOR_PX
-    shift, information = _robust_shift(rows, excess, noise)
-    before, after = _misfits(excess, noise), _misfits(excess - rows @ shift, noise)
-    deviation = float(np.sqrt(np.trace(np.linalg.inv(information + 1e-9 * np.eye(2)))))
-    size = float(np.linalg.norm(shift))
-    sigmas = float(np.sqrt(shift @ information @ shift))
-    if sigmas < SIGMAS_LEAST or size < SHIFT_LEAST_PX or not _explains(before, after):
+    found = _robust_shift(own)
+    before, after = _misfits(own.excess_px / own.noise_px), _misfits(own.missed(found.shift_px, 0.0))
+    size = float(np.linalg.norm(found.shift_px))
+    if found.sigmas < SIGMAS_LEAST or size < SHIFT_LEAST_PX or not _explains(before, after):
         return None
+    moved = _beyond_loose_masks(own, found) >= MOVED_SIGMAS_LEAST and _disagrees(before, _misfits(rest / scale))
     turn = np.degrees(np.arctan(size / camera.intrinsics.fx))
-    return Drift(name, shift, deviation, float(turn), sigmas)
+    return Drift(name, found.shift_px, found.deviation_px, float(turn), found.sigmas, moved)
 
 
-def _equations(name: str, tangencies: list[Tangency]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    rows, excess = [], []
-    for tangency in tangencies:
-        for side in range(2):
-            if tangency.cameras[side] == name:
-                rows.append(tangency.normals[side])
-                excess.append(tangency.excess_px[side])
-    return np.array(rows).reshape(-1, 2), np.array(excess)
+def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
+    """Misses of planes, in standard deviations of two contours that are good to the noise floor."""
+    excess = np.array([t.excess_px[0] for t in tangencies])
+    slopes = np.array([t.steepness for t in tangencies]).reshape(-1, 2)
+    return excess * slopes[:, 0] / (NOISE_FLOOR_PX * np.hypot(slopes[:, 0], slopes[:, 1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShiftEquations:
+    """``normal . shift + outward * loose = excess`` of one camera's tangencies, in its own pixels; ``pixels`` is
+    what an error of a pixel in both pictures amounts to, the other's in proportion of the pixels that a plane's turn
+    passes in each, ``noise_px`` what contours are good to."""
+
+    normals: Float[np.ndarray, "n 2"]
+    outward: Float[np.ndarray, " n"]
+    excess_px: Float[np.ndarray, " n"]
+    pixels: Float[np.ndarray, " n"]
+    contour_noise_px: float
+
+    @property
+    def noise_px(self) -> Float[np.ndarray, " n"]:
+        return self.contour_noise_px * self.pixels
+
+    @classmethod
+    def of(cls, name: str, tangencies: list[Tangency], contour_noise_px: float) -> "ShiftEquations":
+        own = [(t, side) for t in tangencies for side in range(2) if t.cameras[side] == name]
+        ratio = np.array([t.steepness[1 - side] / t.steepness[side] for t, side in own])
+        return cls(
+            np.array([t.normals[side] for t, side in own]).reshape(-1, 2),
+            np.array([t.outward for t, _ in own]),
+            np.array([t.excess_px[side] for t, side in own]),
+            np.hypot(1.0, ratio),
+            contour_noise_px,
+        )
+
+    def missed(self, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> Float[np.ndarray, " n"]:
+        """What shift and looseness leave, in standard deviations."""
+        return (self.normals @ shift_px + self.outward * loose_px - self.excess_px) / self.noise_px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftTerm:
     """``(normal . shift - excess) / noise`` of one camera's tangencies, with Geman and McClure's loss."""
 
-    normals: Float[np.ndarray, "n 2"]
-    excess_px: Float[np.ndarray, " n"]
-    noise_px: float
+    equations: ShiftEquations
 
     def at(self, shift_px: Float[np.ndarray, " 2"]) -> Residuals:
-        miss = (self.normals @ shift_px - self.excess_px) / self.noise_px
-        return Residuals(miss[:, None], lambda: self.normals[:, None] / self.noise_px, GemanMcClure(ROBUST_SIGMAS))
+        own = self.equations
+        miss = own.missed(shift_px, 0.0)
+        return Residuals(miss[:, None], lambda: (own.normals / own.noise_px[:, None])[:, None], _LOSS)
 
 
-def _robust_shift(rows: np.ndarray, excess: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """The shift (px) of least robust misfit, and its information: from the best of those that pairs of equations
-    propose. Where the equations are all of one direction, the shift stays zero across it."""
-    term = ShiftTerm(rows, excess, noise)
-    proposals = [np.zeros(2)]
-    for i, j in combinations(range(len(rows)), 2):
-        pair = rows[[i, j]]
-        if abs(np.linalg.det(pair)) > INDEPENDENT_LEAST:
-            proposals.append(np.linalg.solve(pair, excess[[i, j]]))
-    misfits = _misfits(excess[None, :] - np.array(proposals) @ rows.T, noise).sum(axis=1)
-    problem = Problem((term, Quadratic.prior(NO_SHIFT_INFORMATION * np.eye(2), np.zeros(2))), 2, np.add)
-    found = minimise(problem, proposals[int(np.argmin(misfits))], Limits(tolerance=1e-6))
-    return found.value, problem.equations(found.at).matrix - NO_SHIFT_INFORMATION * np.eye(2)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shift:
+    """A shift (px), and how sure it is if masks are tight."""
+
+    shift_px: Float[np.ndarray, " 2"]
+    deviation_px: float
+    sigmas: float
+
+
+def _robust_shift(own: ShiftEquations) -> _Shift:
+    """The shift of least robust misfit, from the best of those that pairs of equations propose. Where the equations
+    are all of one direction, the shift stays zero across it."""
+    pairs = np.stack(np.triu_indices(len(own.excess_px), 1), axis=1)
+    pairs = pairs[np.abs(np.linalg.det(own.normals[pairs])) > INDEPENDENT_LEAST]
+    met = np.linalg.solve(own.normals[pairs], own.excess_px[pairs][:, :, None])[:, :, 0]
+    proposals = np.concatenate([np.zeros((1, 2)), met])
+    misses = (own.excess_px - proposals @ own.normals.T) / own.noise_px
+    start = proposals[int(np.argmin(_misfits(misses).sum(axis=1)))]
+    known = NO_SHIFT_INFORMATION * np.eye(2)
+    problem = Problem((ShiftTerm(own), Quadratic.prior(known, np.zeros(2))), 2, np.add)
+    found = minimise(problem, start, Limits(tolerance=1e-6))
+    information = problem.equations(found.at).matrix - known
+    deviation = float(np.sqrt(np.trace(np.linalg.inv(information + 1e-9 * np.eye(2)))))
+    return _Shift(found.value, deviation, float(np.sqrt(found.value @ information @ found.value)))
+
+
+def _beyond_loose_masks(own: ShiftEquations, found: _Shift) -> float:
+    """By how many standard deviations the shift explains the planes better than masks that are loose do: the root of
+    the difference of their costs, 0 where loose masks do as well. Each equation proposes a looseness."""
+    deviation_px = LOOSE_PX * float(np.median(own.pixels))
+    proposed = np.append(own.outward * own.excess_px, 0.0)
+    loose = min(_cost(own, np.zeros(2), loose_px) + (loose_px / deviation_px) ** 2 for loose_px in proposed.tolist())
+    return float(np.sqrt(max(0.0, loose - _cost(own, found.shift_px, 0.0))))
+
+
+def _cost(own: ShiftEquations, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> float:
+    return float(_LOSS.cost(own.missed(shift_px, loose_px) ** 2).sum())
 
 
 def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -> bool:
@@ -135,6 +210,13 @@ def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -
     return all(after[k].sum() <= (1.0 - GAIN_LEAST) * before[k].sum() for k in (slice(None), others))
 
 
-def _misfits(miss: Float[np.ndarray, "*n"], noise: float) -> Float[np.ndarray, "*n"]:
-    """Robust misfit of each equation, 0 to 1."""
-    return GemanMcClure(ROBUST_SIGMAS).cost((miss / noise) ** 2) / ROBUST_SIGMAS**2
+def _disagrees(own: Float[np.ndarray, " n"], rest: Float[np.ndarray, " m"]) -> bool:
+    """Whether planes agree better without a camera's own than chance allows (F test of the mean misfits)."""
+    if not len(rest) or not rest.any():
+        return True
+    return bool(fdtrc(len(own), len(rest), own.mean() / rest.mean()) < CHANCE)
+
+
+def _misfits(miss: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Robust misfit of misses in standard deviations, 0 to 1."""
+    return _LOSS.cost(miss**2) / ROBUST_SIGMAS**2

@@ -23,23 +23,33 @@ LEAST_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 @dataclass(frozen=True, slots=True, eq=False)
 class Tangency:
     """One tangent plane of two cameras: in each camera the pixel where it touches, the unit normal of the epipolar line
-    (px), the plane's change of angle per pixel (rad), and by how many pixels its silhouette reaches beyond the plane
-    that touches the other's."""
+    (px), the plane's change of angle per pixel (rad), and by how many pixels its silhouette reaches along the normal
+    beyond the plane that touches the other's. ``outward``: 1.0 where normals point out of the subject, else -1.0."""
 
     cameras: tuple[str, str]
     pixels: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]
     steepness: tuple[float, float]
     normals: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]
     excess_px: tuple[float, float]
+    outward: float
 
 
-def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Tangency]:
-    """Every pair's outer tangent planes that both images hold whole."""
-    outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name]) for camera in rig}
+def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: float = 0.0) -> list[Tangency]:
+    """Every pair's outer tangent planes that both images hold whole; or of the lines ``inset_mm`` inside the outlines,
+    as long in space for every camera."""
+    middle = rig.centre_world()
+    insets_px = {camera.name: inset_mm / pixel_mm(camera, middle) if inset_mm else 0.0 for camera in rig}
+    outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name], insets_px[camera.name]) for camera in rig}
     found = []
     for one, two in combinations(rig, 2):
-        found += _pair(outlines[one.name], outlines[two.name], one, two)
+        if len(outlines[one.name].pixels) and len(outlines[two.name].pixels):
+            found += _pair(outlines[one.name], outlines[two.name], one, two)
     return found
+
+
+def pixel_mm(camera: Camera, place_world: Float[np.ndarray, " 3"]) -> float:
+    """Width (mm) of what a pixel shows at a place's distance."""
+    return float(np.linalg.norm(place_world - camera.centre_world)) / camera.intrinsics.fx
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,8 +61,8 @@ class _Outline:
     size: tuple[int, int]
 
     @classmethod
-    def of(cls, camera: Camera, silhouette: Silhouette) -> "_Outline":
-        hull = outer_hull(silhouette)
+    def of(cls, camera: Camera, silhouette: Silhouette, inset_px: float) -> "_Outline":
+        hull = outer_hull(silhouette, inset_px)
         return cls(hull, camera.rays_world(hull), (camera.intrinsics.width, camera.intrinsics.height))
 
     def cut(self, i: int) -> bool:
@@ -88,7 +98,7 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
     if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
         return []
     found = []
-    for pick in (np.argmax, np.argmin):
+    for pick, outward in ((np.argmax, 1.0), (np.argmin, -1.0)):
         i, j = int(pick(angles[0])), int(pick(angles[1]))
         if first.cut(i) or second.cut(j):
             continue
@@ -98,7 +108,7 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
         ]
         if min(np.linalg.norm(slope) for slope in slopes) >= LEAST_SLOPE:
             difference = float(angles[0][i] - angles[1][j])
-            found.append(tangency((one.name, two.name), pixels, (slopes[0], slopes[1]), difference))
+            found.append(tangency((one.name, two.name), pixels, (slopes[0], slopes[1]), difference, outward))
     return found
 
 
@@ -134,9 +144,11 @@ def tangency(
     pixels: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]],
     slopes: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]],
     difference: float,
+    outward: float,
 ) -> Tangency:
     """Two contour points that one plane should touch, by ``angle_slopes`` there and the difference (rad) of their
-    planes' angles, first less second."""
+    planes' angles, first less second; ``outward``: 1.0 where the angle grows out of the subject, else -1.0."""
     steepness = float(np.linalg.norm(slopes[0])), float(np.linalg.norm(slopes[1]))
     normals = slopes[0] / steepness[0], slopes[1] / steepness[1]
-    return Tangency(cameras, pixels, steepness, normals, (difference / steepness[0], -difference / steepness[1]))
+    excess_px = difference / steepness[0], -difference / steepness[1]
+    return Tangency(cameras, pixels, steepness, normals, excess_px, outward)

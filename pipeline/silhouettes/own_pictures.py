@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_assignment import FITTING_MISFIT, Assignment, find_assignment, own_misfit, ring_texts
+from pipeline.multiview.rig_agreement import wrong_rig
 from pipeline.multiview.triangulation import NoPoint, triangulate
 from rig.capture import Capture, Features, refiled
 from rig.errors import EigenheadError
@@ -53,6 +54,10 @@ class ExchangedPictures(EigenheadError):
         super().__init__(f"{found}; {reason}. File every picture under the name of the camera that took it")
 
 
+class WrongRig(EigenheadError):
+    """Pictures that these cameras cannot have taken."""
+
+
 def own_pictures(
     capture: Capture, rig: Rig, segmented: Segmentation, *, exchanged: Literal["repair", "refuse"]
 ) -> OwnPictures:
@@ -66,6 +71,7 @@ def own_pictures(
 
     Raises:
         ExchangedPictures: an exchange that may not be repaired, or is not sure enough to be.
+        WrongRig: no exchange explains that most cameras contradict the others.
     """
     plates = misplaced_plates(capture, rig)
     if plates and exchanged == "refuse":
@@ -77,6 +83,9 @@ def own_pictures(
     assignment = find_assignment(distinct, rig)
     if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
         raise ExchangedPictures(str(assignment), doubtful=not assignment.overwhelming)
+    wrong = None if assignment.pictures else wrong_rig(distinct, rig)
+    if wrong:
+        raise WrongRig(wrong)
     if assignment.pictures:
         capture = _filed_back(capture, assignment.pictures, rig)
         silhouettes = segmented(capture)

@@ -151,7 +151,8 @@ def _rotation_faults(rotation: np.ndarray, where: str) -> list[str]:
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
         return [f"{where}.camera_from_world.rotation is not orthonormal"]
     if np.linalg.det(rotation) < 0:
-        return [f"{where}.camera_from_world.rotation has determinant -1: a mirrored frame"]
+        told = f"{where}.camera_from_world.rotation has determinant -1: a mirrored frame; negate one axis of the world"
+        return [f"{told} in every pose, so that it is right-handed"]
     return []
 
 

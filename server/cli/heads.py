@@ -245,8 +245,8 @@ def experiments(
     name: Annotated[
         str,
         typer.Argument(
-            help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, posterior, "
-            "views, repeat, span or detail."
+            help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
+            "exchanges, false-alarms, posterior, views, repeat, span or detail."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",

@@ -42,7 +42,7 @@ from pipeline.fitting.rim import project_with_slopes
 from pipeline.fitting.rim_term import observed_rim, rim_rows
 from pipeline.fitting.surface_term import SurfaceTerm, surface_rows
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.camera_drift import ShiftTerm
+from pipeline.multiview.camera_drift import ShiftEquations, ShiftTerm
 from pipeline.multiview.triangulation import ReprojectionTerm
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity, rotation_from_vector
@@ -75,7 +75,8 @@ def reprojection() -> Case:
 
 def image_shift() -> Case:
     rng = np.random.default_rng(1)
-    term = ShiftTerm(rng.normal(size=(8, 2)), rng.normal(size=8), 0.5)
+    normals, outward = rng.normal(size=(8, 2)), rng.choice([-1.0, 1.0], 8)
+    term = ShiftTerm(ShiftEquations(normals, outward, rng.normal(size=8), rng.uniform(1.0, 2.0, 8), 0.4))
     return case(term, np.array([3.0, -1.0]), np.add, np.full(2, 1e-2))
 
 

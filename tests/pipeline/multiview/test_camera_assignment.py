@@ -5,11 +5,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from pipeline.experiments.robustness import knocked
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.multiview.camera_assignment import find_assignment, own_misfit, rings
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.benchmarks.drift_alarms import turned
 from tests.support.silhouette_subjects import captures_of, disturbed
 
 CALIBRATION_PX = 0.3
@@ -80,8 +80,8 @@ def test_knocked_cameras_keep_their_own_pictures(subjects):
     rig, captures = subjects
     rng = np.random.default_rng(4)
     for one, two in (("cam03", "cam04"), ("cam07", "cam08"), ("cam00", "cam01"), ("cam05", "cam06")):
-        knocked = turned(turned(rig, one, 1.5, rng), two, 0.7, rng)
-        assert not find_assignment(captures[1], knocked).pictures
+        off = knocked(knocked(rig, one, 1.5, rng), two, 0.7, rng)
+        assert not find_assignment(captures[1], off).pictures
 
 
 @pytest.mark.gl

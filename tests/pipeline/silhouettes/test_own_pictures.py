@@ -7,22 +7,23 @@ import pytest
 
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import Settings
-from pipeline.silhouettes.own_pictures import ExchangedPictures, misplaced_plates, own_pictures
+from pipeline.silhouettes.own_pictures import ExchangedPictures, WrongRig, misplaced_plates, own_pictures
 from pipeline.silhouettes.segment import segment
 from rig.capture import Capture, refiled
+from rig.studio.scene.layout import arrangement
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]  # the studio takes ten seconds for one capture
 EXCHANGE = {"cam04": "cam06", "cam06": "cam04"}
 
 
-def judged(shot, capture, exchanged: Literal["repair", "refuse"] = "repair"):
+def judged(shot, capture, exchanged: Literal["repair", "refuse"] = "repair", rig=None):
     """``own_pictures`` with the studio's true masks, filed as the pictures are: nothing here depends on their noise."""
     truth = {id(shot.capture.images[name]): mask for name, mask in shot.masks.items()}
 
     def segmented(filed: Capture):
         return {name: silhouette_from_mask(truth[id(image)]) for name, image in filed.images.items()}
 
-    return own_pictures(capture, shot.rig, segmented, exchanged=exchanged)
+    return own_pictures(capture, rig or shot.rig, segmented, exchanged=exchanged)
 
 
 def filed_right(shot, found):
@@ -65,6 +66,11 @@ def test_an_exchange_is_refused_where_the_settings_say_so(half_size_shot):
         judged(half_size_shot, refiled(half_size_shot.capture, pictures=EXCHANGE, plates=EXCHANGE), "refuse")
     with pytest.raises(ExchangedPictures, match="clean plates"):
         judged(half_size_shot, refiled(half_size_shot.capture, plates=EXCHANGE), "refuse")
+
+
+def test_pictures_of_another_rig_are_refused(half_size_shot):
+    with pytest.raises(WrongRig, match=r"cameras\.json is of another rig"):
+        judged(half_size_shot, half_size_shot.capture, rig=arrangement("a").scaled(0.5))
 
 
 def test_a_duplicated_picture_is_left_to_its_own_camera(half_size_shot):

@@ -1,0 +1,91 @@
+"""Rigs that did not take the pictures, planted: each is named with its remedy, and the rig that did is left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.eigenheads.model import load_model
+from pipeline.experiments.subjects import off_by
+from pipeline.imaging.silhouette import silhouette_from_mask
+from pipeline.multiview.rig_agreement import wrong_rig
+from rig.geometry import RigidTransform
+from rig.rig import Rig
+from rig.studio.scene.layout import ARRANGEMENTS_DEG, HEIGHT, WIDTH, arrangement, default_layout
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture(scope="module")
+def seen(renderer):
+    """A rig that is off by what a calibration leaves, and a bare head's true masks and silhouettes."""
+    rig, model = default_layout().scaled(0.5), load_model()
+    vertices = model.vertices(0.8 * np.random.default_rng(2).standard_normal(60))
+    with renderer.silhouette_set(rig, model.levels["full"].faces) as drawn:
+        masks = drawn.masks(vertices + (10.0, -15.0, 5.0))
+    return off_by(rig, 0.06, np.random.default_rng(0)), masks, silhouettes(masks)
+
+
+def silhouettes(masks):
+    return {name: silhouette_from_mask(np.ascontiguousarray(mask)) for name, mask in masks.items()}
+
+
+def reflected(rig, axis):
+    """The rig in a left-handed world, its rotations made proper by the same axis of the cameras."""
+    mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+
+    def pose(of):
+        return RigidTransform(mirror @ of.rotation @ mirror, mirror @ of.translation)
+
+    return Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
+
+
+def test_the_rig_that_took_the_pictures_is_left_alone(seen):
+    rig, _, of_all = seen
+    rng = np.random.default_rng(5)
+    assert wrong_rig(of_all, rig) is None
+    for count in range(3, 11):
+        assert wrong_rig(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_mirrored_rig_is_named(seen, axis):
+    rig, _, of_all = seen
+    found = wrong_rig(of_all, reflected(rig, axis))
+    assert found is not None
+    assert found.startswith("the rig is mirrored")
+    assert "write it right-handed" in found
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda mask: mask[:, ::-1], "flipped left to right"),
+        (lambda mask: mask[::-1, ::-1], "turned by 180 degrees"),
+    ],
+)
+def test_pictures_that_are_all_turned_alike_are_named(seen, change, word):
+    rig, masks, _ = seen
+    assert word in (wrong_rig(silhouettes({name: change(mask) for name, mask in masks.items()}), rig) or "")
+
+
+@pytest.mark.parametrize(("quarters", "word"), [(1, "90 degrees anticlockwise"), (3, "90 degrees clockwise")])
+def test_square_pictures_turned_by_90_degrees_are_named(seen, quarters, word):
+    """Others are refused when they are read: their sides are exchanged."""
+    rig, masks, _ = seen
+    beside, height = (WIDTH - HEIGHT) // 4, HEIGHT // 2
+    lenses = [replace(c.intrinsics, width=height, cx=c.intrinsics.cx - beside) for c in rig]
+    square = Rig(tuple(replace(camera, intrinsics=lens) for camera, lens in zip(rig, lenses, strict=True)))
+    cropped = {name: mask[:, beside:-beside] for name, mask in masks.items()}
+    assert wrong_rig(silhouettes(cropped), square) is None
+    turned = {name: np.rot90(mask, quarters) for name, mask in cropped.items()}  # anticlockwise
+    assert word in (wrong_rig(silhouettes(turned), square) or "")
+
+
+def test_the_calibration_of_another_rig_is_named(seen):
+    _, _, of_all = seen
+    for name in ARRANGEMENTS_DEG:
+        found = wrong_rig(of_all, arrangement(name).scaled(0.5))
+        assert found is not None
+        assert "is of another rig" in found
+        assert "calibrate it again" in found
