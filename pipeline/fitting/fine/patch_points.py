@@ -18,16 +18,18 @@ from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.depth_search import DEPTH_LEVEL, Round, find_places, pixels_per_mm, visibility_of
 from pipeline.fitting.photo.hair_mask import HairProbability, under_hair
 from pipeline.fitting.photo.images import Photographs, load_photographs
-from pipeline.fitting.photo.patches import Patches, make_patches
+from pipeline.fitting.photo.patches import Patches, arrays_of, make_patches
+from pipeline.fitting.photo.refine import RADIUS_WINDOWS
 from pipeline.fitting.rim import Views, pack_views
+from pipeline.kept_arrays import kept_arrays
 from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 from rig.rig import Rig
 
-SAMPLE_MM, CENTRE_MM = 0.7, 1.6
-SEARCH = Round(window_mm=1.2, blur_mm=0.3, reach_mm=0.8, steps=9)
+SAMPLE_MM, CENTRE_MM = 0.7, 1.6  # distance of samples and of patches
+SEARCH = Round(window_mm=1.2, blur_mm=0.3, reach_mm=0.8, steps=9)  # 1.6 and 2 mm wide ones were 0.005 mm worse
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,4 +101,12 @@ def _moved(camera: Camera, shift: Float[np.ndarray, " 6"]) -> Camera:
 
 @lru_cache(maxsize=1)  # studios work with one model
 def _patches(model: HeadModel) -> Patches:
-    return make_patches(model, sample_mm=SAMPLE_MM, centre_mm=CENTRE_MM, radius_mm=2.0 * SEARCH.window_mm)
+    level, mean = model.levels["full"], model.vertices(np.zeros(0))
+    sizes = {"sample_mm": SAMPLE_MM, "centre_mm": CENTRE_MM, "radius_mm": RADIUS_WINDOWS * SEARCH.window_mm}
+    kept = kept_arrays(
+        "fine-patches",
+        (mean, level.faces, level.face_region, sizes),
+        lambda: arrays_of(make_patches(model, **sizes)),
+        made_by=(make_patches, vertex_normals),
+    )
+    return Patches(**kept)
