@@ -74,8 +74,8 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
     """One subject: ``{<seen|hidden>_<region>_<quantity>: value}``, by the default level of detail."""
     subject, settings = known(), Settings(outputs=OutputSettings(surface="head"))
     found = reconstruct(subject.capture, subject.rig, model, settings, renderer=renderer, report=_silent)
-    level = "kernel" if found.detail is None else found.detail.level
-    return {"level": level, **skin_figures(subject, found.mesh_world, found.quality_mm, head_regions(model))}
+    measured = skin_figures(subject, found.mesh_world, found.quality_mm, head_regions(model))
+    return {"level": found.detail.level, **measured}
 
 
 def _silent(stage: str, fraction: float) -> None:
