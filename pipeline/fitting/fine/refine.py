@@ -55,8 +55,8 @@ class Round:
 
 COARSE = (Round(5.0, 10.0, 0.5, 3.0), Round(4.0, 7.0, 0.6, 2.0), Round(3.0, 5.0, 0.7, 1.0))
 FINE = (Round(2.0, 2.5, 0.7, 0.5),)
-LOOKS = 2  # at the photographs, each on the head that the last one left
-PATCH_ROBUST_MM, PATCH_REACH_MM = 0.3, 2.0  # a patch's own error, and how far about it no dense point is asked
+LOOKS_MM = (1.0, 0.5)  # robust scale of each look at the photographs, on the head that the last one left
+PATCH_REACH_MM = 2.0  # about a patch no dense point is asked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,8 +169,8 @@ def draw_to_surface(
         observed, seen = observe(base, now, faces, many, loose, each, settings, settings.floor_mm)
         posterior = solve_field(field, directions, observed)
         now = base + directions.moved(posterior.mean)
-    for _ in range(LOOKS if look is not None else 0):
-        both = with_patches(observed, look(now), base, now, faces)
+    for robust_mm in LOOKS_MM if look is not None else ():
+        both = with_patches(observed, look(now), base, now, faces, robust_mm)
         posterior = solve_field(field, directions, both)
         now = base + directions.moved(posterior.mean)
     deviation = field_deviation(posterior, base, normals, amplitude, seen, settings)
@@ -231,6 +231,7 @@ def with_patches(
     base: Float[np.ndarray, "v 3"],
     now: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
+    robust_mm: float,
 ) -> Observed:
     """What patches of the head as it stands ``now`` say, and dense points where no patch is near."""
     vertex, normals = found.vertex, vertex_normals(now, faces)[found.vertex]
@@ -238,7 +239,7 @@ def with_patches(
         return observed
     place = now[vertex] + found.place_mm[:, None] * normals
     offset = ((place - base[vertex]) * normals).sum(axis=1)
-    information = found.information / (1.0 + (found.place_mm / PATCH_ROBUST_MM) ** 2) ** 2
+    information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
     at = interpolated(base[observed.corner], observed.blend)
     alone = KDTree(base[vertex]).query(at, distance_upper_bound=PATCH_REACH_MM)[0] > PATCH_REACH_MM
     corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
