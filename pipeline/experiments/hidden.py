@@ -2,8 +2,8 @@
 interval holds it.
 
 Subjects are heads of the model's span in the studio, under hair that covers ears and forehead, and, where asked for,
-captures with a truth beside them. Each is reconstructed whole, as a job does it. Distances are from the true surface to
-the head as delivered, weighted by area; regions are the model's, carried to the truth by the nearest vertex. A place
+captures with a truth beside them. Each is reconstructed whole, at level ``fine``. Distances are from the true surface
+to the head as delivered, weighted by area; regions are the model's, carried to the truth by the nearest vertex. A place
 lies within its interval where that distance is below 1.96 times the deviation (``quality``) stated there.
 """
 
@@ -71,8 +71,8 @@ def hidden(
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
-    """One subject: ``{<seen|hidden>_<region>_<quantity>: value}``, by the default level of detail."""
-    subject, settings = known(), Settings(outputs=OutputSettings(surface="head"))
+    """One subject: ``{<seen|hidden>_<region>_<quantity>: value}``, by level ``fine``."""
+    subject, settings = known(), Settings(detail="fine", outputs=OutputSettings(surface="head"))
     found = reconstruct(subject.capture, subject.rig, model, settings, renderer=renderer, report=_silent)
     measured = skin_figures(subject, found.mesh_world, found.quality_mm, head_regions(model))
     return {"level": found.detail.level, **measured}
