@@ -54,7 +54,7 @@ class Round:
 
 
 COARSE = (Round(5.0, 10.0, 0.5, 3.0), Round(4.0, 7.0, 0.6, 2.0), Round(3.0, 5.0, 0.7, 1.0))
-FINE = (Round(2.0, 2.5, 0.7, 0.5),)
+FINE = Round(2.0, 2.5, 0.7, 0.5)
 LOOKS_MM = (1.0, 0.5)  # robust scale of each look at the photographs, on the head that the last one left
 PATCH_REACH_MM = 2.0  # about a patch no dense point is asked
 
@@ -149,27 +149,27 @@ def draw_to_surface(
         The same vertices displaced; where no point is near, as they were.
     """
     amplitude = np.maximum(deviation_mm, settings.least_amplitude_mm)
-    rounds = len(COARSE) + len(FINE)
     told = surface.chosen((surface.part != UNSEEN) & np.isfinite(surface.deviation_mm))
     many = thinned(told, settings.cell_mm)
     few = thinned(many, settings.coarse_cell_mm)
-    now, seen = vertices, np.zeros(len(vertices), bool)
+    now = vertices
     field = _laid_out(nodes.coarse, vertices, settings.coarse_length_mm)
     directions = free_directions(nodes.coarse, nodes.coarse.shape @ amplitude)
     for i, each in enumerate(COARSE):
-        report("fine", i / rounds)
+        report("fine", i / (len(COARSE) + 1))
         observed, _ = observe(vertices, now, faces, few, loose, each, settings, settings.coarse_floor_mm)
         now = vertices + directions.moved(solve_field(field, directions, observed).mean)
     base = now = unfolded(vertices, now, faces)
     normals = vertex_normals(base, faces)
     field = _laid_out(nodes.fine, base, settings.length_mm)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
-    for i, each in enumerate(FINE):
-        report("fine", (len(COARSE) + i) / rounds)
-        observed, seen = observe(base, now, faces, many, loose, each, settings, settings.floor_mm)
-        posterior = solve_field(field, directions, observed)
-        now = base + directions.moved(posterior.mean)
-    for robust_mm in LOOKS_MM if look is not None else ():
+    report("fine", len(COARSE) / (len(COARSE) + 1))
+    observed, seen = observe(base, now, faces, many, loose, FINE, settings, settings.floor_mm)
+    posterior = solve_field(field, directions, observed)
+    now = base + directions.moved(posterior.mean)
+    for robust_mm in LOOKS_MM:
+        if look is None:
+            break
         both = with_patches(observed, look(now), base, now, faces, robust_mm)
         posterior = solve_field(field, directions, both)
         now = base + directions.moved(posterior.mean)

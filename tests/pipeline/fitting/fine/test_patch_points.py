@@ -13,8 +13,8 @@ from tests.support.photo_scene import Scene, ellipsoid_model, photograph
 
 def fine_texture(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Waves of 5 to 9 mm in all directions: a pixel is 0.9 mm."""
-    waves = sum(np.sin(points @ np.array(k)) for k in ([1.2, 0.2, 0.2], [-0.2, 0.8, 0.4], [0.6, -0.5, 0.5]))
-    return 0.5 + 0.1 * waves
+    waves = np.sin(points @ np.array([[1.2, 0.2, 0.2], [-0.2, 0.8, 0.4], [0.6, -0.5, 0.5]]).T)
+    return 0.5 + 0.1 * waves.sum(axis=1)
 
 
 @pytest.fixture(scope="module")
