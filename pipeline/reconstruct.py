@@ -22,6 +22,7 @@ from pipeline.fitting.contour import finish, solve_contour
 from pipeline.fitting.fine.dense_points import dense_points
 from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
 from pipeline.fitting.fine.eyelids import look_at_eyes
+from pipeline.fitting.fine.patch_points import PatchSearch, patch_search
 from pipeline.fitting.fine.refine import Displaced, refine_to_surface
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
@@ -135,7 +136,10 @@ def reconstruct(
     if fine:
         clock("fine")
         surface = without_window_bias(surface, on_face, bias)
-        finer, detail = fine_head(model, fit, quality, surface, capture, rig, settings, report)
+        distances = {name: silhouettes[name].distance for name, used in fit.used.items() if used}
+        hair = {name: part.probability[..., HAIR] for name, part in parts.items()}
+        patches = patch_search(model, fit, capture.images, distances, hair, rig, settings.photo)
+        finer, detail = fine_head(model, fit, quality, surface, patches, capture, rig, settings, report)
         if finer is not None:
             mesh, quality = Mesh(finer.vertices, full.faces), finer.deviation_mm
     clock("texture")
@@ -342,6 +346,7 @@ def fine_head(
     fit: Fit,
     deviation_mm: np.ndarray,
     surface: SurfacePoints,
+    patches: PatchSearch,
     capture: Capture,
     rig: Rig,
     settings: Settings,
@@ -352,7 +357,15 @@ def fine_head(
     eyes = look_at_eyes(model, mesh.vertices, capture.images, rig)
     eigenheads = min(settings.fitting.modes, len(fit.coefficients))
     head = refine_to_surface(
-        fit, model, surface, settings.fine, eigenheads=eigenheads, deviation_mm=deviation_mm, eyes=eyes, report=report
+        fit,
+        model,
+        surface,
+        settings.fine,
+        eigenheads=eigenheads,
+        deviation_mm=deviation_mm,
+        eyes=eyes,
+        patches=patches,
+        report=report,
     )
     share = float(head.observed[model.levels["full"].face_region].mean())
     if share < settings.fine.least_share:

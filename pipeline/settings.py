@@ -123,6 +123,7 @@ class FineSettings:
     correlation_mm: float = 2.5  # radius within which points err alike: a window of dense matching
     common_mm: float = 0.1  # what points may err alike beyond that: cameras, shading
     views_least: int = 4  # that agree on a point: with fewer, beside hair and behind ears, it lies 1 mm too deep
+    hair_off_mm: float = 0.5  # how far beside the skin a point lies that is hair after all
     facing_least: float = 0.35  # cosine between a point's normal and its view: flatter windows smear
     least_share: float = 0.2  # of the face's vertices that the dense surface must show, or it is no use
     draws: int = 24  # of the posterior: its deviation is known to a seventh

@@ -73,6 +73,11 @@ def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.n
 
 def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
     """SKIN, HAIR or CLOTHES at each point, whichever its own cell (or, without one, the nearest) shows most."""
+    return (SKIN + part_shares(votes, points).argmax(axis=1)).astype(np.uint8)
+
+
+def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Probability of skin, hair and clothes at each point, of its own cell or, without one, the nearest."""
     cell = np.floor((points - votes.corner) / CELL_MM).astype(np.int64)
     inside = ((cell >= 0) & (cell < votes.size)).all(axis=1)
     keys = np.where(inside, _keys(cell, votes.size), -1)
@@ -80,4 +85,4 @@ def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.n
     lost = np.flatnonzero(votes.keys[row] != keys)
     if len(lost):
         row[lost] = KDTree(votes.places).query(points[lost])[1]
-    return (SKIN + votes.probability[row].argmax(axis=1)).astype(np.uint8)
+    return votes.probability[row]

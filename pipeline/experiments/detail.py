@@ -30,6 +30,7 @@ from pipeline.eigenheads.subdivision import vertex_areas
 from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import Records, Row
 from pipeline.experiments.span import weighted_quantile
+from pipeline.experiments.visible_surface import read_visible
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.fitting.rim import find_rim, make_topology, pack_views
@@ -50,8 +51,9 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Subject
+from rig.studio.scene.visible import VisiblePoints
 from rig.studio.sensor.faults import Fault
-from rig.studio.sensor.preset import PRESET
+from rig.studio.sensor.preset import PRESET, Preset
 
 Report = Callable[[str, float], None]
 Level = Literal["span", "kernel", "photo"]
@@ -71,6 +73,7 @@ class Known:
     rig: Rig
     mesh: Mesh  # world frame
     face: Bool[np.ndarray, " v"]
+    visible: VisiblePoints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +141,8 @@ def read_known(folder: Path) -> Known:
     """A capture folder and the truth beside it. Raises InputError."""
     capture, rig = read_capture(folder)
     truth = folder.with_name(folder.name + ".truth")
-    return Known(folder.name, capture, rig, read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy"))
+    mesh, face = read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy")
+    return Known(folder.name, capture, rig, mesh, face, read_visible(truth))
 
 
 def photographed(
@@ -149,6 +153,7 @@ def photographed(
     *,
     renderer: Renderer,
     fault: Fault | None = None,
+    preset: Preset = PRESET,
 ) -> Known:
     """A random head in the simulated studio. The same seed makes the same head, look and pose, whatever the fault."""
     rng = np.random.default_rng((9, seed))
@@ -158,8 +163,8 @@ def photographed(
     marks = {name: head.vertices[row] for name, row in population.landmarks.items()}
     subject = Subject(head, marks, level.face_region, f"seed-{seed}")
     faults = () if fault is None else (fault,)
-    shot = simulate(subject, default_layout(), PRESET, rng, renderer=renderer, faults=faults)
-    return Known(subject.name, shot.capture, shot.rig, shot.scene.head, level.face_region)
+    shot = simulate(subject, default_layout(), preset, rng, renderer=renderer, faults=faults)
+    return Known(subject.name, shot.capture, shot.rig, shot.scene.head, level.face_region, shot.scene.visible)
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:

@@ -16,6 +16,7 @@ from pipeline.experiments.convergence import convergence
 from pipeline.experiments.cost import cost
 from pipeline.experiments.drift import drift
 from pipeline.experiments.exchanges import exchanges, false_alarms
+from pipeline.experiments.hidden import hidden
 from pipeline.experiments.levels import levels
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
@@ -55,6 +56,7 @@ class Task:
     folder: Path | None
     report: Report
     simplex: int | None = None
+    captures: bool = False
 
 
 def run_experiment(
@@ -66,15 +68,17 @@ def run_experiment(
     folder: Path | None,
     report: Report,
     simplex: int | None = None,
+    captures: bool = False,
 ) -> Outcome:
     """Figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a table and
-    pictures are left there. ``simplex``: how many subjects of a table the simplex fits too.
+    pictures are left there. ``simplex``: how many subjects of a table the simplex fits too;
+    ``captures``: whether those of ``shared`` count beside the studio's heads.
 
     ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
     """
     if name not in EXPERIMENTS:
         raise UnknownExperiment(name)
-    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, simplex))
+    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, simplex, captures))
     pictures = found.pop("pictures", {})
     text = found.pop("markdown", None) or markdown.of_figures(found["figures"])
     if folder is not None:
@@ -142,6 +146,14 @@ def _detail(task: Task) -> Outcome:
         )
 
 
+def _hidden(task: Task) -> Outcome:
+    captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
+    with Renderer.create() as renderer:
+        return hidden(
+            task.head, captures, renderer=renderer, report=task.report, subjects=task.subjects or 8, folder=task.folder
+        )
+
+
 EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "table1": _table(tables.table1),
     "table2": _table(tables.table2),
@@ -161,6 +173,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "repeat": _drawn(repeat),
     "span": _span,
     "detail": _detail,
+    "hidden": _hidden,
 }
 
 

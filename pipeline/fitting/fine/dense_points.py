@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap, points_world
-from pipeline.dense.part_votes import HAIR, PartVotes, part_codes
+from pipeline.dense.part_votes import HAIR, SKIN, PartVotes, part_shares
 from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.settings import FineSettings
 from rig.mesh import Mesh, vertex_normals
@@ -37,9 +37,13 @@ def dense_points(
     points, normals, deviation = (np.concatenate(column) for column in zip(*clouds, strict=True))
     # A million pixels, a tenth of that in cells.
     cells = thinned(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), settings.cell_mm)
-    part = part_codes(votes, cells.points)
+    share = part_shares(votes, cells.points)
+    part = (SKIN + share.argmax(axis=1)).astype(np.uint8)
+    # What may be hair may lie where hair does: the deviation of both together.
+    doubt = np.where(part == SKIN, 1.0 - share[:, 0] / np.maximum(share.sum(axis=1), 1e-9), 0.0)
+    deviation = np.sqrt(cells.deviation_mm**2 + doubt * settings.hair_off_mm**2)
     part[_behind(cells.points, head_world)] = HAIR  # it bounds nothing there and pulls nothing
-    return replace(cells, part=part)
+    return replace(cells, deviation_mm=deviation, part=part)
 
 
 def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:

@@ -5,6 +5,8 @@ is no help. So each ear first moves as a similarity, from several starts, to whe
 it best (iterated closest points along the normals; Chen and Medioni 1992), and its surroundings follow smoothly.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
@@ -22,10 +24,21 @@ BLEND_MM = 10.0  # over which the head follows
 STARTS_MM = (0.0, -9.0, 9.0)  # up and down the head, and to and fro
 REACHES_MM = (14.0, 10.0, 7.0, 5.0, 4.0, 3.0, 3.0, 3.0)
 ROBUST_SHARE = 0.4  # of the reach
-LEAST_POINTS = 80
+LEAST_POINTS, LEAST_SHOWN = 80, 80  # about the ear, and on it
 TURN_SD, SCALE_SD, SHIFT_SD_MM = 0.2, 0.08, 8.0  # of the motion, against points worth ...
 POINT_SD_MM = 3.0  # ... that each: they are many, and the shape is another's
 AGREEMENT = 0.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """A similarity about the middle of an ear, with its robust cost (per point) and how many points it puts on it."""
+
+    cost: float
+    scale: float
+    turn: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, " 3"]  # mm
+    shown: int
 
 
 def with_ears_in_place(
@@ -64,7 +77,8 @@ def _registered(
     points: SurfacePoints,
     model: HeadModel,
 ) -> Float[np.ndarray, "v 3"]:
-    """All vertices under the motion that explains the points about the ear best."""
+    """All vertices under the motion that explains the points about the ear best; as they were where hardly a point
+    shows the ear itself: under hair the cheek before it would drag it along."""
     centre = vertices[ear].mean(axis=0)
     local = np.flatnonzero(np.linalg.norm(vertices - centre, axis=1) < np.linalg.norm(
         vertices[ear] - centre, axis=1).max() + BLEND_MM)  # fmt: skip
@@ -78,8 +92,10 @@ def _registered(
             shift = rise * up + forth * ahead
             if abs(rise) + abs(forth) <= max(STARTS_MM):  # up, down, to or fro
                 found.append(_descend(vertices[local], part, ear[local], points, centre, shift))
-    _, scale, turn, shift = min(found, key=lambda each: each[0])
-    return scale * (vertices - centre) @ turn.T + centre + shift
+    best = min(found, key=lambda each: each.cost)
+    if best.shown < LEAST_SHOWN:
+        return vertices
+    return best.scale * (vertices - centre) @ best.turn.T + centre + best.shift
 
 
 def _axes(
@@ -101,10 +117,10 @@ def _descend(
     points: SurfacePoints,
     centre: Float[np.ndarray, " 3"],
     shift: Float[np.ndarray, " 3"],
-) -> tuple[float, float, Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
-    """Robust cost (per point), scale, rotation about ``centre`` and shift of the best motion from one start."""
+) -> Motion:
+    """The best motion about ``centre`` from one start."""
     normals = vertex_normals(vertices, faces)
-    scale, turn, cost = 1.0, np.eye(3), np.inf
+    scale, turn, cost, shown = 1.0, np.eye(3), np.inf, 0
     prior = np.diag([TURN_SD**-2] * 3 + [SHIFT_SD_MM**-2] * 3 + [SCALE_SD**-2])
     for reach in REACHES_MM:
         now = scale * (vertices - centre) @ turn.T + centre + shift
@@ -117,6 +133,7 @@ def _descend(
         off = ((points.points[found.row] - at) * ahead).sum(axis=1)
         robust = ROBUST_SHARE * reach
         weight = 1.0 / (1.0 + (found.distance_mm / robust) ** 2) ** 2
+        shown = int(np.count_nonzero(ear[corner].all(axis=1)))
         missing = len(points.points) - len(found.row)
         square = found.distance_mm**2 / (found.distance_mm**2 + robust**2)
         cost = float((square.sum() + missing) / len(points.points))
@@ -127,4 +144,4 @@ def _descend(
         step = np.linalg.solve(weighted.T @ rows + prior, weighted.T @ off - prior @ state)
         turn = rotation_from_vector(step[:3]) @ turn
         shift, scale = shift + step[3:6], scale * float(np.exp(step[6]))
-    return cost, scale, turn, shift
+    return Motion(cost, scale, turn, shift, shown)

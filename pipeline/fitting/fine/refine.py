@@ -25,6 +25,7 @@ from pipeline.fitting.fine.ears import with_ears_in_place
 from pipeline.fitting.fine.eyelids import EyeEvidence, bridged, with_plain_lids
 from pipeline.fitting.fine.folds import unfolded
 from pipeline.fitting.fine.nodes import NodeMesh, Nodes, solving_nodes
+from pipeline.fitting.fine.patch_points import PatchPlaces, PatchSearch
 from pipeline.fitting.fine.smooth_field import SmoothField, smooth_field
 from pipeline.fitting.fine.solve import (
     Observed,
@@ -53,7 +54,9 @@ class Round:
 
 
 COARSE = (Round(5.0, 10.0, 0.5, 3.0), Round(4.0, 7.0, 0.6, 2.0), Round(3.0, 5.0, 0.7, 1.0))
-FINE = (Round(2.0, 2.5, 0.7, 0.5),)
+FINE = Round(2.0, 2.5, 0.7, 0.5)
+LOOKS_MM = (1.0, 0.5)  # robust scale of each look at the photographs, on the head that the last one left
+PATCH_REACH_MM = 2.0  # about a patch no dense point is asked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +78,7 @@ def refine_to_surface(
     eigenheads: int,
     deviation_mm: Float[np.ndarray, " v"],
     eyes: Mapping[str, EyeEvidence] | None = None,
+    patches: PatchSearch | None = None,
     report: Report = lambda stage, fraction: None,
 ) -> Displaced:
     """A fit's head drawn to the dense surface.
@@ -87,6 +91,7 @@ def refine_to_surface(
         eigenheads: how many of the modes are a population's; the rest are smooth deformations along the normals.
         deviation_mm: what the fit says of every vertex (``vertex_deviation_mm``).
         eyes: what photographs show between the lids (``look_at_eyes``); without it they stay as the model has them.
+        patches: the photographs, to be asked once more on the displaced head.
         report: told the share done.
 
     Returns:
@@ -109,6 +114,7 @@ def refine_to_surface(
         surface,
         settings,
         loose=regions["ears"] | regions["neck"],
+        look=patches and patches.places,
         report=report,
     )
     return replace(head, closed_eyes=closed)
@@ -123,6 +129,7 @@ def draw_to_surface(
     settings: FineSettings,
     *,
     loose: Bool[np.ndarray, " v"],
+    look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
     report: Report = lambda stage, fraction: None,
 ) -> Displaced:
     """A surface displaced to points of another, as far as those speak.
@@ -135,35 +142,38 @@ def draw_to_surface(
         surface: the points, same frame.
         settings: lengths and floors.
         loose: vertices that may be farther off than the others.
+        look: asks the photographs about the surface as it stands.
         report: told the share done.
 
     Returns:
         The same vertices displaced; where no point is near, as they were.
     """
     amplitude = np.maximum(deviation_mm, settings.least_amplitude_mm)
-    rounds = len(COARSE) + len(FINE)
     told = surface.chosen((surface.part != UNSEEN) & np.isfinite(surface.deviation_mm))
     many = thinned(told, settings.cell_mm)
     few = thinned(many, settings.coarse_cell_mm)
-    now, seen = vertices, np.zeros(len(vertices), bool)
+    now = vertices
     field = _laid_out(nodes.coarse, vertices, settings.coarse_length_mm)
     directions = free_directions(nodes.coarse, nodes.coarse.shape @ amplitude)
     for i, each in enumerate(COARSE):
-        report("fine", i / rounds)
+        report("fine", i / (len(COARSE) + 1))
         observed, _ = observe(vertices, now, faces, few, loose, each, settings, settings.coarse_floor_mm)
         now = vertices + directions.moved(solve_field(field, directions, observed).mean)
     base = now = unfolded(vertices, now, faces)
     normals = vertex_normals(base, faces)
     field = _laid_out(nodes.fine, base, settings.length_mm)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
-    deviation = amplitude
-    for i, each in enumerate(FINE):
-        report("fine", (len(COARSE) + i) / rounds)
-        observed, seen = observe(base, now, faces, many, loose, each, settings, settings.floor_mm)
-        posterior = solve_field(field, directions, observed)
+    report("fine", len(COARSE) / (len(COARSE) + 1))
+    observed, seen = observe(base, now, faces, many, loose, FINE, settings, settings.floor_mm)
+    posterior = solve_field(field, directions, observed)
+    now = base + directions.moved(posterior.mean)
+    for robust_mm in LOOKS_MM:
+        if look is None:
+            break
+        both = with_patches(observed, look(now), base, now, faces, robust_mm)
+        posterior = solve_field(field, directions, both)
         now = base + directions.moved(posterior.mean)
-        if i == len(FINE) - 1:
-            deviation = field_deviation(posterior, base, normals, amplitude, seen, settings)
+    deviation = field_deviation(posterior, base, normals, amplitude, seen, settings)
     return Displaced(unfolded(base, now, faces), deviation, seen)
 
 
@@ -213,6 +223,33 @@ def observe(
     seen[corner[speaks & skin]] = True
     information = robust / (variance * shared)
     return Observed(corner[kept], found.blend[kept], between[kept], offset[kept], information[kept]), seen
+
+
+def with_patches(
+    observed: Observed,
+    found: PatchPlaces,
+    base: Float[np.ndarray, "v 3"],
+    now: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    robust_mm: float,
+) -> Observed:
+    """What patches of the head as it stands ``now`` say, and dense points where no patch is near."""
+    vertex, normals = found.vertex, vertex_normals(now, faces)[found.vertex]
+    if not len(vertex):
+        return observed
+    place = now[vertex] + found.place_mm[:, None] * normals
+    offset = ((place - base[vertex]) * normals).sum(axis=1)
+    information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
+    at = interpolated(base[observed.corner], observed.blend)
+    alone = KDTree(base[vertex]).query(at, distance_upper_bound=PATCH_REACH_MM)[0] > PATCH_REACH_MM
+    corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
+    return Observed(
+        np.concatenate([observed.corner[alone], corner]),
+        np.concatenate([observed.blend[alone], blend]),
+        np.concatenate([observed.normal[alone], normals]),
+        np.concatenate([observed.offset_mm[alone], offset]),
+        np.concatenate([observed.information[alone], information]),
+    )
 
 
 def _crowd(

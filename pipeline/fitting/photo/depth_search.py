@@ -19,18 +19,20 @@ from pipeline.fitting.photo.correlation import Pictures, Samples, choose_views, 
 from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.fitting.photo.patches import Patches
 from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations, moved_views
+from pipeline.fitting.rim import Views
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import rasterise
 from pipeline.parallel_for import thread_count
 from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.geometry import RigidTransform
-from rig.mesh import vertex_normals
+from rig.mesh import Mesh
 
 DEPTH_LEVEL = "p95"  # of the z-buffer: it differs from the full mesh by far less than what may hide a sample
 LEAST_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
 EDGE_PX = 4  # nothing is read nearer to the image's edge
 WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
+BOUND_HEIGHT = 0.9  # correlation from which on hair says where it is
 SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring a surface within the window
 
 
@@ -63,20 +65,41 @@ def sample_visibility(
     """Draws the depth of the head in every view, and asks for every sample."""
     model, pose = problem.model, state.world_from_head
     cage = model.cage(state.coefficients)
-    vertices = pose.apply(model.levels["full"].operator @ cage)
-    coarse = pose.apply(model.levels[DEPTH_LEVEL].operator @ cage)
-    normals = vertex_normals(vertices, model.levels["full"].faces)
-    points, outward = patches.points(vertices), patches.normals(normals)
-    cameras = moved_cameras(problem, state)
+    head = Mesh(pose.apply(model.levels["full"].operator @ cage), model.levels["full"].faces)
+    coarse = Mesh(pose.apply(model.levels[DEPTH_LEVEL].operator @ cage), model.levels[DEPTH_LEVEL].faces)
+    return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks, settings)
+
+
+def visibility_of(
+    head_world: Mesh,
+    coarse_world: Mesh,
+    cameras: tuple[Camera, ...],
+    views: Views,
+    patches: Patches,
+    speaks: Bool[np.ndarray, " k"],
+    settings: PhotoSettings,
+) -> SampleVisibility:
+    """Who sees what of a head; a mesh that is ``coarse`` is drawn for what hides it.
+
+    Args:
+        head_world: the patches' mesh, mm.
+        coarse_world: the same surface with fewer triangles.
+        cameras: those of the views, where they stand.
+        views: their silhouettes.
+        patches: whose samples are asked for.
+        speaks: views whose photograph shows something.
+        settings: margins.
+    """
+    normals = head_world.normals()
+    points, outward = patches.points(head_world.vertices), patches.normals(normals)
 
     def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        camera, distance = cameras[k], distance_of(problem.views, k)
+        camera, distance = cameras[k], distance_of(views, k)
         facing, ends = np.zeros(len(points), np.float32), np.zeros((2, len(points), 2))
         if not speaks[k]:
             return facing, ends[0], ends[1]
-        depth, _ = rasterise(
-            camera.project(coarse), camera_depths(camera, coarse), model.levels[DEPTH_LEVEL].faces, *distance.shape
-        )
+        pixel, depth = camera.project(coarse_world.vertices), camera_depths(camera, coarse_world.vertices)
+        depth, _ = rasterise(pixel, depth, coarse_world.faces, *distance.shape)
         facing = facing_of(points, outward, camera, depth, distance, settings)
         seen = np.flatnonzero(facing)
         here, further = camera.project(points[seen]), camera.project(points[seen] + outward[seen])
@@ -85,7 +108,9 @@ def sample_visibility(
 
     with ThreadPoolExecutor(thread_count()) as pool:
         facing, pixel, along = zip(*pool.map(one, range(len(cameras))), strict=True)
-    return SampleVisibility(cameras, vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along))
+    return SampleVisibility(
+        cameras, head_world.vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along)
+    )
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
@@ -141,25 +166,15 @@ def observe(
     """Where the photographs see the surface, by the vertices at the patches' centres, and the vertices that they see
     without knowing where they are; a patch of ``hair`` says only that the head is no farther out than that. ``basis``:
     the model's modes at the centres."""
-    views = problem.views
-    steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
-    image, noise = blurred(photographs, each.blur_mm * scale)
-    weights, seen = patches.weights(each.window_mm), visibility.facing > 0
-    samples = Samples(visibility.pixel, visibility.along, seen)
-    pictures = Pictures(views.size, views.offset, image, noise)
-    grey = sweep(samples, pictures, steps)
-    view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
-    found = find_peaks(correlate(patches, weights, view, value, seen, grey, noise), steps)
-    blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
-    variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - found.height) / found.curvature
-    several, clear = view[:, 1] >= 0, found.inside & (found.height > settings.least_correlation)
-    kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > 0.9))))
+    found = find_places(photographs, patches, visibility, problem.views, scale, each, settings)
+    several, clear, view, value = found.several, found.clear, found.view, found.value
+    kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > BOUND_HEIGHT))))
     # Patches overlap: what they say together is worth their area, not their number.
     overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / settings.centre_mm**2)
-    information = 1.0 / (overlap * variance[kept])
+    information = 1.0 / (overlap * found.variance[kept])
     rows, place = patches.centre[kept], found.place[kept]
-    grams = gram_matrices(patches, kept, weights, view[kept], place, samples, pictures)
+    grams = gram_matrices(patches, kept, found.weights, view[kept], place, found.samples, found.pictures)
     stood, normal = visibility.vertices[rows], visibility.normals[rows]
     sensitivity = camera_sensitivity(
         view[kept], value[kept], grams, stood + place[:, None] * normal, normal, visibility.cameras
@@ -180,6 +195,46 @@ def observe(
         camera_gradient=camera_gradient - metric @ state.camera_shift.ravel(),
     )
     return observations, patches.centre[~hair & several & ~clear]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Where c patches look most alike, and what that was read from."""
+
+    place: Float[np.ndarray, " c"]  # mm along the normal
+    height: Float[np.ndarray, " c"]  # the correlation there
+    variance: Float[np.ndarray, " c"]  # mm^2
+    several: Bool[np.ndarray, " c"]  # two views or more see the patch
+    clear: Bool[np.ndarray, " c"]  # they agree, inside the reach
+    view: Int[np.ndarray, "c n"]
+    value: Float[np.ndarray, "c n"]
+    weights: Float[np.ndarray, " e"]
+    samples: Samples
+    pictures: Pictures
+
+
+def find_places(
+    photographs: Photographs,
+    patches: Patches,
+    visibility: SampleVisibility,
+    views: Views,
+    scale: Float[np.ndarray, " k"],
+    each: Round,
+    settings: PhotoSettings,
+) -> Places:
+    """Every patch moved along its normal through the photographs of the views that see it; ``scale``: px a mm."""
+    steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
+    image, noise = blurred(photographs, each.blur_mm * scale)
+    weights, seen = patches.weights(each.window_mm), visibility.facing > 0
+    samples = Samples(visibility.pixel, visibility.along, seen)
+    pictures = Pictures(views.size, views.offset, image, noise)
+    grey = sweep(samples, pictures, steps)
+    view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
+    peaks = find_peaks(correlate(patches, weights, view, value, seen, grey, noise), steps)
+    blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
+    variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
+    clear = peaks.inside & (peaks.height > settings.least_correlation)
+    return Places(peaks.place, peaks.height, variance, view[:, 1] >= 0, clear, view, value, weights, samples, pictures)
 
 
 def metric_rig(

@@ -183,6 +183,7 @@ def test_every_name_of_the_contract_is_there() -> None:
         ("convergence", "section52_largest_mm", 0.3),
         ("alignment", "off_mm_mean", 3.0),
         ("table1", "contour_l2_max", 1e3),
+        ("hidden", "studio_seen_face_median_mm", 0.2),
     ],
 )
 def test_a_short_run_leaves_rows_a_table_and_figures(tmp_path: Path, name: str, figure: str, most: float) -> None:
