@@ -38,7 +38,7 @@ from pipeline.results.camera_metrics import camera_figures, start_masks
 from pipeline.results.measurements import landmarks, measurements
 from pipeline.results.plausibility import plausibility_warnings, refuse
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.settings import Settings
+from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
 from pipeline.silhouettes.own_pictures import own_pictures
 from pipeline.silhouettes.segment import segment
 from pipeline.texture.atlas import paint_atlas
@@ -52,7 +52,6 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 
 VIEWS_LEAST = 3
-PHOTO_DETAIL = (None, "photo", "fine")  # levels that look inside the outline
 Report = Callable[[str, float], None]
 Segment = Callable[..., dict[str, Silhouette]]
 
@@ -123,7 +122,7 @@ def reconstruct(
     fit, model, detail, parts = fit_head(model, start, capture, silhouettes, rig, settings, renderer, clock)
     full, finer = model.levels["full"], None
     mesh, quality = fitted_mesh(model, fit), vertex_deviation_mm(model, fit)
-    fine = detail.level == "photo" and settings.detail == "fine"
+    fine = detail.level == "photo" and settings.detail in FINE_LEVELS
     maps: tuple[DepthMap, ...] = ()
     if fine or settings.outputs.surface != "head":
         clock("depth")
@@ -308,7 +307,7 @@ def fit_head(
     state, own = solved.state, solved.problem.model
     head_world = Mesh(state.world_from_head.apply(own.vertices(state.coefficients)), own.levels["full"].faces)
     parts = find_parts(own, head_world, capture, silhouettes, rig, settings, clock)
-    if settings.detail in PHOTO_DETAIL:
+    if settings.detail in PHOTO_LEVELS:
         hair = {name: part.probability[..., HAIR] for name, part in parts.items()}
         solved, detail = refine_with_photographs(solved, capture.images, settings.photo, hair=hair)
     model, eigenheads = solved.problem.model, min(settings.fitting.modes, len(model.modes))
@@ -325,7 +324,7 @@ def find_parts(
     clock: Clock,
 ) -> dict[str, PartMap]:
     """Skin, hair and clothes in every photograph, where the settings ask for what depends on it."""
-    if settings.detail not in PHOTO_DETAIL and settings.outputs.surface == "head":
+    if settings.detail not in PHOTO_LEVELS and settings.outputs.surface == "head":
         return {}
     clock("parts")
     places = {name: head_world.vertices[vertex] for name, vertex in model.landmarks.items()}

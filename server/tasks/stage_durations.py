@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from pipeline.settings import Settings
+from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
 from rig.atomic_write import write_atomically
 from rig.cache_folder import cache_folder
 
@@ -34,20 +34,18 @@ SIMPLEX_S = 200.0  # of the simplex's fit, at the same pace: a minute on idle co
 LEARNING = 0.3  # weight of the newest job; the first one of its kind counts alone
 LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
 
-PHOTO_DETAIL = (None, "photo", "fine")
-
 
 def kind_of(settings: Settings) -> str:
     """What decides which stages a job has and how long they are: "contour photo both", say."""
     atlas = " atlas" if settings.outputs.atlas else ""
-    return f"{settings.method} {settings.detail or 'photo'} {settings.outputs.surface}{atlas}"
+    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}{atlas}"
 
 
 def first_guess(settings: Settings) -> dict[str, float]:
     """Seconds of the stages that a job with these settings has, before one was seen."""
-    photographs = settings.method == "contour" and settings.detail in PHOTO_DETAIL
-    fine, bust = photographs and settings.detail == "fine", settings.outputs.surface != "head"
-    parts = settings.detail in PHOTO_DETAIL or bust
+    photographs = settings.method == "contour" and settings.detail in PHOTO_LEVELS
+    fine, bust = photographs and settings.detail in FINE_LEVELS, settings.outputs.surface != "head"
+    parts = settings.detail in PHOTO_LEVELS or bust
     left_out = {
         "parts": not parts,
         "fit again": not parts,

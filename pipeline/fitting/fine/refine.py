@@ -56,7 +56,7 @@ class Round:
 COARSE = (Round(5.0, 10.0, 0.5, 3.0), Round(4.0, 7.0, 0.6, 2.0), Round(3.0, 5.0, 0.7, 1.0))
 FINE = Round(2.0, 2.5, 0.7, 0.5)
 LOOKS_MM = (1.0, 0.5)  # robust scale of each look at the photographs, on the head that the last one left
-PATCH_REACH_MM = 2.0  # about a patch no dense point is asked
+PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches as far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
