@@ -19,7 +19,7 @@ def test_the_side_to_the_lamp_is_bright_and_the_other_is_not_black() -> None:
     towards = normals @ LAMP
     np.testing.assert_allclose(colours[towards.argmin()], DARKEST * SKIN, atol=1.0)
     np.testing.assert_allclose(colours[towards.argmax()], SKIN, atol=2.0)
-    blue = np.tile(np.uint8([0, 0, 200]), (len(normals), 1))
+    blue = np.tile(np.array([0, 0, 200], np.uint8), (len(normals), 1))
     assert lit(BALL, blue, darkest=1.0).tolist() == blue.tolist()
 
 
