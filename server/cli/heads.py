@@ -99,7 +99,7 @@ def verify(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """A studio's acceptance test: is a mannequin of known shape measured right, and twice the same?
+    """Judge a rig by a mannequin of known shape.
 
     Status 1 where a limit is missed."""
     from server.cli.reconstruct_local import settings_document

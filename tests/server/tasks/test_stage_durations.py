@@ -11,9 +11,10 @@ from server.tasks.stage_durations import FIRST_S, LEARNING, StageDurations, firs
 @pytest.mark.parametrize(
     ("document", "extra", "missing"),
     [
-        ({}, {"parts", "depth", "bust"}, {"fine", "atlas"}),
-        ({"detail": "fine"}, {"fine"}, {"atlas"}),
-        ({"outputs": {"atlas": True}}, {"atlas"}, {"fine"}),
+        ({}, {"parts", "depth", "fine", "bust"}, {"atlas"}),
+        ({"detail": "photo"}, {"parts", "depth", "bust"}, {"fine"}),
+        ({"detail": "photo", "outputs": {"surface": "head"}}, {"parts"}, {"depth", "fine", "bust"}),
+        ({"outputs": {"atlas": True}}, {"atlas"}, set()),
         ({"detail": "span", "outputs": {"surface": "head"}}, set(), {"parts", "depth", "fine", "bust", "atlas"}),
         ({"detail": "span"}, {"parts", "depth", "bust"}, {"fine"}),
     ],
@@ -40,7 +41,7 @@ def test_what_one_process_learns_every_other_finds(tmp_path: Path) -> None:
     assert StageDurations(file).of(span) == first_guess(span)
 
 
-@pytest.mark.parametrize("text", ["", "[1]", '{"contour photo both": 3}', '{"contour photo both": {"depth": "long"}}'])
+@pytest.mark.parametrize("text", ["", "[1]", '{"contour fine both": 3}', '{"contour fine both": {"depth": "long"}}'])
 def test_a_damaged_file_is_no_harm(tmp_path: Path, text: str) -> None:
     file = tmp_path / "durations.json"
     file.write_text(text)
