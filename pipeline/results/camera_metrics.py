@@ -53,15 +53,20 @@ def camera_figures(
         return CameraFigures(
             used=fit.used.get(camera.name, False),
             iou=_overlap(observed, fitted[camera.name], _zone(camera, face)),
-            contour_rms_px=float(np.sqrt((length @ residual**2) / length.sum())) if spoke else None,
+            contour_rms_px=_rms(residual, length) if spoke else None,
             excluded_share=float(length[np.abs(residual) > EXCLUDED_PX].sum() / length.sum()) if spoke else None,
             xor_cost=after,
             xor_cost_start=before,
             samples=int(here.sum()),
+            outside_rms_px=_rms(np.maximum(residual, 0.0), length) if spoke else None,
         )
 
     with ThreadPoolExecutor(thread_count()) as pool:  # distance transforms release the interpreter lock
         return dict(zip(rig.names, pool.map(figures_of, range(len(rig)), rig), strict=True))
+
+
+def _rms(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> float:
+    return float(np.sqrt((weight @ values**2) / weight.sum()))
 
 
 def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) -> list[float]:

@@ -26,7 +26,9 @@ class CameraFigures:
 
     ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none trimmed; ``excluded_share`` is the
     part of them (0 to 1) that the fit did not believe. ``xor_cost`` is eq. (5) of the fitted head, ``xor_cost_start``
-    of the head that the fit started from. A figure that a view cannot have (no rim sample in it) is None.
+    of the head that the fit started from. ``outside_rms_px`` counts only how far the head reaches beyond the mask: what
+    lies inside it may be hidden by hair, hands or shoulders. A figure that a view cannot have (no rim sample in it) is
+    None.
     """
 
     used: bool
@@ -36,6 +38,7 @@ class CameraFigures:
     xor_cost_start: float | None = None
     excluded_share: float | None = None
     samples: int = 0
+    outside_rms_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,10 +18,10 @@ from rig.geometry import Similarity
 WIDTHS = {f"cam{k:02}": 1024 for k in range(11)}
 
 
-def codes(coefficients, scale=1.0, rms_px=None):
+def codes(coefficients, scale=1.0, outside_px=None):
     fit = Fit("contour", coefficients, Similarity(scale, np.eye(3), np.zeros(3)), 1, "converged")
-    rms = dict.fromkeys(WIDTHS, 3.0) | (rms_px or {})
-    figures = {name: CameraFigures(True, 0.98, value, 100.0) for name, value in rms.items()}
+    outside = dict.fromkeys(WIDTHS, 0.2) | (outside_px or {})
+    figures = {name: CameraFigures(True, 0.98, 60.0, 100.0, outside_rms_px=value) for name, value in outside.items()}
     return [warning.code for warning in plausibility_warnings(fit, figures, WIDTHS)]
 
 
@@ -43,8 +43,9 @@ def test_a_scale_beyond_other_populations_is_named(scale, named):
 
 
 def test_a_camera_whose_contour_the_head_misses_is_named():
-    assert codes(np.zeros(60), rms_px={"cam03": 113.0}) == ["contour-implausible"]
-    assert codes(np.zeros(60), rms_px={"cam03": 33.0}) == []  # hair
+    assert codes(np.zeros(60), outside_px={"cam03": 13.0}) == ["contour-implausible"]
+    assert codes(np.zeros(60), outside_px={"cam03": 1.0}) == []
+    assert codes(np.zeros(60)) == []  # 60 px inside every outline: hair, shoulders
 
 
 def test_named_codes_become_failures():
