@@ -15,11 +15,11 @@ from pipeline.settings import read_table
 class Limits:
     """The most that each figure of a verification may be; ``least_covered`` is the least."""
 
-    face_rms_mm: float = 0.45  # deviation from the reference, of any capture
-    features_rms_mm: float = 1.0  # the same of eyes, nose and mouth, the worst of them
-    probing_form_mm: float = 5.5  # range of the deviations of 99.7 % of the face
+    face_rms_mm: float = 0.35  # deviation from the reference, of any capture
+    features_rms_mm: float = 0.8  # the same of eyes, nose and mouth, the worst of them
+    probing_form_mm: float = 4.5  # range of the deviations of 99.7 % of the face
     size_error_percent: float = 0.3
-    distance_mm: float = 5.5  # RMS of the landmark distances: what nothing fixes along the surface slides
+    distance_mm: float = 5.0  # RMS of the landmark distances: what nothing fixes along the surface slides
     repeatability_mm: float = 0.2  # scatter over the face along its normal, RMS
     least_covered: float = 0.9  # share of the face that the reference covers
 
