@@ -12,9 +12,17 @@ from tests.support.services import ROOT
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def opened_browser() -> Iterator[Browser]:
     with chromium() as opened:
         yield opened
+
+
+@pytest.fixture
+def browser(opened_browser: Browser) -> Iterator[Browser]:
+    """Pages left open would ask the studio for pictures, or a service that is gone, until the last test of a file."""
+    yield opened_browser
+    for context in opened_browser.contexts:
+        context.close()
 
 
 @pytest.fixture(scope="session")
