@@ -128,7 +128,7 @@ def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path) -> None:
         httpx.Client(base_url=service.url, timeout=120) as client,
     ):
         capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
-        settings = {"detail": "span"}
+        settings = {"detail": "span", "outputs": {"surface": "head"}}
         first = submit(service, capture, 0, settings)
         undisturbed = files_of(await_state(client, first, ("succeeded", "failed"), 240))
         assert {"head.ply", "head.glb", "contact_sheet.png"} <= undisturbed.keys()
