@@ -56,11 +56,7 @@ def exchanges(
 ) -> Outcome:  # fmt: skip
     """Shares of exchanges that are named and repaired, by kind."""
     records = Records(folder, "exchanges", key_of(model.sha256, *ASKED, *CONTOUR))
-    span, rows = with_modes(model, 60), []
-    for i, subject in enumerate(random_subjects(subjects, seed=18)):
-        report(subject.name, i / subjects)
-        compute = partial(_exchanged_row, span, subject, renderer, np.random.default_rng([18, i]), worn=bool(i % 2))
-        rows.append(records.row(subject.name, compute))
+    rows = _rows(_exchanged_row, model, renderer, records, report, seed=18, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
     for kind in KINDS:
         for quantity in ("named", "repaired"):
@@ -76,24 +72,31 @@ def false_alarms(
 ) -> Outcome:  # fmt: skip
     """Good captures in which pictures are called exchanged, or a camera moved or its mask loose."""
     records = Records(folder, "false_alarms", key_of(model.sha256, *ASKED, camera_drift))
-    span, rows = with_modes(model, 60), []
-    for i, subject in enumerate(random_subjects(subjects, seed=19)):
-        report(subject.name, i / subjects)
-        compute = partial(_told_of_good, span, subject, renderer, np.random.default_rng([19, i]), worn=bool(i % 2))
-        rows.append(records.row(subject.name, compute))
+    rows = _rows(_told_of_good, model, renderer, records, report, seed=19, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
     found |= {code: sum(code in row["codes"] for row in rows) for code in GOOD_CODES}
     return {"figures": found, "rows": rows, "markdown": markdown.of_figures(found)}
+
+
+def _rows(
+    row_of: Callable[..., Row], model: HeadModel, renderer: Renderer, records: Records,
+    report: Callable[[str, float], None], *, seed: int, subjects: int,
+) -> list[Row]:  # fmt: skip
+    """A row a capture, every other one worn, kept so that a stopped run goes on."""
+    span, rows = with_modes(model, 60), []
+    for i, subject in enumerate(random_subjects(subjects, seed=seed)):
+        report(subject.name, i / subjects)
+        compute = partial(row_of, span, subject, renderer, np.random.default_rng([seed, i]), worn=bool(i % 2))
+        rows.append(records.row(subject.name, compute))
+    return rows
 
 
 def _exchanged_row(
     model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator, *, worn: bool
 ) -> Row:
     true_rig = default_layout()
-    capture, rig = (
-        _filed(_seen(model, subject, true_rig, renderer, rng, worn=worn)),
-        off_by(true_rig, CALIBRATION_PX, rng),
-    )
+    capture = _filed(_seen(model, subject, true_rig, renderer, rng, worn=worn))
+    rig = off_by(true_rig, CALIBRATION_PX, rng)
     good = _asked(capture, rig)
     base_mm = _error_mm(model, subject, good.silhouettes, rig)
     row: Row = {"worn": worn, "good_codes": [warning.code for warning in good.warnings], "error_mm": base_mm}
