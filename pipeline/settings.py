@@ -122,10 +122,7 @@ class FineSettings:
     coarse_cell_mm: float = 2.5
     floor_mm: float = 0.05  # error of a point that its deviation does not show
     coarse_floor_mm: float = 0.3  # the nodes' edges are 4 mm long: relief that they cannot follow
-    correlation_mm: float = (
-        4.0  # radius within which points err alike: windows of dense matching overlap. With 2.5 heads
-    )
-    # that the fit knows exactly take up more of their errors (0.076 for 0.070 mm), recorded ones are alike
+    correlation_mm: float = 4.0  # radius within which points err alike: windows of dense matching overlap
     common_mm: float = 0.1  # what points may err alike beyond that: cameras, shading
     views_least: int = 4  # that agree on a point: with fewer, beside hair and behind ears, it lies 1 mm too deep
     hair_off_mm: float = 0.5  # how far beside the skin a point lies that is hair after all
