@@ -31,12 +31,14 @@ from rig.mesh import Mesh
 Field = Float32[np.ndarray, " n"]
 Points = Float[np.ndarray, "m 3"]
 
-COARSEST_MM = 8.0  # the first level's step is at least this: the whole box then has some 100,000 nodes
-REACH, BEHIND = 3.0, 2.5  # steps before and behind a surface within which its distance counts
+COARSEST_MM = 5.0  # the first level's step is at least this: the whole box then has half a million nodes
+# Steps before and behind a surface within which its distance counts. Distances outside are cut off so short because the
+# inside of a shoulder is no thicker: a membrane between +3 and -1 step moves its surface inwards, or away.
+REACH, BEHIND = 1.5, 2.5
 AGREEMENT = 1.0  # steps (and at least a millimetre) within which votes are of one surface
-UNIT_MM, FLOOR_MM = 0.5, 0.1  # a vote of the first deviation weighs one; none is better than the second
+UNIT_STEPS, FLOOR_MM = 2 / 3, 0.1  # a vote of the first deviation weighs one; none is better than the second
 DATA_WEIGHT = 10.0  # of a vote, by that of one edge of the membrane
-BLEND_MM = 20.0  # from the edge of what is seen to where the guess prevails: its weight is (step / that)^2
+BLEND_MM = 1.5  # from the edge of what is seen to where the guess prevails: its weight is (step / that)^2
 UNDECIDED_BLEND_MM = 150.0  # the same where there is hardly a guess
 SWEEPS, FINE_SWEEPS = 60, 16
 FACTOR, FINE_FACTOR = 1.8, 1.4  # of over-relaxation
@@ -90,7 +92,7 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
     """What the views say of every node."""
     value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
     step = grid.step_mm
-    limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_MM, FLOOR_MM])
+    limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
     place = (grid.index, grid.corner, step)
     given = (*place, views.packed(), limits, value, weight, bound)
     in_threads(len(grid), lambda first, last: vote(*given, first, last))

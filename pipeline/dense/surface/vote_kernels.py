@@ -13,6 +13,7 @@ VIEWS_MOST = 64
 PLANE_SHARE = 0.3  # of the way along the ray that a place before a surface is off at least, however flat that is seen
 THICKEST_MM = 60.0  # of a body behind its surface, where no silhouette bounds it
 UNDECIDED = -1.0  # weight of a place inside of the outlines that only their guess beyond the photographs leaves out
+WIDENING = 1.0  # beyond a photograph a body may widen by as much as it lies beyond it: shoulders do
 FLATTEST = 0.1  # cosine beyond which a tangent plane says nothing of a place beside it
 UNKNOWN_MM = 1e9  # deviations beyond are infinite
 
@@ -56,7 +57,7 @@ def vote(
             place[axis] = corner[axis] + step_mm * index[n, axis]
         count = 0
         hull, hull_next = -1e9, -1e9  # largest and second largest distance outside a silhouette
-        guess = -1e9  # the largest one with silhouettes that go on beyond their photographs
+        guess = -1e9  # the largest one with silhouettes that go on, widening, beyond their photographs
         hidden = 1e9  # smallest depth behind a surface that is seen
         framed, framed_next = 1e9, 1e9  # smallest and second smallest distance outside a photograph
         for v in range(len(cameras)):
@@ -68,7 +69,7 @@ def vote(
             scale = depth / cameras[v, LENS]
             edge, off = (pixels[at, FRAME] + beyond) * scale, pixels[at, OUTLINE] * scale
             framed, framed_next = min(framed, edge), min(framed_next, max(framed, edge))
-            guess = max(guess, off)
+            guess = max(guess, off - WIDENING * beyond * scale)
             if edge > 0.0:
                 continue
             hull, hull_next = max(hull, off), max(hull_next, min(hull, off))
