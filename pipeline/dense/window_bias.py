@@ -10,11 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 
+from pipeline.dense.cells import sorted_into_cells
+from pipeline.dense.window_bias_kernels import windowed_heights
+from pipeline.parallel_for import in_threads
 from rig.mesh import Mesh
 
-WINDOW_MM, NEIGHBOURS = 2.5, 48  # standard deviation of the window, and vertices that it is summed over
+WINDOW_MM, REACH_MM = 2.5, 6.25  # standard deviation of the window, and where it ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +30,10 @@ class WindowBias:
 def windowed_height(vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
     """How far (mm, along the normal) the mean of the surface over a window lies above each vertex; sheets that face
     another way do not count."""
-    distance, near = KDTree(vertices).query(vertices, k=min(NEIGHBOURS, len(vertices)), workers=-1)
-    weight = np.exp(-0.5 * (distance / WINDOW_MM) ** 2)
-    weight *= np.maximum(np.einsum("vkc,vc->vk", normals[near], normals), 0.0)
-    height = np.einsum("vkc,vc->vk", vertices[near], normals) - (vertices * normals).sum(axis=1)[:, None]
-    return (weight * height).sum(axis=1) / weight.sum(axis=1)
+    height_mm, cells = np.zeros(len(vertices)), sorted_into_cells(vertices, REACH_MM)
+    given = (np.ascontiguousarray(vertices), np.ascontiguousarray(normals), *cells, WINDOW_MM, REACH_MM, height_mm)
+    in_threads(len(vertices), lambda first, last: windowed_heights(*given, first, last))
+    return height_mm
 
 
 def without_bias(mesh_world: Mesh, measured: Bool[np.ndarray, " v"], bias: WindowBias) -> Mesh:

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline.dense.cells import sorted_into_cells
 from pipeline.dense.surface.crossing_kernels import crossing_triangles
 from rig.mesh import Mesh
 
@@ -17,13 +18,10 @@ def crossing_faces(
     corners = vertices[faces]
     low = corners.min(axis=1)
     wide = max(float((corners.max(axis=1) - low).max()), 1e-9)
-    cell = np.floor((corners.mean(axis=1) - low.min(axis=0)) / wide).astype(np.int64) + 1
-    spans = cell.max(axis=0) + 2
-    keys = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
-    order = np.argsort(keys, kind="stable")
+    cells = sorted_into_cells(corners.mean(axis=1), wide)
     crossing = np.zeros(len(faces), bool)
     chosen = np.ones(len(faces), bool) if active is None else active
-    crossing_triangles(vertices, faces, order, keys[order], spans, chosen, crossing)
+    crossing_triangles(vertices, faces, *cells, chosen, crossing)
     return crossing
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.dense.part_votes import HAIR, SKIN
-from pipeline.dense.window_bias import NEIGHBOURS, WINDOW_MM, WindowBias, windowed_height, without_bias
+from pipeline.dense.window_bias import REACH_MM, WINDOW_MM, WindowBias, windowed_height, without_bias
 from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from rig.mesh import Mesh
@@ -32,12 +32,12 @@ def seen_through_windows(wall: Mesh, common_mm: float, share: float) -> SurfaceP
 
 def test_the_mean_over_a_window_lies_below_a_dome_by_its_curvature() -> None:
     """r^2 / 2R below the top at a distance r. Of a Gaussian cut off at rho, r^2 is 2 sigma^2 (1 - t / (e^t - 1)) in the
-    mean, with t = rho^2 / 2 sigma^2; so many neighbours 1 mm apart reach to rho^2 = neighbours / pi."""
+    mean, with t = rho^2 / 2 sigma^2."""
     x, y = (each.ravel() for each in np.meshgrid(np.arange(-20, 21.0), np.arange(-20, 21.0)))
     vertices = np.column_stack([x, y, np.sqrt(80.0**2 - x**2 - y**2)])
     top = int(np.argmin(np.hypot(x, y)))
     found = windowed_height(vertices, vertices / 80.0)[top]
-    t = NEIGHBOURS / np.pi / (2 * WINDOW_MM**2)
+    t = REACH_MM**2 / (2 * WINDOW_MM**2)
     assert found == pytest.approx(-(WINDOW_MM**2) / 80.0 * (1 - t / np.expm1(t)), rel=0.03)
 
 
