@@ -17,7 +17,7 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 def heads(rows: Sequence[Sequence[tuple[str, Mesh]]]) -> ImageRgb:
     """Figure 4: shaded heads (head frame) in rows, seen from the subject's left front."""
-    return np.vstack([np.hstack([_labelled(clay(mesh), text) for text, mesh in row]) for row in rows])
+    return np.vstack([np.hstack([labelled(clay(mesh), text) for text, mesh in row]) for row in rows])
 
 
 def differences(rows: Sequence[tuple[str, Masks, Masks]], cameras: Sequence[str]) -> ImageRgb:
@@ -33,7 +33,8 @@ def differences(rows: Sequence[tuple[str, Masks, Masks]], cameras: Sequence[str]
     return contact_sheet(drawn)
 
 
-def _labelled(image: ImageRgb, text: str) -> ImageRgb:
+def labelled(image: ImageRgb, text: str) -> ImageRgb:
+    """The image with a line of text at its top."""
     out = image.copy()
     cv2.putText(out, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
     return out

@@ -24,6 +24,7 @@ from pipeline.experiments.posterior_check import posterior_check
 from pipeline.experiments.repeat import repeat
 from pipeline.experiments.robustness import robustness
 from pipeline.experiments.views import views
+from pipeline.experiments.visible import visible
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.images import write_image
@@ -146,12 +147,16 @@ def _detail(task: Task) -> Outcome:
         )
 
 
-def _hidden(task: Task) -> Outcome:
-    captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
-    with Renderer.create() as renderer:
-        return hidden(
-            task.head, captures, renderer=renderer, report=task.report, subjects=task.subjects or 8, folder=task.folder
-        )
+def _seen(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
+    """An experiment on studio heads and, where asked for, on the shared captures."""
+
+    def run(task: Task) -> Outcome:
+        captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
+        count = {"subjects": task.subjects} if task.subjects else {}
+        with Renderer.create() as renderer:
+            return experiment(task.head, captures, renderer=renderer, report=task.report, folder=task.folder, **count)
+
+    return run
 
 
 EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
@@ -173,7 +178,8 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "repeat": _drawn(repeat),
     "span": _span,
     "detail": _detail,
-    "hidden": _hidden,
+    "hidden": _seen(hidden),
+    "visible": _seen(visible),
 }
 
 

@@ -246,7 +246,7 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail or hidden."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden or visible."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
@@ -254,7 +254,7 @@ def experiments(
     simplex: Annotated[
         int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
     ] = None,
-    captures: Annotated[bool, typer.Option(help="hidden: the captures of --shared, too.")] = False,
+    captures: Annotated[bool, typer.Option(help="hidden, visible: the captures of --shared, too.")] = False,
     shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
     out: Annotated[
         Path | None, typer.Option(help="Keeps rows there, so that a stopped run goes on; and the table and pictures.")

@@ -36,7 +36,7 @@ COARSEST_MM = 5.0  # the first level's step is at least this: the whole box then
 # inside of a shoulder is no thicker: a membrane between +3 and -1 step moves its surface inwards, or away.
 REACH, BEHIND = 1.5, 2.5
 AGREEMENT = 1.0  # steps (and at least a millimetre) within which votes are of one surface
-UNIT_STEPS, FLOOR_MM = 2 / 3, 0.1  # a vote of the first deviation weighs one; none is better than the second
+UNIT_STEPS, FLOOR_MM = 1 / 3, 0.1  # a vote of the first deviation weighs one; none is better than the second
 DATA_WEIGHT = 10.0  # of a vote, by that of one edge of the membrane
 BLEND_MM = 1.5  # from the edge of what is seen to where the guess prevails: its weight is (step / that)^2
 UNDECIDED_BLEND_MM = 150.0  # the same where there is hardly a guess

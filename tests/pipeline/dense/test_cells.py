@@ -22,4 +22,5 @@ def test_keys_are_sorted_and_the_outermost_cells_are_empty() -> None:
     cells = sorted_into_cells(np.random.default_rng(1).normal(size=(50, 3)), 0.7)
     assert (np.diff(cells.keys) >= 0).all()
     index = np.stack(np.unravel_index(cells.keys, cells.spans))
-    assert (index >= 1).all() and (index < cells.spans[:, None] - 1).all()
+    assert (index >= 1).all()
+    assert (index < cells.spans[:, None] - 1).all()

@@ -1,0 +1,144 @@
+"""All that the cameras see: studio heads under all the hair that the studio has, and captures with a truth beside them,
+by part: recall, precision, what head.ply and bust.ply differ by, seconds; and each in clay beside the truth.
+
+``precision`` is of the whole closed surface, within 25 mm of what is seen. Its own guess at what nobody sees begins
+there, too, so that no closed surface reaches 1; ``precision_seen`` is of what the file itself calls seen.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.dense.part_votes import SKIN
+from pipeline.dense.surface.fusion import BustSurface
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
+from pipeline.eigenheads.model import HeadModel
+from pipeline.experiments.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
+from pipeline.experiments.hidden import figures
+from pipeline.experiments.outcome import Outcome, Row
+from pipeline.experiments.pictures import labelled
+from pipeline.experiments.records import Records, key_of
+from pipeline.experiments.visible_surface import score_visible
+from pipeline.reconstruct import reconstruct
+from pipeline.results.clay import clay
+from pipeline.settings import Settings
+from rig.errors import EigenheadError
+from rig.formats.images import write_image
+from rig.mesh import Mesh
+from rig.render.renderer import Renderer
+from rig.studio.scene.visible import VisiblePoints
+from rig.studio.sensor.preset import PRESET
+
+Report = Callable[[str, float], None]
+STYLES = (
+    "short", "over-ears", "long", "curly", "fringe", "bun", "beard", "bald", "cap", "glasses", "long,beard",
+    "curly,glasses",
+)  # fmt: skip
+SPLAT_MM = 1.8  # half the side of a point of the truth in pictures: points are 1.5 mm apart in the mean
+AZIMUTHS_DEG = (30.0, -75.0)
+
+
+def visible(
+    model: HeadModel,
+    captures: Mapping[str, Path],
+    *,
+    renderer: Renderer,
+    report: Report,
+    subjects: int = len(STYLES),
+    folder: Path | None = None,
+) -> Outcome:
+    """``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean over the group: ``studio``,
+    or a capture by its name.
+
+    Args:
+        model: fitted, and drawn from.
+        captures: folders with a truth beside them, by name.
+        renderer: for the studio.
+        report: told the subject and the share done.
+        subjects: heads in the studio, one a style of ``STYLES`` in turn.
+        folder: keeps rows, so that a stopped run goes on, and a picture of every subject.
+    """
+    records = Records(folder, "visible", key_of(model.sha256, Settings()))
+    jobs: list[tuple[str, str, Callable[[], Known]]] = []
+    for number in range(subjects):
+        style = STYLES[number % len(STYLES)]
+        preset = replace(PRESET, hairstyle=tuple(style.split(",")))
+        draw = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, 300 + number, renderer=renderer)
+        jobs.append(("studio", f"{number:02}-{style.replace(',', '-')}", partial(draw, preset=preset)))
+    jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
+    rows = []
+    for done, (group, name, read) in enumerate(jobs):
+        report(name, done / len(jobs))
+        picture = None if folder is None else folder / f"visible-{name}.png"
+        compute = partial(known_row, read, model, renderer, picture)
+        rows.append({"name": name, "group": group, **records.row(name, compute)})
+    report("done", 1.0)
+    return {"figures": figures(rows), "rows": rows}
+
+
+def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
+    """One subject by the default job."""
+    subject, before = known(), time.process_time()
+    found = reconstruct(subject.capture, subject.rig, model, Settings(), renderer=renderer, report=_silent)
+    seconds = time.process_time() - before
+    if found.bust is None:
+        raise EigenheadError(f"{subject.name}: no bust ({'; '.join(str(warning) for warning in found.warnings)})")
+    bust = found.bust.surface
+    if picture is not None:
+        in_head = found.fit.world_from_head.inverse()
+        meshes = {"truth": splats(subject.visible), "bust.ply": bust.mesh_world, "head.ply": found.mesh_world}
+        write_image(
+            picture, _row(subject.name, {k: Mesh(in_head.apply(m.vertices), m.faces) for k, m in meshes.items()})
+        )
+    whole = score_visible(subject.visible, bust.mesh_world)
+    seen = score_visible(subject.visible, seen_of(bust))
+    return {
+        **{key: value for key, value in whole.flat().items() if key.endswith(("within_2mm", "median", "closed"))},
+        **{f"precision_seen_{part}_within_2mm": figures["within_2mm"] for part, figures in seen.precision.items()},
+        "head_to_bust_median_mm": float(np.median(head_to_bust(found.mesh_world, bust))),
+        "cpu_s": seconds,
+    }
+
+
+def seen_of(bust: BustSurface) -> Mesh:
+    """The triangles whose corners some photograph measures."""
+    return Mesh(bust.mesh_world.vertices, bust.mesh_world.faces[bust.seen[bust.mesh_world.faces].all(axis=1)])
+
+
+def head_to_bust(head_world: Mesh, bust: BustSurface) -> Float[np.ndarray, " n"]:
+    """Distances (mm) of the bust's seen skin to the head, where the head has any within 5 mm."""
+    skin = bust.mesh_world.vertices[bust.part == SKIN]
+    far = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(skin).distances
+    return far[far < 5.0]
+
+
+def splats(points: VisiblePoints) -> Mesh:
+    """A square about each point, across its normal: what there is to see of a truth."""
+    normals = points.normals.astype(float)
+    aside = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    aside *= SPLAT_MM / np.linalg.norm(aside, axis=1, keepdims=True)
+    along = np.cross(normals, aside)
+    corners = [points.points + i * aside + j * along for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    first = 4 * np.arange(len(normals))[:, None]
+    faces = np.concatenate([first + np.array([[0, 1, 2]]), first + np.array([[0, 2, 3]])])
+    return Mesh(np.stack(corners, axis=1).reshape(-1, 3), faces.astype(np.int32))
+
+
+def _row(name: str, in_head: Mapping[str, Mesh]) -> np.ndarray:
+    low, high = in_head["bust.ply"].vertices.min(axis=0), in_head["bust.ply"].vertices.max(axis=0)
+    return np.hstack(
+        [
+            labelled(clay(mesh, azimuth_deg=azimuth, box=(low, high)), f"{name}: {title}")
+            for azimuth in AZIMUTHS_DEG
+            for title, mesh in in_head.items()
+        ]
+    )
+
+
+def _silent(stage: str, fraction: float) -> None:
+    pass
