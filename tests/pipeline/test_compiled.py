@@ -7,11 +7,13 @@ import sys
 from pathlib import Path
 from types import FunctionType
 
+import llvmlite.binding
 import pytest
 
 from pipeline import compiled
 from pipeline.compiled import function_digest, njit
 
+ROOT = Path(__file__).parents[2]
 SCALE = 2.0
 
 
@@ -101,7 +103,7 @@ def test_another_process_with_another_hash_seed_finds_it(folder: Path) -> None:
         subprocess.run(
             [sys.executable, "-c", code],
             env=os.environ | {"PYTHONHASHSEED": seed},
-            cwd=Path(__file__).parents[2],
+            cwd=ROOT,
             capture_output=True,
             text=True,
             check=True,
@@ -112,9 +114,22 @@ def test_another_process_with_another_hash_seed_finds_it(folder: Path) -> None:
     assert found == ["0\n", "1\n"]
 
 
+@pytest.mark.parametrize("given", [{}, {"NUMBA_CPU_NAME": "generic"}])
+def test_what_one_machine_compiled_runs_on_the_next(given: dict[str, str]) -> None:
+    """For one level of x86-64 where the machine has it; NUMBA_CPU_NAME goes before."""
+    features = llvmlite.binding.get_host_cpu_features()
+    if not all(features.get(feature) for feature in compiled.PORTABLE_FEATURES):
+        pytest.skip("another processor: it compiles for itself")
+    code = "from pipeline.compiled import machine; print(machine())"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")} | given
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert repr(given.get("NUMBA_CPU_NAME", compiled.PORTABLE_CPU)) in done.stdout
+
+
 def test_every_compiled_loop_of_the_project_is_kept() -> None:
-    root = Path(__file__).parents[2]
     for room in ("rig", "pipeline", "calibration", "server"):
-        for path in (root / room).rglob("*.py"):
-            if path != root / "pipeline" / "compiled.py":
+        for path in (ROOT / room).rglob("*.py"):
+            if path != ROOT / "pipeline" / "compiled.py":
                 assert "from numba import njit" not in path.read_text(encoding="utf-8"), f"{path}: pipeline.compiled"
