@@ -64,7 +64,7 @@ def prepare_kernels(report: Report, settings: "Settings | None" = None) -> Prepa
     missing = [kernel for kernel in kernels if not kernel.is_kept()]
     if not missing or not _can_keep():
         return Prepared(0, len(missing), len(kernels))
-    log.warning("compiling %d loops, once for this machine and version", len(missing))
+    log.warning("compiling what a job calls (loops: %d), once for this machine and version", len(missing))
     groups = sorted(by_module(missing), key=lambda group: sum(kernel.size() for kernel in group), reverse=True)
     work = _Work(groups, len(missing), report)
     work.told(0)
