@@ -5,7 +5,8 @@ BIN := .venv/bin
 setup:       ## uv, the locked environment, an EGL; nothing where nothing is missing
 	@deploy/setup.sh
 
-demo: setup  ## the main job: simulated rig, capture, service, textured head in out/demo
+demo:        ## the main job: simulated rig, capture, service, textured head in out/demo
+	@deploy/setup.sh --quick
 	$(BIN)/eigenhead demo --out out/demo
 
 serve: setup ## the service with its data in out/data

@@ -3,6 +3,7 @@
 #
 #   deploy/setup.sh           what `make demo`, `make test` and the service need
 #   deploy/setup.sh --tests   also the Debian packages without which some tests skip
+#   deploy/setup.sh --quick   what `make demo` needs: each command compiles the loops of its own job before it begins
 #
 # Needs bash and python3 (3.11 or newer), nothing else. As root it installs missing Debian packages; without root it
 # names the one command to run. Says what it did; does nothing, in milliseconds, where nothing is to do.
@@ -19,20 +20,23 @@ TEST_PACKAGES=(nginx-light caddy openssl curl gcc libc6-dev gcc-avr avr-libc sim
 say() { echo "setup: $*" >&2; }
 fail() { say "$*"; exit 1; }
 
-tests=""
+tests="" quick=""
 for argument in "$@"; do
   case "$argument" in
     --tests) tests=tests ;;
-    *) fail "unknown option $argument; it knows --tests" ;;
+    --quick) quick=quick ;;
+    *) fail "unknown option $argument; it knows --tests and --quick" ;;
   esac
 done
 
 # The stamp holds what the environment was made from; with --tests it stands for the packages too.
 stamp=".venv/.ready${tests:+-$tests}"
 wanted="$(cat uv.lock pyproject.toml deploy/setup.sh deploy/wheel_imports.py | sha256sum) $PWD"
-if [ -x .venv/bin/python ] && [ "$(cat "$stamp" 2>/dev/null)" = "$wanted" ]; then
-  exit 0
-fi
+for made in "$stamp" ${quick:+.venv/.ready-quick}; do
+  if [ -x .venv/bin/python ] && [ "$(cat "$made" 2>/dev/null)" = "$wanted" ]; then
+    exit 0
+  fi
+done
 
 missing_packages() {
   local package
@@ -95,9 +99,14 @@ fi
 
 # Once, not at every start and in the first job. uv installs sources alone, and where PYTHONDONTWRITEBYTECODE is set each
 # start would translate them again: 1.1 of the 1.4 s in which Numba is imported.
-say "compiling what a start loads and the loops of a job, once for this machine"
+say "compiling what a start loads, once for this machine"
 env -u PYTHONDONTWRITEBYTECODE .venv/bin/python -c 'from server.cli import demo; from server.http import serve; from server.worker import worker' ||
   say "the service's modules cannot be imported; \`eigenhead doctor\` may say why"
+if [ -n "$quick" ]; then
+  echo "$wanted" >.venv/.ready-quick
+  say "ready"
+  exit 0
+fi
 env -u PYTHONDONTWRITEBYTECODE .venv/bin/eigenhead prepare >&2 || say "loops will be compiled when a job needs them"
 
 if [ -n "$tests" ]; then

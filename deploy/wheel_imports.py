@@ -6,13 +6,20 @@ imports so that they say where the module then is (`from rig.camera import Camer
 `from eigenhead.rig.camera import Camera`). Nothing else in a file changes, neither a line number. What cannot be moved
 like that (a module named in a string, `import rig.camera`) ends the build with its file and line.
 
+With EIGENHEAD_WHEEL_LOOPS=1 the wheel also carries the loops of a job compiled, for `pipeline.compiled.PORTABLE_CPU`,
+and the Python and Numba of the environment that builds (`uv build --wheel --no-build-isolation`); with others they are
+not found, and compiled as from any other wheel.
+
 The package `eigenhead` itself is written here, for the wheel and for the checkout's own environment: the names of
 `[tool.hatch.build.targets.wheel.hooks.custom.public]` in pyproject.toml, each imported when it is first asked for.
 """
 
 import ast
+import os
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,6 +29,8 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 WHEEL_PACKAGE = "eigenhead"
 PACKAGES = ("rig", "pipeline", "calibration", "server")
+LOOPS = "EIGENHEAD_WHEEL_LOOPS"
+COMPILE_S = 1800.0  # the longest that compiling may take
 NOT_CARRIED = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
 
 _MODULE_NAME = re.compile(rf"({'|'.join(PACKAGES)})((\.\w+)*)\.?(:\w*)?")
@@ -52,6 +61,8 @@ class WheelImports(BuildHookInterface):
         else:
             write_facade(package, public)
             carry_packages(root, package)
+            if os.environ.get(LOOPS):
+                carry_loops(package)
             build_data["force_include"] = {str(package): WHEEL_PACKAGE}
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
@@ -70,6 +81,21 @@ def carry_packages(root: Path, target: Path) -> None:
         if path != target / "__init__.py" and path != target / "__main__.py":
             place = path.relative_to(target)
             path.write_bytes(moved_imports(path.read_bytes(), place, target))
+
+
+def carry_loops(package: Path) -> None:
+    """Compiles the loops of a job, as this copy of the code defines them, into the copy.
+
+    Raises:
+        subprocess.CalledProcessError: where the Python that builds cannot (it lacks Numba, say).
+    """
+    with tempfile.TemporaryDirectory(prefix="eigenhead-loops-") as cache:
+        environment = os.environ | {"PYTHONPATH": str(package.parent), "EIGENHEAD_CACHE": cache}
+        command = [sys.executable, "-P", "-m", WHEEL_PACKAGE, "prepare"]
+        subprocess.run(command, env=environment, check=True, timeout=COMPILE_S)
+        shutil.copytree(Path(cache) / "kernels", package / "pipeline" / "compiled_loops")
+    for left in package.rglob("__pycache__"):
+        shutil.rmtree(left)
 
 
 def moved_imports(source: bytes, place: Path, packages: Path) -> bytes:

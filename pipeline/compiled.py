@@ -7,6 +7,10 @@ damaged. Here each compiled function is one file in ``cache_folder()/kernels``, 
 sha256 of all that it follows from: the byte code and constants of the function and of all that it calls, the types of
 its arguments, the processor, and the versions of Python, Numba and LLVM.
 
+The processor is the same for every x86-64 machine since 2013 (``PORTABLE_CPU``), so that what one machine compiled
+runs on the next: in a container, from a wheel, out of a CI's cache. Code for the very processor was no faster: on one
+with AVX-512 a job took as many processor seconds.
+
 Numba has no public interface for that. What is used of its inside: ``Dispatcher._cache`` (an object with
 ``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``.
 """
@@ -22,6 +26,7 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import llvmlite
+import llvmlite.binding
 import numba
 import numpy as np
 from numba.core import config, serialize
@@ -32,9 +37,26 @@ from numba.core.registry import cpu_target
 from rig.atomic_write import write_atomically
 from rig.cache_folder import cache_folder
 
+CARRIED = Path(__file__).with_name("compiled_loops")  # beside the code, where a wheel was built with them
 DIGEST_BYTES = 32
+PORTABLE_CPU = "x86-64-v3"
+PORTABLE_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")  # what that level adds
 
 log = logging.getLogger("eigenhead")
+
+
+def _choose_processor() -> None:
+    """Before anything is compiled; NUMBA_CPU_NAME goes before, and another processor compiles for itself."""
+    options: Any = config
+    try:
+        host: dict[str, bool] = dict(llvmlite.binding.get_host_cpu_features())
+    except RuntimeError:  # LLVM does not know this processor
+        return
+    if options.CPU_NAME is None and all(host.get(feature) for feature in PORTABLE_FEATURES):
+        options.CPU_NAME, options.CPU_FEATURES = PORTABLE_CPU, ""
+
+
+_choose_processor()
 
 
 def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -46,7 +68,8 @@ def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]]
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(**options)(function)
+        chosen: dict[str, Any] = {"no_cfunc_wrapper": True, **options}  # nothing in C calls them: 8 % of compiling
+        dispatcher = numba.njit(**chosen)(function)
         if cache and isinstance(dispatcher, Dispatcher):  # with NUMBA_DISABLE_JIT it is the function itself
             dispatcher._cache = KeptFunction(dispatcher)  # type: ignore[assignment]
         return dispatcher
@@ -74,16 +97,26 @@ class KeptFunction:
         name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(told.encode()).hexdigest()}"
 
+    def is_kept(self, signature: Any) -> bool:
+        """Whether there is a file for these argument types."""
+        file = self.file(signature)
+        try:
+            return (CARRIED / file.name).is_file() or file.is_file()
+        except OSError:  # a folder that cannot be looked into
+            return False
+
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The compiled function, or None where none is kept, or a damaged one."""
         target_context.refresh()
-        try:
-            data = self.file(signature).read_bytes()
-        except OSError:
-            return None
-        if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
-            return None
-        return CompileResult._rebuild(target_context, *pickle.loads(data[DIGEST_BYTES:]))
+        file = self.file(signature)
+        for path in (CARRIED / file.name, file):
+            try:
+                data = path.read_bytes()
+            except OSError:
+                continue
+            if hashlib.sha256(data[DIGEST_BYTES:]).digest() == data[:DIGEST_BYTES]:
+                return CompileResult._rebuild(target_context, *pickle.loads(data[DIGEST_BYTES:]))
+        return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keeps a compiled function; where that is not possible it says so, once, and goes on."""
@@ -93,7 +126,7 @@ class KeptFunction:
         try:
             write_atomically(self.file(signature), hashlib.sha256(data).digest() + data)
         except OSError as error:
-            say_not_kept("compiled kernels", error)
+            say_not_kept(error)
 
     def flush(self) -> None:
         """Nothing: a file that the code no longer leads to is not found."""
@@ -104,14 +137,15 @@ def _warned() -> set[str]:
     return set()
 
 
-def say_not_kept(what: str, error: OSError) -> None:
-    """One line for each kind of thing that could not be written to the cache folder."""
-    if what not in _warned():
-        _warned().add(what)
+def say_not_kept(error: OSError) -> None:
+    """One line a process where the cache folder cannot be written."""
+    folder = str(cache_folder())
+    if folder not in _warned():
+        _warned().add(folder)
         log.warning(
-            "%s are not kept in %s (%s): they are made anew each time; EIGENHEAD_CACHE names another folder",
-            what,
-            cache_folder(),
+            "compiled loops and arrays of head models are not kept in %s (%s): what is missing there is made anew each "
+            "time; EIGENHEAD_CACHE names another folder",
+            folder,
             error.strerror or error,
         )
 

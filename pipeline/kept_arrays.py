@@ -63,7 +63,7 @@ def kept_arrays(
         write_atomically(path, _packed(made))
         _remove_unused(path.parent)
     except OSError as error:
-        say_not_kept("arrays of the head model", error)
+        say_not_kept(error)
     return made
 
 

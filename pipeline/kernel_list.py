@@ -1,6 +1,7 @@
 """The compiled loops that a default job calls, with the types that it calls them with: what can be compiled ahead.
 
-``kernels.txt`` beside this file has a line for each: module and function, then the types of the arguments.
+``kernels.txt`` beside this file has a line for each: module and function, then the types of the arguments. First come
+those of a job without the dense stage (``--detail photo --surface head``), after an empty line those that it adds.
 ``float32[2C]`` is a two-dimensional array in C order (A: any strides), with ``r`` behind it one that is not written to;
 ``4*float64`` is a tuple, ``dense.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is recorded, not
 thought out: ``python -m tests.support.kernel_recorder`` writes it from jobs that it runs, and a test runs a job and
@@ -60,13 +61,10 @@ class Kernel:
         return tuple(type_from_text(text) for text in self.arguments)
 
     def is_kept(self) -> bool:
-        """Whether an earlier process left it in the cache folder."""
+        """Whether the wheel brought it, or an earlier process left it in the cache folder."""
         dispatcher = self.dispatcher()
         kept = None if dispatcher is None else getattr(dispatcher, "_cache", None)
-        try:
-            return not isinstance(kept, KeptFunction) or kept.file(self.signature()).is_file()
-        except OSError:  # a folder that cannot be looked into
-            return False
+        return not isinstance(kept, KeptFunction) or kept.is_kept(self.signature())
 
     def size(self) -> int:
         """Of the code that is compiled, the loops that it calls included, in bytes of the interpreter's: what takes
@@ -81,9 +79,10 @@ class Kernel:
             dispatcher.compile(self.signature())
 
 
-def listed_kernels() -> list[Kernel]:
-    """All of the list."""
-    return [Kernel.from_line(line) for line in LIST.read_text(encoding="utf-8").splitlines()]
+def listed_kernels(*, dense: bool = True) -> list[Kernel]:
+    """All of the list, or without those that only the dense stage calls."""
+    plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
+    return [Kernel.from_line(line) for line in (*plain.splitlines(), *(added.splitlines() if dense else ()))]
 
 
 def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:

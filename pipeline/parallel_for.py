@@ -12,8 +12,6 @@ from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
-import numpy as np
-
 from rig.errors import InputError
 
 THREADS, THREADS_MOST = "EIGENHEAD_THREADS", 512
@@ -43,8 +41,8 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
     if threads == 1:
         work(0, count)
         return
-    ends = np.linspace(0, count, min(SLICES, count) + 1).astype(int).tolist()
-    slices = list(pairwise(ends))[::-1]
+    parts = max(1, min(SLICES, count))
+    slices = list(pairwise(count * k // parts for k in range(parts + 1)))[::-1]
 
     def take() -> None:
         while slices:

@@ -93,7 +93,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The folder of programs of an environment that holds the wheel, and the packages it depends on from ours."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [uv(), "build", "--wheel", "--no-build-isolation", "--offline", "--python", sys.executable, "-o", folder]
-    subprocess.run([*build, ROOT], check=True, capture_output=True, timeout=120)
+    environment = os.environ | {"EIGENHEAD_WHEEL_LOOPS": "1"}
+    subprocess.run([*build, ROOT], env=environment, check=True, capture_output=True, timeout=600)
     venv.create(folder / "venv", symlinks=True)
     python = folder / "venv" / "bin" / "python"
     install = [uv(), "pip", "install", "--offline", "--no-deps", "--python", python, *folder.glob("*.whl")]
@@ -124,6 +125,15 @@ def test_the_wheel_runs_none_of_the_code_of_a_folder_with_its_packages_names(ins
     answer = json.loads(run(tmp_path, installed / "eigenhead", "demo", "--out", "out", "--json"))
     assert Path(tmp_path, answer["ply"]).is_file()
     assert not marker.exists(), marker.read_text()
+
+
+@pytest.mark.slow
+def test_the_wheel_carries_its_loops_compiled(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path / "cache"))
+    answer = json.loads(run(tmp_path, installed / "eigenhead", "prepare", "--json"))
+    assert answer["compiled"] == 0
+    assert answer["known"] > 30
+    assert not list(tmp_path.glob("cache/kernels/*"))
 
 
 @pytest.mark.slow

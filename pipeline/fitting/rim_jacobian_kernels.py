@@ -36,7 +36,7 @@ def fill_rows(first, last, level, count, turn, place, cameras, rim, out):
     indptr, indices, data, modes = level
     view, corner, blend, point, gradient = rim
     for s in range(first, last):
-        gx, gy, gz = gradient[s]
+        gx, gy, gz = gradient[s, 0], gradient[s, 1], gradient[s, 2]
         hx = gx * turn[0, 0] + gy * turn[1, 0] + gz * turn[2, 0]
         hy = gx * turn[0, 1] + gy * turn[1, 1] + gz * turn[2, 1]
         hz = gx * turn[0, 2] + gy * turn[1, 2] + gz * turn[2, 2]

@@ -54,9 +54,11 @@ def projected_with_slopes(points, view, cameras):
     pixels, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
     for n in range(len(points)):
         camera = cameras[view[n]]
-        x, y, z = points[n]
-        pixels[n] = project(camera, x, y, z)
-        slopes[n, 0], slopes[n, 1] = projection_slopes(camera, x, y, z)
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        pixels[n, 0], pixels[n, 1] = project(camera, x, y, z)
+        of_column, of_row = projection_slopes(camera, x, y, z)
+        for c in range(3):
+            slopes[n, 0, c], slopes[n, 1, c] = of_column[c], of_row[c]
     return pixels, slopes
 
 
@@ -66,7 +68,7 @@ def normals_and_planes(vertices, faces):
     normals = np.zeros_like(vertices)
     planes = np.empty((4, len(faces)))
     for f in range(len(faces)):
-        a, b, c = faces[f]
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
         wx, wy, wz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
         nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
@@ -78,7 +80,8 @@ def normals_and_planes(vertices, faces):
         planes[3, f] = nx * vertices[a, 0] + ny * vertices[a, 1] + nz * vertices[a, 2]
     for v in range(len(normals)):
         length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2) + 1e-30
-        normals[v] /= length
+        for c in range(3):
+            normals[v, c] /= length
     return normals, planes
 
 
@@ -89,7 +92,7 @@ def _facing(planes, centres):
     for first in range(0, len(words), BLOCK):
         last = min(first + BLOCK, len(words))
         for k in range(len(centres)):
-            x, y, z = centres[k]
+            x, y, z = centres[k, 0], centres[k, 1], centres[k, 2]
             bit = np.uint64(1) << np.uint64(k)
             for f in range(first, last):
                 in_front = planes[0, f] * x + planes[1, f] * y + planes[2, f] * z > planes[3, f]
@@ -143,7 +146,8 @@ def _crossed(faces, active, behind):
     which, words = np.empty(len(active), np.int32), np.empty(len(active), np.uint64)
     count = 0
     for s in range(len(active)):
-        a, b, c = faces[active[s]]
+        f = active[s]
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         word = (behind[a] ^ behind[b]) | (behind[a] ^ behind[c])
         if word:
             which[count], words[count] = active[s], word
@@ -163,7 +167,8 @@ def _chain(surface, sweep, bit, camera):
     for j in range(len(sweep.outline)):
         if not sweep.outline_words[j] & bit:
             continue
-        a, b, one, two = surface.edges[sweep.outline[j]]
+        e = sweep.outline[j]
+        a, b, one, two = surface.edges[e, 0], surface.edges[e, 1], surface.edges[e, 2], surface.edges[e, 3]
         if not sweep.facing[one] & bit:
             a, b = b, a
         chain[i, 0], chain[i, 1] = project(camera, vertices[a, 0], vertices[a, 1], vertices[a, 2])
@@ -189,7 +194,7 @@ def _rows(chain, height):
     entries = np.empty((5, start[height]))
     fill = start[:-1].copy()
     for i in range(len(chain)):
-        x0, y0, x1, y1, layers = chain[i]
+        x0, y0, x1, y1, layers = chain[i, 0], chain[i, 1], chain[i, 2], chain[i, 3], chain[i, 4]
         low, high = min(y0, y1), max(y0, y1)
         if high > 1e8 or high < 0 or low >= height or low == high:
             continue
@@ -218,7 +223,7 @@ def _layers(x, y, start, entries):
 @njit(cache=True, fastmath=True)
 def _read(pictures, k, x, y):
     """The signed distance of a view at a pixel."""
-    width, height = pictures.size[k]
+    width, height = pictures.size[k, 0], pictures.size[k, 1]
     column, right = cell(x, width)
     row, down = cell(y, height)
     return sample_row(pictures.distance, pictures.offset[k] + row * width + column, width, right, down)
@@ -284,13 +289,13 @@ def _crossings(surface, sweep, bit, centre, corners, samples):
 def _view(k, surface, sweep, bit, pictures, steps, averaged, corners, samples):
     """One view: fills ``corners`` and ``samples`` with the samples on the outer outline; returns their number."""
     camera = pictures.cameras[k]
-    width, height = pictures.size[k]
+    width, height = pictures.size[k, 0], pictures.size[k, 1]
     start, entries = _rows(_chain(surface, sweep, bit, camera), height)
     count, joined, segments = _crossings(surface, sweep, bit, pictures.centres[k], corners, samples)
     for s in range(count):
         samples[s, U], samples[s, V] = project(camera, samples[s, X], samples[s, Y], samples[s, Z])
     for j in range(joined):
-        a, b = segments[j]
+        a, b = segments[j, 0], segments[j, 1]
         dx, dy = samples[b, U] - samples[a, U], samples[b, V] - samples[a, V]
         half = 0.5 * np.sqrt(dx * dx + dy * dy)
         samples[a, LENGTH] += half

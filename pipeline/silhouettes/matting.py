@@ -70,7 +70,8 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     box = _pixels(cells, zone.shape, image.shape)
     light = (background.field * _light_outside(decision.coarse, background, mask))[cells]
     sigma = background.noise[cells] @ np.full(3, 1 / 3, np.float32)
-    own, paint = image[box], decision.paint[cells]
+    own = image[box]
+    paint = np.ascontiguousarray(decision.paint[cells])  # as the better guess is: one loop is compiled for both
     args = (LINEAR, own, background.plates[:, *box], light, sigma, zone[cells], probability[cells].astype(np.float32))
     alpha, _, _ = solve_alpha(*args, paint, (COARSE_ALPHA_SIGMA, SHADE), True)
     alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)

@@ -37,12 +37,14 @@ def first_guess(
     for step in range(len(order)):
         v = order[step]
         count = 0
-        total = np.zeros(values.shape[1])
         for k in range(starts[v], starts[v + 1]):
-            if known[indices[k]]:
-                total += values[indices[k]]
-                count += 1
-        values[v] = total / max(count, 1)
+            count += known[indices[k]]
+        for c in range(values.shape[1]):
+            total = 0.0
+            for k in range(starts[v], starts[v + 1]):
+                if known[indices[k]]:
+                    total += values[indices[k], c]
+            values[v, c] = total / max(count, 1)
         known[v] = True
 
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from pipeline.results.overlays import PANEL
+from pipeline.settings import settings_from_document
 from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from server.address import listen
@@ -57,13 +58,14 @@ class DemoDocument(TypedDict):
     methods: dict[str, MethodDocument]
 
 
-def run_demo(out: Path, *, seed: int, compare: bool, report: Report) -> DemoDocument:
+def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Report) -> DemoDocument:
     """Starts a service in a temporary data folder, triggers its simulated rig, submits a job, follows it, and fetches
     its result into ``out``.
 
     Args:
         out: folder of the result.
         seed: of the subject.
+        full: the job that is run where nothing is asked, with the dense stage; else the head at level ``photo``.
         compare: solve by the paper's simplex too, into ``out/simplex``, and lay both side by side.
         report: told the stage and the share of the whole that is done.
 
@@ -71,7 +73,8 @@ def run_demo(out: Path, *, seed: int, compare: bool, report: Report) -> DemoDocu
         What ``demo --json`` prints.
     """
     began = time.monotonic()
-    prepare_kernels(_part(report, "", 0.0, 0.0))
+    asked: dict[str, object] = {} if full else {"detail": "photo", "outputs": {"surface": "head"}}
+    prepare_kernels(_part(report, "", 0.0, 0.0), settings_from_document(asked))
     with tempfile.TemporaryDirectory(prefix="eigenhead-demo-") as scratch:
         data = Path(scratch) / "data"
         report("service", 0.0)
@@ -82,7 +85,7 @@ def run_demo(out: Path, *, seed: int, compare: bool, report: Report) -> DemoDocu
             starts = {"contour": 0.1, "simplex": 0.4, "": 1.0}
             for method, after in pairwise([*folders, ""]):  # one at a time: both draw
                 start, share = starts[method], starts[after] - starts[method]
-                job = client.submit(capture["id"], settings={"method": method})
+                job = client.submit(capture["id"], settings=asked | {"method": method})
                 client.wait(job["id"], report=_part(report, f"{method}: ", start, share))
                 client.download(job["id"], folders[method])
         truth = data / "captures" / capture["id"] / "truth"

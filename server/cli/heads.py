@@ -213,16 +213,17 @@ def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
 def demo(
     out: Annotated[Path, typer.Option(help="Where the result goes.", file_okay=False)] = Path("out/demo"),
     seed: Annotated[int, typer.Option(help="Subject and noise of the simulated studio.", min=0)] = 1,
+    full: Annotated[bool, typer.Option("--full", help="The default job, with the dense surface and the bust.")] = False,
     compare: Annotated[bool, typer.Option("--compare", help="Solve by the paper's simplex too: minutes more.")] = False,
     json_out: Json = False,
 ) -> None:
     """Run the main job end to end.
 
-    Simulated rig, capture, service, head."""
+    Simulated rig, capture, service, head at level photo."""
     from server.cli.demo import run_demo
 
     with progress_bar() as report:
-        done = run_demo(out, seed=seed, compare=compare, report=report)
+        done = run_demo(out, seed=seed, full=full, compare=compare, report=report)
     error = done["error_mm"]
     answer(
         done,

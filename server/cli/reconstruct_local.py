@@ -58,7 +58,7 @@ def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "
     from rig.formats.capture_folder import read_capture
 
     shot, rig = read_capture(folder)
-    prepare_kernels(report)
+    prepare_kernels(report, chosen)
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result

@@ -60,15 +60,16 @@ def prepare(json_out: Json = False) -> None:
 
     began = monotonic()
     with progress_bar() as report:
-        compiled, known = prepare_kernels(report)
+        done = prepare_kernels(report)
     seconds = round(monotonic() - began, 3)
-    told = (
-        f"{compiled} of {known} loops compiled in {seconds:.1f} s"
-        if compiled
-        else f"all {known} loops were compiled before"
+    told = f"all {done.known} loops were compiled before"
+    if done.compiled or done.missing:
+        told = f"{done.compiled} of {done.known} loops compiled in {seconds:.1f} s"
+    answer(
+        done._asdict() | {"seconds": seconds, "folder": str(cache_folder())}, json_out, [f"{cache_folder()}  {told}"]
     )
-    document = {"compiled": compiled, "known": known, "seconds": seconds, "folder": str(cache_folder())}
-    answer(document, json_out, [f"{cache_folder()}  {told}"])
+    if done.missing:
+        sys.exit(1)
 
 
 @app.command(epilog="Example: eigenhead doctor")

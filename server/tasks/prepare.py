@@ -1,23 +1,37 @@
 """What a first job would wait for, made ahead: the compiled loops of ``pipeline.kernel_list``, in processes over all
 cores. Set-up does it (``eigenhead prepare``), and a command that finds something missing does it before its work."""
 
+import errno
+import logging
 import os
+import shutil
 import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rig.cache_folder import cache_folder
 from server.tasks.child import Bench, Child
 
 if TYPE_CHECKING:
     from pipeline.kernel_list import Kernel
+    from pipeline.settings import Settings
 
 Report = Callable[[str, float], None]
+log = logging.getLogger("eigenhead")
+FREE_LEAST = 16 << 20  # bytes of disk: the list takes 6 MB, and arrays come after it
 PROCESSES_MOST = 8  # each takes 250 MB and half a second to load what it compiles
+
+
+class Prepared(NamedTuple):
+    """Numbers of loops."""
+
+    compiled: int  # now
+    missing: int  # still: nothing can be kept
+    known: int
 
 
 def compile_kernel(bench: Bench, report: Report, *, line: str) -> bool:
@@ -29,24 +43,28 @@ def compile_kernel(bench: Bench, report: Report, *, line: str) -> bool:
     return kernel.is_kept()
 
 
-def prepare_kernels(report: Report) -> tuple[int, int]:
-    """Compiles what the list has and the cache folder lacks.
+def prepare_kernels(report: Report, settings: "Settings | None" = None) -> Prepared:
+    """Compiles what the list has and the cache folder lacks, and says so in a line.
 
     Where nothing can be kept it says so in a line and compiles nothing: each process will have to, for itself.
 
     Args:
         report: told "compiling 12 of 49 loops" and the share that is done, from several threads, one at a time. What
             it raises ends the work; what was compiled until then is kept.
+        settings: of a job; the loops that it does not call are left out. Without them all of the list counts.
 
     Returns:
-        How many loops were compiled, and how many the list has.
+        How many loops there are, and what became of them.
     """
     from pipeline.kernel_list import by_module, listed_kernels
+    from pipeline.settings import FINE_LEVELS
 
-    kernels = listed_kernels()
+    dense = settings is None or settings.detail in FINE_LEVELS or settings.outputs.surface != "head"
+    kernels = listed_kernels(dense=dense)
     missing = [kernel for kernel in kernels if not kernel.is_kept()]
     if not missing or not _can_keep():
-        return 0, len(kernels)
+        return Prepared(0, len(missing), len(kernels))
+    log.warning("compiling what a job calls (loops: %d), once for this machine and version", len(missing))
     groups = sorted(by_module(missing), key=lambda group: sum(kernel.size() for kernel in group), reverse=True)
     work = _Work(groups, len(missing), report)
     work.told(0)
@@ -54,7 +72,7 @@ def prepare_kernels(report: Report) -> tuple[int, int]:
     with ThreadPoolExecutor(count, thread_name_prefix="compile") as pool:
         for done in [pool.submit(work.compile_groups) for _ in range(count)]:
             done.result()
-    return work.done, len(kernels)
+    return Prepared(work.done, len(missing) - work.done, len(kernels))
 
 
 class _Work:
@@ -96,7 +114,9 @@ def _can_keep() -> bool:
         folder = cache_folder() / "kernels"
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
+            if shutil.disk_usage(folder).free < FREE_LEAST:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             return True
     except OSError as error:
-        say_not_kept("compiled kernels", error)
+        say_not_kept(error)
         return False

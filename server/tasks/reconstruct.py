@@ -49,12 +49,15 @@ def reconstruct_capture(
     from rig.formats.capture_folder import read_capture
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
+    from server.tasks.prepare import prepare_kernels
 
+    chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
+    kind = f"{chosen.detail} {chosen.outputs.surface}"
+    bench.keep(f"loops {kind}", lambda: prepare_kernels(lambda _, share: report("compiling", share), chosen))
     name = model or "default"
     head_model = bench.keep(f"model {name}", lambda: load_model(name))
     renderer = bench.keep("renderer", Renderer.create)
     shot, rig = read_capture(Path(capture))
-    chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
     done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=report, segment=once)
     report("write", 0.0)
     write_result(Path(result), done, shot)

@@ -1,6 +1,6 @@
 """Seconds of a job's stages, from image files to result files, warm: medians and least of several rounds; peak memory.
 
-python -m tests.benchmarks.image_stages --json
+python -m tests.benchmarks.image_stages --detail photo --surface head --json
 
 ``segmentation`` is eleven 1024 x 768 images, ``texture`` colours the model's full mesh from them; ``hull``, which no
 job needs, is the visual hull of the silhouettes. ``total`` is from opening the first file to the last one written,
@@ -30,11 +30,14 @@ from rig.render.renderer import Renderer
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, default=Path("../shared/data/captures/scan-a"))
-    parser.add_argument("--detail", choices=("span", "kernel", "photo"), default="span")
+    parser.add_argument("--detail", choices=("span", "kernel", "photo", "fine"), default="span")
+    parser.add_argument("--surface", choices=("head", "bust", "both"), help="both where nothing is asked")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     model, settings = load_model(), replace(Settings(), detail=arguments.detail)
+    if arguments.surface:
+        settings = replace(settings, outputs=replace(settings.outputs, surface=arguments.surface))
     rounds: list[dict[str, float]] = []
     own: dict[str, float] = {}
     with Renderer.create() as renderer, tempfile.TemporaryDirectory() as scratch:

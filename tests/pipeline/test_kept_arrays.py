@@ -107,7 +107,7 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_line(folder: Path, caplo
     assert equal(found)
     assert not any(array.flags.writeable for array in found.values())
     (line,) = caplog.messages
-    assert line.startswith("arrays of the head model are not kept")
+    assert line.startswith("compiled loops and arrays of head models are not kept in")
 
 
 def test_a_full_disk_leaves_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,10 +13,12 @@ from server.processes import python_command, python_environment
 
 
 def test_every_line_names_a_loop_and_its_types() -> None:
-    lines = LIST.read_text(encoding="utf-8").splitlines()
-    assert lines == sorted(set(lines))
+    plain, added = (part.splitlines() for part in LIST.read_text(encoding="utf-8").split("\n\n"))
+    assert plain == sorted(set(plain))
+    assert added == sorted(set(added) - set(plain))
     kernels = listed_kernels()
-    assert [kernel.line for kernel in kernels] == lines
+    assert [kernel.line for kernel in kernels] == plain + added
+    assert [kernel.line for kernel in listed_kernels(dense=False)] == plain
     for kernel in kernels:
         dispatcher = kernel.dispatcher()
         assert dispatcher is not None
@@ -58,7 +60,10 @@ def test_a_default_job_calls_no_loop_that_the_list_lacks(tmp_path: Path) -> None
 
     run(python_command("cli", "simulate", str(tmp_path / "shot"), "--seed", "1"))
     run([sys.executable, "-m", "tests.support.kernel_recorder", str(tmp_path / "list"), str(tmp_path / "shot")])
-    called = {Kernel.from_line(line) for line in (tmp_path / "list").read_text(encoding="utf-8").splitlines()}
-    missing = sorted(kernel.line for kernel in called - set(listed_kernels()))
-    assert not missing, "write the list anew: python -m tests.support.kernel_recorder pipeline/kernels.txt CAPTURE..."
-    assert len(called) > 30
+    parts = (tmp_path / "list").read_text(encoding="utf-8").split("\n\n")
+    plain, added = ({Kernel.from_line(line) for line in part.splitlines()} for part in parts)
+    for called, dense in ((plain, False), (plain | added, True)):
+        missing = sorted(kernel.line for kernel in called - set(listed_kernels(dense=dense)))
+        assert not missing, "write the list: python -m tests.support.kernel_recorder pipeline/kernels.txt CAPTURE..."
+    assert len(plain) > 20
+    assert len(added) > 10

@@ -1,11 +1,12 @@
 """Which compiled loops jobs call, and with which types.
 
-python -m tests.support.kernel_recorder pipeline/kernels.txt CAPTURE... writes the list from default jobs on captures.
+python -m tests.support.kernel_recorder pipeline/kernels.txt CAPTURE... writes the list from jobs on captures: first
+without the dense stage, then as by default.
 """
 
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -42,16 +43,21 @@ def recorded() -> Iterator[set[Kernel]]:
         KeptFunction.load_overload, KeptFunction.save_overload = load, save
 
 
-def kernels_of(capture: Path) -> set[Kernel]:
-    """Of a default job on a capture folder, in a process that has run none before."""
+PLAIN = {"detail": "photo", "outputs": {"surface": "head"}}
+
+
+def kernels_of(captures: list[Path], settings: Mapping[str, object]) -> set[Kernel]:
+    """Of jobs on capture folders, those that no earlier job of this process called."""
     from server.cli.reconstruct_local import reconstruct_locally
 
     with recorded() as found, tempfile.TemporaryDirectory() as scratch:
-        reconstruct_locally(capture, Path(scratch) / "out", model=None, settings={}, report=lambda stage, share: None)
+        for capture in captures:
+            out = Path(scratch) / capture.name
+            reconstruct_locally(capture, out, model=None, settings=settings, report=lambda stage, share: None)
     return found
 
 
 if __name__ == "__main__":
     target, *captures = map(Path, sys.argv[1:])
-    lines = sorted({kernel.line for capture in captures for kernel in kernels_of(capture)})
-    target.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    parts = [sorted(kernel.line for kernel in kernels_of(captures, settings)) for settings in (PLAIN, {})]
+    target.write_text("\n\n".join(map("\n".join, parts)) + "\n", encoding="utf-8")

@@ -6,11 +6,8 @@ import json
 import os
 import shutil
 import struct
-import subprocess
-import time
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ import pytest
 
 from rig.formats.archive import pack_folder
 from tests.rig.formats.test_archive import HOSTILE
+from tests.support.disks import small_disk
 from tests.support.services import RunningService, await_state, running_service, small_capture
 
 MEMORY_MOST = 1 << 30
@@ -213,24 +211,6 @@ def test_eighty_hostile_uploads(tmp_path: Path) -> None:
         pack_folder(honest, tmp_path / "honest.tar")
         done = client.post("/v1/captures/uploads", files={"file": (tmp_path / "honest.tar").read_bytes()})
         assert done.status_code == 201
-
-
-@contextmanager
-def small_disk(folder: Path, megabytes: int) -> Iterator[Path]:
-    """A file system of its own that can be filled."""
-    folder.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "tmpfs", str(folder)], capture_output=True, check=False
-    )
-    if done.returncode:
-        pytest.skip("mounting a tmpfs needs root")
-    try:
-        yield folder
-    finally:
-        for _ in range(50):
-            if subprocess.run(["umount", str(folder)], capture_output=True, check=False).returncode == 0:
-                break
-            time.sleep(0.1)
 
 
 def fill(disk: Path, leave: int) -> Path:

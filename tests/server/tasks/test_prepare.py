@@ -1,14 +1,22 @@
 """Compiling ahead: everything once, and no harm where it is stopped, cannot be kept, or is done twice."""
 
 import logging
+import os
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from pipeline import compiled, kernel_list
 from pipeline.kernel_list import Kernel
+from server.processes import python_environment
 from server.tasks.prepare import prepare_kernels
+from tests.support.disks import small_disk
 
 LINES = (
     "dense.surface.grid_kernels:grown bool[3C]",
@@ -24,7 +32,7 @@ class Stopped(Exception):
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, and a list of two loops."""
     monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(kernel_list, "listed_kernels", lambda: [Kernel.from_line(line) for line in LINES])
+    monkeypatch.setattr(kernel_list, "listed_kernels", lambda dense: [Kernel.from_line(line) for line in LINES])
     compiled._warned().clear()
     return tmp_path / "cache" / "kernels"
 
@@ -36,14 +44,14 @@ def kept(folder: Path) -> set[str]:
 @pytest.mark.slow
 def test_what_is_missing_is_compiled_once_and_counted_aloud(folder: Path) -> None:
     told: list[tuple[str, float]] = []
-    assert prepare_kernels(lambda stage, share: told.append((stage, share))) == (2, 2)
+    assert prepare_kernels(lambda stage, share: told.append((stage, share))) == (2, 0, 2)
     assert told == [(f"compiling {done} of 2 loops", done / 2) for done in range(3)]
     assert {"grid_kernels.grown", "vertex_colours_kernels.blend_views"} <= kept(folder)
     told.clear()
-    assert prepare_kernels(lambda stage, share: told.append((stage, share))) == (0, 2)
+    assert prepare_kernels(lambda stage, share: told.append((stage, share))) == (0, 0, 2)
     assert told == []
     next(folder.glob("grid_kernels.grown-*")).unlink()
-    assert prepare_kernels(lambda stage, share: None) == (1, 2)
+    assert prepare_kernels(lambda stage, share: None) == (1, 0, 2)
 
 
 @pytest.mark.slow
@@ -58,8 +66,8 @@ def test_two_at_once_and_one_that_is_stopped_do_no_harm(folder: Path) -> None:
         assert not path.name.startswith(".")
     with ThreadPoolExecutor(2) as pool:
         done = [pool.submit(prepare_kernels, lambda stage, share: None) for _ in range(2)]
-        assert {future.result()[1] for future in done} == {2}
-    assert prepare_kernels(lambda stage, share: None) == (0, 2)
+        assert {future.result().known for future in done} == {2}
+    assert prepare_kernels(lambda stage, share: None) == (0, 0, 2)
 
 
 def test_a_folder_that_cannot_be_written_is_said_in_one_line(
@@ -67,7 +75,94 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_line(
 ) -> None:
     folder.parent.write_text("a file where the folder should be")
     with caplog.at_level(logging.WARNING):
-        assert prepare_kernels(lambda stage, share: pytest.fail("compiles in vain")) == (0, 2)
-        assert prepare_kernels(lambda stage, share: pytest.fail("compiles in vain")) == (0, 2)
+        assert prepare_kernels(lambda stage, share: pytest.fail("compiles in vain")) == (0, 2, 2)
+        assert prepare_kernels(lambda stage, share: pytest.fail("compiles in vain")) == (0, 2, 2)
     (line,) = caplog.messages
-    assert line.startswith("compiled kernels are not kept")
+    assert line.startswith("compiled loops and arrays of head models are not kept in")
+
+
+PREPARE_AND_USE = """
+import sys
+import numpy as np
+from pipeline import kernel_list
+from pipeline.dense.surface.grid_kernels import grown
+from pipeline.kept_arrays import kept_arrays
+from pipeline.kernel_list import Kernel
+from server.tasks.prepare import prepare_kernels
+
+kernel_list.listed_kernels = lambda dense: [Kernel.from_line(line) for line in sys.argv[1:]]
+print(*prepare_kernels(lambda stage, share: None), flush=True)
+kept_arrays("some", [1], lambda: {"a": np.arange(99999)}, made_by=[])
+cells = np.zeros((3, 3, 3), bool)
+cells[1, 1, 1] = True
+print(grown(cells).sum())
+"""
+
+
+def preparing(cache: Path, script: Path) -> "subprocess.Popen[str]":
+    """A process that compiles ahead, keeps arrays, and calls a loop; it leads a group of its own."""
+    script.write_text(PREPARE_AND_USE)
+    return subprocess.Popen(
+        [sys.executable, script, *LINES],
+        env=python_environment() | {"EIGENHEAD_CACHE": str(cache)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def ended(process: "subprocess.Popen[str]") -> tuple[list[str], list[str]]:
+    """Lines of standard output and error."""
+    out, told = process.communicate(timeout=120)
+    assert process.returncode == 0, told
+    return out.splitlines(), told.splitlines()
+
+
+@pytest.mark.slow
+def test_one_that_is_killed_leaves_nothing_that_others_stumble_over(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    killed = preparing(cache, tmp_path / "use.py")
+    deadline = time.monotonic() + 60
+    while not list(cache.glob("kernels/*")) and time.monotonic() < deadline:
+        time.sleep(0.002)
+    os.killpg(killed.pid, signal.SIGKILL)
+    assert killed.wait(10) == -signal.SIGKILL
+    killed.communicate()
+    (numbers, count), _ = ended(preparing(cache, tmp_path / "use.py"))
+    compiled_now, missing, known = map(int, numbers.split())
+    assert (compiled_now > 0, missing, known) == (True, 0, 2)
+    assert int(count) > 1
+    (numbers, _), told = ended(preparing(cache, tmp_path / "use.py"))
+    assert numbers == "0 0 2"
+    assert told == []
+
+
+@pytest.mark.slow
+def test_two_processes_at_once_do_no_harm(tmp_path: Path) -> None:
+    for process in [preparing(tmp_path / "cache", tmp_path / "use.py") for _ in range(2)]:
+        (numbers, count), _ = ended(process)
+        assert numbers.split()[1:] == ["0", "2"]
+        assert int(count) > 1
+    assert not list((tmp_path / "cache").rglob(".*"))
+    assert ended(preparing(tmp_path / "cache", tmp_path / "use.py"))[0][0] == "0 0 2"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["full", "read-only", "no folder"])
+def test_where_nothing_can_be_kept_the_work_is_done_and_one_line_says_so(tmp_path: Path, kind: str) -> None:
+    with ExitStack() as stack:
+        if kind == "no folder":
+            (tmp_path / "home").write_text("a file where the folder should be")
+            home = tmp_path / "home"
+        else:
+            home = stack.enter_context(small_disk(tmp_path / "home", 1, *(["ro"] if kind == "read-only" else [])))
+        if kind == "full":
+            (home / "ballast").write_bytes(bytes((1 << 20) - (16 << 10)))
+        out, told = ended(preparing(home / "cache", tmp_path / "use.py"))
+        assert out[0] == "0 2 2"
+        assert int(out[1]) > 1
+        (line,) = told
+        assert line.startswith(f"compiled loops and arrays of head models are not kept in {home / 'cache'} (")
+        assert {"full": "No space left", "read-only": "Read-only", "no folder": "Not a directory"}[kind] in line
+        assert not [path for path in home.rglob("*") if path.is_file() and path.name != "ballast"]
