@@ -18,7 +18,7 @@ def test_a_wrong_shape_is_refused() -> None:
     with pytest.raises(BeartypeCallHintViolation, match="rotation"):
         RigidTransform(np.zeros((2, 2)), np.zeros(3))
     with pytest.raises(BeartypeCallHintViolation, match="other"):
-        RigidTransform(np.eye(3), np.zeros(3)) @ "other"  # pyright: ignore[reportOperatorIssue]
+        _ = RigidTransform(np.eye(3), np.zeros(3)) @ "other"  # pyright: ignore[reportOperatorIssue]
 
 
 @checked
