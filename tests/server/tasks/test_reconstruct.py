@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import load_model
 from pipeline.reconstruct import TooFewViews
@@ -57,7 +57,7 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     assert all(camera["used"] for camera in report["cameras"].values())
     assert {warning["code"] for warning in report["warnings"]} <= {"view"}
     face = shot.scene.head.vertices[shot.scene.photographed]
-    away, _ = cKDTree(read_mesh(tmp_path / "result" / "head.ply").vertices).query(face)
+    away, _ = KDTree(read_mesh(tmp_path / "result" / "head.ply").vertices).query(face)
     # A pixel is 2.3 mm at the head here, and outlines are met to half a one.
     assert np.median(away) < 1.2
     assert np.quantile(away, 0.95) < 4.6
