@@ -12,9 +12,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import hypothesis
 import pytest
-from jaxtyping import install_import_hook
 
-from tests.support.shape_checks import checked_modules
+from tests.support.shape_checks import check_imports, checked_modules
 
 if TYPE_CHECKING:  # the product is imported after the hook
     from rig.render.renderer import Renderer
@@ -92,7 +91,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.option.markexpr == FAST:  # before anything of the product is imported
-        install_import_hook(checked_modules(), "tests.support.shape_checks.check_types")
+        check_imports(checked_modules())
     if os.environ.get("CI") == "true":
         lines = ALLOWED_SKIPS.read_text(encoding="utf-8").splitlines()
         patterns = [line.split()[0] for line in lines if line.strip() and not line.startswith("#")]

@@ -57,10 +57,9 @@ class CornersAt:
         weight = np.sqrt(self.term.loss.weight((self.residual**2).sum(axis=1)))
         blocks = np.concatenate([self.by_view(), self.residual[:, :, None]], axis=2)
         blocks = (blocks * weight[:, None, None]).reshape(2 * len(self.residual), -1)
-        for view, (camera, shot) in enumerate(zip(seen.camera, seen.shot, strict=True)):
+        for view, at in enumerate(places(seen, cameras, len(equations.gradient))):
             block = blocks[2 * seen.starts[view] : 2 * seen.starts[view + 1]]
             product = block.T @ block
-            at = places(camera, shot, cameras, len(equations.gradient))
             equations.matrix[np.ix_(at, at)] += product[:-1, :-1]
             equations.gradient[at] += product[:-1, -1]
 
@@ -84,16 +83,14 @@ class CornersAt:
         """Derivatives by all parameters, mostly zeros: for tests and other solvers."""
         seen, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
-        for view, (camera, shot) in enumerate(zip(seen.camera, seen.shot, strict=True)):
+        for view, at in enumerate(places(seen, len(self.state.intrinsics), size)):
             own = slice(seen.starts[view], seen.starts[view + 1])
-            whole[own, :, places(camera, shot, len(self.state.intrinsics), size)] = rows[own]
+            whole[own, :, at] = rows[own]
         return whole
 
 
-def places(camera: int | np.integer, shot: int | np.integer, cameras: int, size: int) -> Int[np.ndarray, " 22"]:
-    """Where a view's parameters stand among all: its camera's, its board's, its camera's time offset."""
-    own, board = camera * PER_CAMERA, cameras * PER_CAMERA + shot * PER_SHOT
-    at = np.empty(PER_CAMERA + PER_SHOT + 1, int)
-    at[:PER_CAMERA], at[PER_CAMERA:-1] = np.arange(own, own + PER_CAMERA), np.arange(board, board + PER_SHOT)
-    at[-1] = size - cameras + camera
-    return at
+def places(seen: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
+    """Where each view's parameters stand among all: its camera's, its board's, its camera's time offset."""
+    own = seen.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
+    board = cameras * PER_CAMERA + seen.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)
+    return np.concatenate([own, board, size - cameras + seen.camera[:, None]], axis=1)

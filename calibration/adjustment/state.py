@@ -97,8 +97,7 @@ def moved_state(state: BundleState, step: Float[np.ndarray, " q"]) -> BundleStat
 
 
 def _motions(steps: Float[np.ndarray, "n 6"]) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    turns = np.stack([rotation_from_vector(step[:3]) for step in steps]) if len(steps) else np.zeros((0, 3, 3))
-    return turns, steps[:, 3:]
+    return rotation_from_vector(steps[:, :3]), steps[:, 3:]
 
 
 def orthonormal(state: BundleState) -> BundleState:

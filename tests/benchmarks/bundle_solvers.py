@@ -58,8 +58,7 @@ def scipys(state: BundleState, seen: Observations) -> float:
     def jacobian(step: np.ndarray) -> coo_matrix:
         here = CornerTerm(seen, np.ones(len(state.intrinsics))).at(at(step))
         count, cameras = len(seen.points), len(state.intrinsics)
-        own = [places(c, s, cameras, len(mask)) for c, s in zip(seen.camera, seen.shot, strict=True)]
-        columns = np.repeat(np.array(own)[seen.view_of][:, None], 2, axis=1)
+        columns = np.repeat(places(seen, cameras, len(mask))[seen.view_of][:, None], 2, axis=1)
         rows = np.broadcast_to(np.arange(2 * count).reshape(count, 2, 1), columns.shape)
         values = here.by_view()
         matrix = coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * count, len(mask)))

@@ -27,6 +27,7 @@ FLAGS = [
 ]
 SIZES = {"1366x768": (1366, 768), "3840x2160": (3840, 2160)}
 SEVERE = ("serious", "critical")
+LONG_MS = 240_000  # a reconstruction on a machine that does other things too
 
 
 @contextmanager

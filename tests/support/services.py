@@ -16,6 +16,7 @@ import numpy as np
 
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
+from rig.formats.archive import pack_folder
 from rig.formats.capture_folder import write_capture
 from rig.geometry import RigidTransform
 from rig.rig import Rig
@@ -126,3 +127,20 @@ def small_capture(folder: Path, seed: int = 0, cameras: int = 3, size: int = 24)
     plates = {name: (rng.integers(0, 256, (size, size, 3), dtype=np.uint8),) for name in rig.names}
     write_capture(folder, Capture(images, plates), rig)
     return folder
+
+
+def packed_capture(folder: Path, seed: int = 0) -> Path:
+    """An archive of ``small_capture`` in ``folder``."""
+    small_capture(folder / f"capture{seed}", seed)
+    pack_folder(folder / f"capture{seed}", folder / f"capture{seed}.tar")
+    return folder / f"capture{seed}.tar"
+
+
+def uploaded_capture(service: RunningService, folder: Path, seed: int = 0) -> str:
+    """The id that the service gave to a small capture, labelled with its seed."""
+    files = {"file": packed_capture(folder, seed).read_bytes()}
+    answer = httpx.post(
+        service.url + "/v1/captures/uploads", files=files, data={"label": f"subject {seed}"}, timeout=60
+    )
+    assert answer.status_code == 201, answer.text
+    return answer.json()["id"]

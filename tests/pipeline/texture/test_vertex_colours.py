@@ -52,30 +52,42 @@ def uneven() -> Shot:
     return shoot(EXPOSURES)
 
 
-def test_the_default_is_better_than_the_papers_mean_where_exposures_differ(uneven: Shot) -> None:
-    found, reference = colour(uneven), colour(uneven, blend="reference")
+@pytest.fixture(scope="module")
+def even_colours(even: Shot) -> Texture:
+    return colour(even)
+
+
+@pytest.fixture(scope="module")
+def uneven_colours(uneven: Shot) -> Texture:
+    return colour(uneven)
+
+
+def test_the_default_is_better_than_the_papers_mean_where_exposures_differ(
+    uneven: Shot, uneven_colours: Texture
+) -> None:
+    found, reference = uneven_colours, colour(uneven, blend="reference")
     visible = (found.views > 0) & (reference.views > 0)
     assert visible.mean() > 0.6
     assert psnr(found, uneven, visible) > psnr(reference, uneven, visible) + 3.0
 
 
-def test_it_is_never_worse_where_they_do_not(even: Shot) -> None:
-    found, reference = colour(even), colour(even, blend="reference")
+def test_it_is_never_worse_where_they_do_not(even: Shot, even_colours: Texture) -> None:
+    found, reference = even_colours, colour(even, blend="reference")
     visible = (found.views > 0) & (reference.views > 0)
     assert psnr(found, even, visible) > psnr(reference, even, visible)
     # 1.5 % noise is 3.8 codes; some three views and four pixels each leave 3.8 / sqrt(3) / 1.5 = 1.5 codes: 44 dB.
     assert psnr(found, even, visible) > 38
 
 
-def test_gains_are_found(uneven: Shot) -> None:
-    found = np.array(list(colour(uneven).gains.values()))
+def test_gains_are_found(uneven_colours: Texture) -> None:
+    found = np.array(list(uneven_colours.gains.values()))
     wanted = 1 / EXPOSURES
     wanted /= np.exp(np.log(wanted).mean(axis=0))
     np.testing.assert_allclose(found, wanted, rtol=0.015)
 
 
-def test_no_background_reaches_the_mesh(even: Shot) -> None:
-    found = colour(even)
+def test_no_background_reaches_the_mesh(even: Shot, even_colours: Texture) -> None:
+    found = even_colours
     screen = 255 * srgb_from_linear(np.array(SCREEN))
     # On the way from the truth to the screen's green: how far, as a share?
     way = screen - even.truth
@@ -119,8 +131,8 @@ def test_highlights_count_less_than_what_the_other_views_say() -> None:
     assert psnr(robust, shot, visible) > psnr(plain, shot, visible) + 0.5
 
 
-def test_vertices_that_no_camera_sees_are_marked_and_filled_between_their_neighbours(even: Shot) -> None:
-    found = colour(even)
+def test_vertices_that_no_camera_sees_are_marked_and_filled_between_their_neighbours(even_colours: Texture) -> None:
+    found = even_colours
     hidden = found.views == 0
     assert found.filled == hidden.sum() > 100
     # Harmonic: no filled value lies outside the range of the known ones.

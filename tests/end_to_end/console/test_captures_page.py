@@ -1,0 +1,118 @@
+"""Captures in a real browser: archives, sessions, and two pages that show the same."""
+
+import base64
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from rig.formats.archive import pack_folder
+from tests.support.browser import keep_screenshots, visit
+from tests.support.services import RunningService, packed_capture, small_capture, uploaded_capture
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def test_an_archive_that_cannot_be_used_shows_every_fault(
+    browser: Browser, service: RunningService, tmp_path: Path
+) -> None:
+    v = visit(browser, service.url)
+    page = v.go("/captures")
+    expect(page.get_by_text("No captures yet")).to_be_visible()
+    good = packed_capture(tmp_path)
+    broken = tmp_path / "broken"
+    small_capture(broken, 1)
+    (broken / "images" / "cam00.png").unlink()
+    (broken / "images" / "cam02.png").write_bytes(b"no image")
+    pack_folder(broken, tmp_path / "broken.tar")
+    page.locator("input[type=file]").set_input_files([tmp_path / "broken.tar"])
+    expect(page.get_by_text("refused")).to_be_visible(timeout=30_000)
+    faults = page.locator("ul.faults li")
+    expect(faults.filter(has_text="cam00")).to_have_count(1)
+    expect(faults.filter(has_text="cam02")).to_have_count(1)
+    drop_file(page, "section.page", good)
+    expect(page.locator(".thumb img").first).to_be_visible(timeout=30_000)
+    assert [error for error in v.errors if "422" not in error] == []  # the browser itself notes the refused upload
+
+
+def drop_file(page: Page, selector: str, path: Path) -> None:
+    """Drags ``path`` over an element and lets go."""
+    make = """([name, text]) => { const held = new DataTransfer();
+      held.items.add(new File([Uint8Array.from(atob(text), c => c.charCodeAt(0))], name)); return held; }"""
+    held = page.evaluate_handle(make, [path.name, base64.b64encode(path.read_bytes()).decode()])
+    for event in ("dragover", "drop"):
+        page.dispatch_event(selector, event, {"dataTransfer": held})
+
+
+def test_two_pages_agree_and_a_removal_is_taken_back(browser: Browser, service: RunningService, tmp_path: Path) -> None:
+    uploaded_capture(service, tmp_path, 1)
+    one, two = visit(browser, service.url), visit(browser, service.url)
+    here, there = one.go("/captures"), two.go("/captures")
+    expect(there.locator(".row-button")).to_have_count(1)
+    uploaded_capture(service, tmp_path, 2)
+    for page in (here, there):
+        expect(page.locator(".row-button")).to_have_count(2, timeout=5000)
+    here.locator("#remove").click()
+    for page in (here, there):
+        expect(page.locator(".row-button")).to_have_count(1, timeout=5000)
+    there.get_by_role("button", name="Undo").click()
+    for page in (here, there):
+        expect(page.locator(".row-button")).to_have_count(2, timeout=5000)
+    here.locator("#remove").click()
+    deadline = time.monotonic() + 30
+    while len(httpx.get(service.url + "/v1/captures").json()["captures"]) == 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+    here.locator("#reconstruct").click()
+    jobs = two.go("/jobs")
+    expect(jobs.locator("[data-state=succeeded]")).to_have_count(1, timeout=30_000)
+    jobs.get_by_role("button", name="Remove").click()
+    expect(jobs.locator("[data-job]")).to_have_count(0, timeout=5000)
+    here.get_by_role("button", name="Undo").click()  # on another page
+    expect(jobs.locator("[data-state=succeeded]")).to_have_count(1, timeout=5000)
+    one.check_clean()
+    two.check_clean()
+
+
+def test_a_session_is_begun_filled_and_erased(
+    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+) -> None:
+    uploaded_capture(service, tmp_path, 1)
+    v = visit(browser, service.url)
+    page = v.go("/captures")
+    expect(page.locator(".row-button")).to_have_count(1)
+    page.locator("#new-session").click()
+    page.get_by_label("Subject").fill("Anna")
+    page.get_by_label("Consent").fill("signed 2026-11-21")
+    page.get_by_role("button", name="Begin").click()
+    expect(page.locator("#session option:checked")).to_have_text("Anna (0)")
+    expect(page.get_by_text("No captures in this session yet")).to_be_visible()
+    page.locator("input[type=file]").set_input_files([packed_capture(tmp_path, 2)])
+    expect(page.locator(".thumb img").first).to_be_visible(timeout=30_000)
+    page.get_by_label("Label").fill("profile")
+    page.get_by_label("Expression").fill("smile")
+    page.keyboard.press("Tab")
+    expect(page.locator(".row-button", has_text="Anna · smile")).to_have_count(1)
+    expect(page.locator(".row-button strong")).to_have_text("profile")
+    keep_screenshots(page, screenshots, "captures-session")
+    rig = v.go("/")
+    expect(rig.locator("#session option:checked")).to_have_text("Anna")  # what is shot now belongs to it
+    page = v.go("/captures")
+    page.locator("#method").select_option("simplex")
+    page.locator("#reconstruct-all").click()
+    expect(page.get_by_text("Queued 1 job.")).to_be_visible(timeout=30_000)
+    job = httpx.get(service.url + "/v1/jobs").json()["jobs"][0]
+    assert (job["settings"], job["session"] is not None) == ({"method": "simplex"}, True)
+    page.locator("#erase").click()
+    page.get_by_role("button", name="Keep").click()
+    page.locator("#erase").click()
+    page.locator("#erase-for-good").click()
+    expect(page.locator("#session option:checked")).to_have_text("all captures", timeout=30_000)
+    expect(page.locator(".row-button strong")).to_have_text("subject 1")
+    captures = httpx.get(service.url + "/v1/captures").json()["captures"]
+    assert [capture["label"] for capture in captures] == ["subject 1"]
+    assert httpx.get(service.url + "/v1/jobs").json()["jobs"] == []
+    assert len([*(service.data / "cache/captures").iterdir()]) == 1
+    v.check_clean()

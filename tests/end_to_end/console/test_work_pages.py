@@ -1,0 +1,103 @@
+"""Features, jobs and calibrations in a real browser."""
+
+import re
+import shutil
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, expect
+
+from rig.formats.archive import pack_folder
+from tests.support.browser import LONG_MS, keep_screenshots, live_rate, visit
+from tests.support.services import RunningService, uploaded_capture
+from tests.support.shared_data import shared
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def test_quick_keys_do_not_overtake_each_other(browser: Browser, service: RunningService, tmp_path: Path) -> None:
+    uploaded_capture(service, tmp_path)
+    v = visit(browser, service.url)
+    page = v.go("/features")
+    view = page.locator("svg[data-view]").first
+    view.focus()
+    for _ in range(4):
+        page.keyboard.press("Enter")  # nothing is suggested: the middle of the image, 12, 12
+        for _ in range(8):
+            page.keyboard.press("ArrowRight")
+        expect(page.get_by_text("14.0, 12.0")).to_be_visible()
+        expect(page.locator("[data-point]").first).to_contain_text("1 view")
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press("Delete")
+        expect(page.locator("[data-point]").first).to_contain_text("not set")
+    v.check_clean()
+
+
+def test_a_job_is_cancelled_and_restarted_with_other_settings(
+    browser: Browser, service: RunningService, tmp_path: Path
+) -> None:
+    capture = uploaded_capture(service, tmp_path)
+    httpx.post(service.url + "/v1/jobs", json={"capture_id": capture, "settings": {"front": "long"}})
+    v = visit(browser, service.url)
+    page = v.go("/jobs")
+    expect(page.locator("[data-state=running]")).to_have_count(1, timeout=30_000)
+    expect(page.get_by_text(re.compile(r"\d s left")).first).to_be_visible(timeout=30_000)
+    page.locator("#cancel").click()
+    expect(page.locator("[data-state=cancelled]")).to_have_count(1, timeout=10_000)
+    page.locator("#restart").click()
+    page.get_by_label("Front camera").fill("fail")
+    page.get_by_role("button", name="Queue the new job").click()
+    expect(page.locator("[data-state=failed]")).to_have_count(1, timeout=30_000)
+    expect(page.get_by_text("cam01 sees nobody")).to_be_visible()
+    newest = httpx.get(service.url + "/v1/jobs").json()["jobs"][0]
+    assert newest["settings"] == {"front": "fail"}
+    assert newest["restart_of"] is not None
+    v.check_clean()
+
+
+def test_pages_show_the_truth_after_the_service_was_killed_under_a_job(
+    browser: Browser, service: RunningService, tmp_path: Path
+) -> None:
+    """What they showed before was made wrong meanwhile: the job that ran is cancelled, another one is done."""
+    capture = uploaded_capture(service, tmp_path)
+    httpx.post(service.url + "/v1/jobs", json={"capture_id": capture, "settings": {"front": "long"}})
+    page, rig = visit(browser, service.url).go("/jobs"), visit(browser, service.url).go("/")
+    expect(page.locator("[data-state=running]")).to_have_count(1, timeout=30_000)
+    live_rate(rig, 0.1)
+    service.kill()
+    for shown in (page, rig):
+        expect(shown.locator("#popup")).to_be_visible(timeout=20_000)
+    service.start()
+    job = httpx.get(service.url + "/v1/jobs").json()["jobs"][0]["id"]
+    assert httpx.post(f"{service.url}/v1/jobs/{job}/cancel").status_code < 300
+    assert httpx.post(service.url + "/v1/jobs", json={"capture_id": capture}).status_code == 202
+    expect(page.locator("[data-state=cancelled]")).to_have_count(1, timeout=150_000)
+    expect(page.locator("[data-state=succeeded]")).to_have_count(1, timeout=60_000)
+    expect(page.locator("#popup")).to_be_hidden()
+    assert live_rate(rig, 3.0) > 0  # pictures again
+
+
+def test_a_calibration_is_uploaded_shown_and_refused_for_another_rig(
+    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+) -> None:
+    board, folder = shared("data/multicam-board"), tmp_path / "board"
+    for camera in ("cam_0", "cam_1", "cam_2", "cam_3"):
+        shutil.copytree(board / camera, folder / "IMAGES" / camera)
+    shutil.copy(board / "board.toml", folder / "board.toml")
+    pack_folder(folder, tmp_path / "board.tar")
+    v = visit(browser, service.url)
+    page = v.go("/calibration")
+    page.locator("input[type=file]").set_input_files([tmp_path / "board.tar"])
+    row = page.locator("[data-calibration]")
+    expect(row).to_have_count(1, timeout=LONG_MS)
+    expect(page.locator("[data-calibration][data-state=succeeded]")).to_have_count(1, timeout=LONG_MS)
+    expect(page.locator("table tr", has_text="cam_3")).to_be_visible()
+    keep_screenshots(page, screenshots, "calibration-report")
+    page.get_by_role("button", name="Use this").click()
+    expect(page.get_by_text("The calibration is of other cameras than the rig has")).to_be_visible()
+    page.get_by_role("button", name="New calibration").click()
+    page.locator("#shoot").click()  # the studio has a person in it, and no board
+    expect(page.get_by_text("No camera saw the board")).to_be_visible(timeout=LONG_MS)
+    assert httpx.get(service.url + "/v1/captures").json()["captures"] == []
+    v.check_clean()

@@ -1,0 +1,85 @@
+"""What a job does, from a capture folder to the files of a result, in this process: a small studio picture set."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from pipeline.eigenheads.model import load_model
+from pipeline.reconstruct import TooFewViews
+from rig.formats.capture_folder import write_capture
+from rig.formats.mesh_file import read_mesh
+from rig.render.renderer import Renderer
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import SimulatedCapture, simulate
+from rig.studio.sensor.preset import PRESET
+from server.tasks.child import Bench
+from server.tasks.reconstruct import reconstruct_capture
+from server.tasks.subjects import drawn_subject
+
+
+@pytest.fixture(scope="module")
+def shot(renderer: Renderer) -> SimulatedCapture:
+    """Seven cameras at 410 x 307 pixels."""
+    rng = np.random.default_rng(23)
+    rig = default_layout().subset(("cam00", "cam01", "cam02", "cam03", "cam04", "cam06", "cam08")).scaled(0.4)
+    return simulate(drawn_subject(load_model(), rng), rig, PRESET, rng, renderer=renderer)
+
+
+@pytest.mark.gl
+def test_a_capture_folder_becomes_a_head_and_its_report(
+    renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
+) -> None:
+    write_capture(tmp_path / "capture", shot.capture, shot.rig)
+    bench, heard = Bench(), []
+    bench.keep("renderer", lambda: renderer)
+    reconstruct_capture(
+        bench,
+        lambda stage, fraction: heard.append((stage, fraction)),
+        capture=str(tmp_path / "capture"),
+        result=str(tmp_path / "result"),
+        cache=str(tmp_path / "cache"),
+        model=None,
+        settings={"detail": "span"},
+    )
+    order = list(dict.fromkeys(stage for stage, _ in heard))
+    assert [stage for stage in order if stage in ("read", "segmentation", "fit", "texture", "write")] == [
+        "read",
+        "segmentation",
+        "fit",
+        "texture",
+        "write",
+    ]
+    report = json.loads((tmp_path / "result" / "report.json").read_text())
+    assert all(camera["used"] for camera in report["cameras"].values())
+    assert {warning["code"] for warning in report["warnings"]} <= {"view"}
+    face = shot.scene.head.vertices[shot.scene.photographed]
+    away, _ = KDTree(read_mesh(tmp_path / "result" / "head.ply").vertices).query(face)
+    # A pixel is 2.3 mm at the head here, and outlines are met to half a one.
+    assert np.median(away) < 1.2
+    assert np.quantile(away, 0.95) < 4.6
+    assert any((tmp_path / "cache").rglob("*"))  # the silhouettes, for the next job
+
+
+@pytest.mark.gl
+def test_an_empty_studio_is_refused_and_leaves_no_result(
+    renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
+) -> None:
+    nobody = {name: plates[0] for name, plates in shot.capture.backgrounds.items()}
+    write_capture(tmp_path / "capture", replace(shot.capture, images=nobody, features={}), shot.rig)
+    bench = Bench()
+    bench.keep("renderer", lambda: renderer)
+    with pytest.raises(TooFewViews, match="cam06"):
+        reconstruct_capture(
+            bench,
+            lambda stage, fraction: None,
+            capture=str(tmp_path / "capture"),
+            result=str(tmp_path / "result"),
+            cache=str(tmp_path / "cache"),
+            model=None,
+            settings={},
+        )
+    assert not (tmp_path / "result").exists()
