@@ -150,7 +150,13 @@ def _hidden(task: Task) -> Outcome:
     captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
     with Renderer.create() as renderer:
         return hidden(
-            task.head, captures, renderer=renderer, report=task.report, subjects=task.subjects or 8, folder=task.folder
+            task.head,
+            captures,
+            renderer=renderer,
+            report=task.report,
+            others=_facekit(task.shared),
+            subjects=task.subjects or 4,
+            folder=task.folder,
         )
 
 
