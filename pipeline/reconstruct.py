@@ -29,6 +29,7 @@ from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.refine import refine_with_photographs
 from pipeline.fitting.posterior import vertex_deviation_mm, with_estimated_prior
 from pipeline.fitting.simplex.hierarchy import fit_simplex
+from pipeline.fitting.span_misfit import with_span_misfit
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.kept_arrays import kept_arrays
@@ -311,7 +312,11 @@ def fit_head(
         hair = {name: part.probability[..., HAIR] for name, part in parts.items()}
         solved, detail = refine_with_photographs(solved, capture.images, settings.photo, hair=hair)
     model, eigenheads = solved.problem.model, min(settings.fitting.modes, len(model.modes))
-    return with_estimated_prior(model, finish(solved), eigenheads), model, detail, parts
+    relief_mm = settings.photo.fine_amplitude_mm
+    if detail.level == "span":
+        wider = _basis(model, eigenheads, kernel=True)
+        return with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, parts
+    return with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm), model, detail, parts
 
 
 def find_parts(

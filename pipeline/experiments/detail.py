@@ -15,7 +15,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -74,6 +74,7 @@ class Known:
     mesh: Mesh  # world frame
     face: Bool[np.ndarray, " v"]
     visible: VisiblePoints
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # world frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +165,9 @@ def photographed(
     subject = Subject(head, marks, level.face_region, f"seed-{seed}")
     faults = () if fault is None else (fault,)
     shot = simulate(subject, default_layout(), preset, rng, renderer=renderer, faults=faults)
-    return Known(subject.name, shot.capture, shot.rig, shot.scene.head, level.face_region, shot.scene.visible)
+    head_world = shot.scene.head
+    places = {name: head_world.vertices[row] for name, row in population.landmarks.items()}
+    return Known(subject.name, shot.capture, shot.rig, head_world, level.face_region, shot.scene.visible, places)
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:

@@ -1,16 +1,20 @@
 """Skin that the cameras see and skin that hair or clothes hide, apart and by region: error, and how often the stated
-interval holds it.
+interval holds it, at every level of detail; the same of landmarks and measurements.
 
-Subjects are heads of the model's span in the studio, under hair that covers ears and forehead, and, where asked for,
-captures with a truth beside them. Each is reconstructed whole, at level ``fine``. Distances are from the true surface
-to the head as delivered, weighted by area; regions are the model's, carried to the truth by the nearest vertex. A place
-lies within its interval where that distance is below 1.96 times the deviation (``quality``) stated there.
+Subjects are heads of the model's span in the studio, under hair that covers ears and forehead, heads of another
+population there under any hair, and, where asked for, captures with a truth beside them. Each is reconstructed whole at
+every level, from the same silhouettes. Distances are from the true surface to the head as delivered, weighted by area;
+regions are the model's, carried to the truth by the nearest vertex. A place lies within its interval where that
+distance is below 1.96 times the deviation (``quality``) stated there; a landmark counts by its coordinates, a
+measurement by its length. Another population has its landmarks where its makers put them, millimetres along the surface
+from ours: that counts as error, as it does for whoever compares two programs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,22 +24,33 @@ from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.experiments import markdown
 from pipeline.experiments.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.records import Records, key_of
 from pipeline.experiments.span import weighted_quantile
+from pipeline.fitting import posterior, span_misfit
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.reconstruct import reconstruct
+from pipeline.results import measurements
+from pipeline.results.measurements import DISTANCES, Landmark, Measurement
 from pipeline.settings import OutputSettings, Settings
+from pipeline.silhouettes.segment import segment
+from rig.capture import Capture
 from rig.mesh import Mesh, boundary_edges
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS
 from rig.studio.sensor.preset import PRESET
 
 Report = Callable[[str, float], None]
+Level = Literal["span", "kernel", "photo", "fine"]
 HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm down the forehead
 SEEN_MM, HIDDEN_MM = 2.0, 4.0  # from the visible points, 1.5 mm apart; what lies between is neither
 INTERVAL = 1.96  # standard deviations that hold 95 %
+FIRST_SEED = 4  # on the heads before it what intervals assume of unseen skin was measured
 LEAST_PLACES = 50  # of a region, for figures of its own
+LEVELS: tuple[Level, ...] = ("span", "kernel", "photo", "fine")
+POOLED = ("studio", "draws")  # every subject of which counts alike in the figures of ``all``
 
 
 def hidden(
@@ -44,42 +59,103 @@ def hidden(
     *,
     renderer: Renderer,
     report: Report,
-    subjects: int = 8,
+    others: HeadModel | None = None,
+    subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<seen|hidden>_<region>_<quantity>``, the mean over
-    the group: ``studio``, or a capture by its name.
+    """``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<level>_<seen|hidden>_<region>_<quantity>`` or
+    ``<group>_<level>_<landmarks|measurements>_within_95``, the mean over the group: ``studio``, ``draws``, both as
+    ``all``, or a capture by its name.
 
     Args:
         model: fitted, and drawn from.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
         report: told the subject and the share done.
-        subjects: heads in the studio.
+        others: another population to draw as many heads from.
+        subjects: heads of each population.
         folder: keeps rows, so that a stopped run goes on.
     """
-    records = Records(folder, "hidden", key_of(model.sha256, Settings()))
+    key = key_of(model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, measurements)
+    records = Records(folder, "hidden", key)
+    seeds = range(FIRST_SEED, FIRST_SEED + subjects)
     drawn = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer, preset=HEAVY_HAIR)
-    jobs = [("studio", f"studio-{seed:02}", partial(drawn, seed)) for seed in range(subjects)]
+    jobs = [("studio", f"studio-{seed:02}", partial(drawn, seed)) for seed in seeds]
+    if others is not None:
+        drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer)
+        jobs += [("draws", f"draw-{seed:02}", partial(drawn, seed)) for seed in seeds]
     jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, read) in enumerate(jobs):
         report(name, done / len(jobs))
         rows.append({"name": name, "group": group, **records.row(name, partial(known_row, read, model, renderer))})
     report("done", 1.0)
-    return {"figures": figures(rows), "rows": rows}
+    found = figures(rows)
+    return {"figures": found, "rows": rows, "markdown": as_markdown(found)}
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
-    """One subject: ``{<seen|hidden>_<region>_<quantity>: value}``, by level ``fine``."""
-    subject, settings = known(), Settings(detail="fine", outputs=OutputSettings(surface="head"))
-    found = reconstruct(subject.capture, subject.rig, model, settings, renderer=renderer, report=_silent)
-    measured = skin_figures(subject, found.mesh_world, found.quality_mm, head_regions(model))
-    return {"level": found.detail.level, **measured}
+    """One subject: ``{level: {<seen|hidden>_<region>_<quantity>: value}}``."""
+    subject = known()
+    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=_silent)
+
+    def segmented(capture: Capture, *given: object, report: Report) -> dict[str, Silhouette]:
+        """The same for every level; pictures that were put right are segmented anew."""
+        again = capture is not subject.capture
+        return segment(capture, subject.rig, Settings().segmentation, report=report) if again else silhouettes
+
+    found: Row = {}
+    for level in LEVELS:
+        settings = Settings(detail=level, outputs=OutputSettings(surface="head"))
+        given = (subject.capture, subject.rig, model, settings)
+        done = reconstruct(*given, renderer=renderer, report=_silent, segment=segmented)
+        found[level] = {
+            "reached": done.detail.level,
+            **skin_figures(subject, done.mesh_world, done.quality_mm, head_regions(model)),
+            **landmark_figures(subject.landmarks, done.landmarks, done.measurements),
+        }
+    return found
 
 
 def _silent(stage: str, fraction: float) -> None:
     pass
+
+
+def landmark_figures(
+    true: Mapping[str, Float[np.ndarray, " 3"]],
+    found: Mapping[str, Landmark],
+    lengths: Mapping[str, Measurement],
+) -> dict[str, float]:
+    """Median error and stated deviation (mm), and share within 95 % intervals, of landmarks (by coordinate) and of
+    measurements; nothing where no landmark is known.
+
+    Args:
+        true: world frame, mm, by name.
+        found: of the head as delivered.
+        lengths: the same.
+    """
+    off, stated = [], []
+    for name, mark in found.items():
+        if name in true and mark.std_mm is not None:
+            off.append(mark.position_mm - true[name])
+            stated.append(mark.std_mm)
+    measured = [
+        (abs(lengths[name].value_mm - float(np.linalg.norm(true[one] - true[two]))), lengths[name].std_mm)
+        for name, (one, two) in DISTANCES.items()
+        if name in lengths and one in true and two in true
+    ]
+    if not off or not measured:
+        return {}
+    errors, deviations = np.array(off), np.array(stated)
+    wrong, said = np.array(measured, float).T
+    return {
+        "landmarks_median_mm": float(np.median(np.linalg.norm(errors, axis=1))),
+        "landmarks_stated_mm": float(np.median(np.linalg.norm(deviations, axis=1))),
+        "landmarks_within_95": float((np.abs(errors) < INTERVAL * deviations).mean()),
+        "measurements_median_mm": float(np.median(wrong)),
+        "measurements_stated_mm": float(np.median(said)),
+        "measurements_within_95": float((wrong < INTERVAL * said).mean()),
+    }
 
 
 def skin_figures(
@@ -122,10 +198,34 @@ def skin_figures(
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
-    """Means over the subjects of each group, of what they have."""
+    """Means over the subjects of each group, of what they have, and over those of all populations together."""
     values: dict[str, list[float]] = {}
     for row in rows:
-        for key, value in row.items():
-            if isinstance(value, float):
-                values.setdefault(f"{row['group']}_{key}", []).append(value)
+        groups = (row["group"], "all") if row["group"] in POOLED else (row["group"],)
+        for level in LEVELS:
+            for key, value in row.get(level, {}).items():
+                for group in groups if isinstance(value, float) else ():
+                    values.setdefault(f"{group}_{level}_{key}", []).append(value)
     return {key: float(np.mean(found)) for key, found in values.items()}
+
+
+def as_markdown(found: Mapping[str, float]) -> str:
+    """Shares within 95 % intervals by group and level, and of seen and hidden skin median error and deviation."""
+    columns = ("seen_all", "seen_face", "hidden_all", "hidden_face", "landmarks", "measurements")
+    present = [key.removesuffix("_seen_all_within_95") for key in found if key.endswith("_seen_all_within_95")]
+    rows = [
+        [
+            place.replace("_", " "),
+            *(
+                " / ".join(
+                    f"{found[f'{place}_{column}_{what}']:.3g}" for what in ("within_95", "median_mm", "stated_mm")
+                )
+                if f"{place}_{column}_within_95" in found
+                else ""
+                for column in columns
+            ),
+        ]
+        for place in present
+    ]
+    header = ("within 95 % / median mm / stated mm", *(column.replace("_", " ") for column in columns))
+    return markdown.table(header, rows)

@@ -147,16 +147,28 @@ def _detail(task: Task) -> Outcome:
         )
 
 
-def _seen(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
-    """An experiment on studio heads and, where asked for, on the shared captures."""
+def _hidden(task: Task) -> Outcome:
+    with Renderer.create() as renderer:
+        return hidden(
+            task.head,
+            _captures(task),
+            renderer=renderer,
+            report=task.report,
+            others=_facekit(task.shared),
+            subjects=task.subjects or 4,
+            folder=task.folder,
+        )
 
-    def run(task: Task) -> Outcome:
-        captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
-        count = {"subjects": task.subjects} if task.subjects else {}
-        with Renderer.create() as renderer:
-            return experiment(task.head, captures, renderer=renderer, report=task.report, folder=task.folder, **count)
 
-    return run
+def _visible(task: Task) -> Outcome:
+    count = {"subjects": task.subjects} if task.subjects else {}
+    with Renderer.create() as renderer:
+        return visible(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
+
+
+def _captures(task: Task) -> dict[str, Path]:
+    """The shared captures that have a truth, where they are asked for."""
+    return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
 
 
 EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
@@ -178,8 +190,8 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "repeat": _drawn(repeat),
     "span": _span,
     "detail": _detail,
-    "hidden": _seen(hidden),
-    "visible": _seen(visible),
+    "hidden": _hidden,
+    "visible": _visible,
 }
 
 

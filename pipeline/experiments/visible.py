@@ -6,7 +6,7 @@ there, too, so that no closed surface reaches 1; ``precision_seen`` is of what t
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,6 @@ from pipeline.dense.surface.fusion import BustSurface
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
 from pipeline.experiments.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
-from pipeline.experiments.hidden import figures
 from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.pictures import labelled
 from pipeline.experiments.records import Records, key_of
@@ -142,3 +141,13 @@ def _row(name: str, in_head: Mapping[str, Mesh]) -> np.ndarray:
 
 def _silent(stage: str, fraction: float) -> None:
     pass
+
+
+def figures(rows: Sequence[Row]) -> dict[str, float]:
+    """Means over the subjects of each group, of what they have."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        for key, value in row.items():
+            if isinstance(value, float):
+                values.setdefault(f"{row['group']}_{key}", []).append(value)
+    return {key: float(np.mean(found)) for key, found in values.items()}

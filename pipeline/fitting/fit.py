@@ -24,5 +24,6 @@ class Fit:
     stopped_because: str
     covariance: Float[np.ndarray, "p p"] | None = None
     misfit_mm: Float[np.ndarray, " v0"] | None = None  # by cage vertex: relief that no mode follows
+    sliding_mm: float = 0.0  # standard deviation of a place along the surface, beyond what the covariance says
     used: Mapping[str, bool] = field(default_factory=dict)  # by camera: did it speak?
     camera_shift: Mapping[str, Float[np.ndarray, " 6"]] = field(default_factory=dict)  # left perturbation, rad and mm

@@ -5,13 +5,20 @@ head of the model's own population deviates there by half of what the kernel all
 as much. How far a head strays is seen where it is seen: ``with_estimated_prior`` estimates the prior's variance from
 the coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
 https://doi.org/10.1162/neco.1992.4.3.415).
+
+Two things follow that no coefficient shows. The kernel moves the surface along its normals, and a head that strays from
+the eigenheads strays along the surface as well: a landmark's place there is as unsure as the kernel allows
+(``Fit.sliding_mm``). And what modes are too coarse for, the relief that only photographs resolve, is there where they
+are silent, too. A fit to the eigenheads alone says nothing of either (``span_misfit``).
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.eigenheads.gaussian_process import SCALES
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fit import Fit
@@ -20,11 +27,12 @@ from rig.mesh import vertex_normals
 # Measured on heads of the model's population and of another, with ears and forehead under hair (experiments hidden).
 LEAST_DETERMINED = 5.0  # coefficients; of fewer the prior's scale is not estimated
 VARIANCE_RANGE = (0.1, 4.0)
-KERNEL_VARIANCE_UNSEEN = 2.0  # hidden skin strays more than seen skin: no landmark holds it in its place
+KERNEL_VARIANCE_UNSEEN = 4.0  # hidden skin strays more than seen skin: no landmark holds it in its place
+KERNEL_MM = math.hypot(*(scale.amplitude_mm for scale in SCALES))
 EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance ratio
 
 
-def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int) -> Fit:
+def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
     """The fit with the covariance that follows from a prior whose variance is estimated from the fit itself.
 
     What the photographs determine keeps its variance. With ``C`` the covariance under unit priors, group by group of
@@ -34,6 +42,7 @@ def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int) -> Fit:
         model: with the modes that the fit has.
         fit: with its covariance under unit priors; one without is returned as it is.
         eigenheads: how many of the modes are a population's; the rest are the kernel's.
+        relief_mm: standard deviation of what only photographs show, on a head that strays as the kernel says.
     """
     if fit.covariance is None or len(fit.coefficients) <= eigenheads:
         return fit
@@ -43,10 +52,12 @@ def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int) -> Fit:
     ratio = np.ones(len(fit.covariance))
     ratio[:eigenheads], ratio[eigenheads:count] = population, KERNEL_VARIANCE_UNSEEN * kernel
     information = np.linalg.inv(fit.covariance) + np.diag(1.0 / ratio - 1.0)
-    misfit = np.zeros(len(model.mean)) if fit.misfit_mm is None else fit.misfit_mm
+    relief = relief_mm * math.sqrt(kernel)
+    misfit = np.maximum(0.0 if fit.misfit_mm is None else fit.misfit_mm, np.full(len(model.mean), relief))
     ears = head_regions(model)["ears"][: len(model.mean)]  # the cage's vertices come first
     misfit = np.where(ears, np.maximum(misfit, EAR_MISFIT_MM * min(kernel, 1.0 + 0.25 * kernel)), misfit)
-    return replace(fit, covariance=np.linalg.inv(0.5 * (information + information.T)), misfit_mm=misfit)
+    covariance = np.linalg.inv(0.5 * (information + information.T))
+    return replace(fit, covariance=covariance, misfit_mm=misfit, sliding_mm=KERNEL_MM * math.sqrt(kernel))
 
 
 def _variance_ratio(fit: Fit, modes: slice) -> float:
@@ -69,15 +80,20 @@ def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
     operator = model.levels["full"].operator
     if fit.covariance is None:
         return np.zeros(model.levels["full"].count)
+    return np.sqrt(np.maximum(operator @ cage_variance(model, fit), 0.0))
+
+
+def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
+    """Variance (mm^2) of the cage's vertices along their normals, of a fit with a covariance."""
+    assert fit.covariance is not None
     rows = normal_rows(model, fit)
     # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.
     covariance = 0.5 * (fit.covariance + fit.covariance.T)
     scale = np.sqrt(np.diag(covariance))
     factor = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))) * scale[:, None]
     variance = ((rows @ factor.astype(np.float32)) ** 2).sum(axis=1)
-    if fit.misfit_mm is not None:
-        variance = variance + fit.misfit_mm**2
-    return np.sqrt(np.maximum(operator @ variance.astype(float), 0.0))
+    misfit = 0.0 if fit.misfit_mm is None else fit.misfit_mm
+    return variance.astype(float) + misfit**2
 
 
 def normal_rows(model: HeadModel, fit: Fit) -> Float[np.ndarray, "v0 p"]:

@@ -5,6 +5,10 @@ model's full level, so with ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the 
 ``s R h_m`` by a coefficient, ``-[x - t]x`` by a left rotation about the head's place, the identity by the translation
 and ``x - t`` by log scale. A distance has ``var = g C g^T``; its rotation and translation parts cancel by themselves.
 
+Where on the surface a landmark lies hardly shows in outlines or in photographs of skin; the eigenheads say it, and a
+head that strays from them strays along the surface, too. A landmark is unsure by ``Fit.sliding_mm`` in every direction
+of its tangent plane; two landmarks slide alike as far as the kernel of ``gaussian_process`` says for their distance.
+
 Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three points that
 are not among the 26 landmarks: the farthest point of the back of the head from the glabella in the midsagittal plane
 (opisthocranion) and the most lateral points of the skull above the ears (euryon). They are found on the fitted head;
@@ -18,9 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.eigenheads.gaussian_process import SCALES
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
 from rig.geometry import cross_matrix
+from rig.mesh import vertex_normals
 
 DISTANCES: Mapping[str, tuple[str, str]] = {
     "head_breadth": ("euryon_right", "euryon_left"),
@@ -74,6 +80,8 @@ def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | N
     if fit.covariance is None:
         return {name: Landmark(point, None) for name, point in zip(names, points, strict=True)}
     variance = np.einsum("nip,pq,niq->ni", jacobian, fit.covariance, jacobian)
+    normals = _normals(model, fit, vertices)[index]
+    variance += fit.sliding_mm**2 * (1.0 - normals**2)
     std = np.sqrt(np.maximum(variance, 0.0))
     return {name: Landmark(points[i], std[i]) for i, name in enumerate(names)}
 
@@ -94,8 +102,31 @@ def measurements(
     units = chords / np.maximum(values, 1e-9)[:, None]
     gradients = np.einsum("ni,nip->np", units, jacobian[1::2] - jacobian[::2])
     variances = np.einsum("np,pq,nq->n", gradients, fit.covariance, gradients)
+    normals = _normals(model, fit, vertices)[index]
+    variances += fit.sliding_mm**2 * _sliding_apart(units, values, normals[::2], normals[1::2])
     stds = np.sqrt(np.maximum(variances, 0.0))
     return {name: Measurement(float(values[i]), float(stds[i])) for i, name in enumerate(found)}
+
+
+def _normals(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None) -> Float[np.ndarray, "v 3"]:
+    """Of the head as delivered, world frame."""
+    head = fit.world_from_head.apply(model.vertices(fit.coefficients)) if vertices is None else vertices
+    return vertex_normals(head, model.levels["full"].faces)
+
+
+def _sliding_apart(
+    units: Float[np.ndarray, "n 3"],
+    lengths_mm: Float[np.ndarray, " n"],
+    first_normals: Float[np.ndarray, "n 3"],
+    second_normals: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, " n"]:
+    """Variance of distances along ``units`` between places that slide with unit variance, each in its tangent plane."""
+    first, second = (
+        units - normals * (units * normals).sum(axis=1, keepdims=True) for normals in (first_normals, second_normals)
+    )
+    alike = sum(s.amplitude_mm**2 * np.exp(-0.5 * (lengths_mm / s.length_mm) ** 2) for s in SCALES)
+    alike = alike / sum(s.amplitude_mm**2 for s in SCALES)
+    return (first**2).sum(axis=1) + (second**2).sum(axis=1) - 2.0 * alike * (first * second).sum(axis=1)
 
 
 def _points(

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.detail import Known
-from pipeline.experiments.hidden import figures, skin_figures
+from pipeline.experiments.hidden import as_markdown, figures, landmark_figures, skin_figures
+from pipeline.results.measurements import Landmark, Measurement
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.studio.scene.layout import default_layout
@@ -41,8 +42,35 @@ def test_seen_and_hidden_skin_are_told_apart_by_region() -> None:
     assert not any("none" in key for key in said)
 
 
-def test_figures_are_means_of_a_group() -> None:
-    rows = [{"name": "a", "group": "studio", "level": "fine", "seen_all_median_mm": 0.1},
-            {"name": "b", "group": "studio", "level": "fine", "seen_all_median_mm": 0.3},
-            {"name": "scan", "group": "scan", "level": "photo", "hidden_ears_within_95": 0.9}]  # fmt: skip
-    assert figures(rows) == pytest.approx({"studio_seen_all_median_mm": 0.2, "scan_hidden_ears_within_95": 0.9})
+def test_landmarks_count_by_coordinate_and_measurements_by_length() -> None:
+    true = {"cheilion_right": np.zeros(3), "cheilion_left": np.array([50.0, 0.0, 0.0])}
+    found = {
+        "cheilion_right": Landmark(np.array([0.5, 0.0, 3.0]), np.full(3, 1.0)),
+        "cheilion_left": Landmark(np.array([51.0, 3.0, 3.0]), np.full(3, 1.0)),
+        "gonion_left": Landmark(np.zeros(3), np.full(3, 1.0)),  # of no known place
+    }
+    said = landmark_figures(
+        true, found, {"mouth_breadth": Measurement(52.0, 1.5), "nose_length": Measurement(1.0, 1.0)}
+    )
+    assert said["landmarks_within_95"] == pytest.approx(0.5)  # three of six are three deviations off
+    assert said["landmarks_stated_mm"] == pytest.approx(np.sqrt(3.0))
+    assert said["measurements_median_mm"] == pytest.approx(2.0)
+    assert said["measurements_within_95"] == 1.0
+    assert landmark_figures({}, found, {}) == {}
+
+
+def test_figures_are_means_of_a_group_and_of_all_populations() -> None:
+    rows = [{"name": "a", "group": "studio", "fine": {"reached": "fine", "seen_all_median_mm": 0.1}},
+            {"name": "b", "group": "draws", "fine": {"reached": "fine", "seen_all_median_mm": 0.3}},
+            {"name": "scan", "group": "scan", "photo": {"reached": "photo", "hidden_ears_within_95": 0.9}}]  # fmt: skip
+    expected = {"studio": 0.1, "draws": 0.3, "all": 0.2}
+    found = figures(rows)
+    assert {name: found[f"{name}_fine_seen_all_median_mm"] for name in expected} == pytest.approx(expected)
+    assert found["scan_photo_hidden_ears_within_95"] == pytest.approx(0.9)
+    assert len(found) == 4
+
+
+def test_the_table_has_a_row_for_each_group_and_level() -> None:
+    found = {f"studio_fine_seen_all_{what}": value for what, value in
+             {"within_95": 0.95, "median_mm": 0.1, "stated_mm": 0.2}.items()}  # fmt: skip
+    assert "| studio fine | 0.95 / 0.1 / 0.2 |" in as_markdown(found)

@@ -1,10 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeline.eigenheads.gaussian_process import SCALES
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.fitting.fit import Fit
 from pipeline.results.measurements import DISTANCES, landmarks, measurements
 from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import Mesh
 
 COUNT = 8
 SIZE = COUNT + 7  # coefficients, rotation, translation, log scale
@@ -96,3 +100,32 @@ def test_the_mean_head_has_an_adults_measures(model: HeadModel) -> None:
     assert set(found) == set(DISTANCES)
     for name, (low, high) in ADULT_MM.items():
         assert low < found[name].value_mm < high, (name, found[name].value_mm)
+
+
+def test_landmarks_slide_in_their_tangent_planes(model: HeadModel) -> None:
+    """Against draws of a smooth field along the surface, with the kernel's correlation."""
+    sliding = 2.0
+    fit = replace(fit_at(np.zeros(SIZE), 1e-12 * np.eye(SIZE)), sliding_mm=sliding)
+    mesh = Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), model.levels["full"].faces)
+    names = [name for pair in DISTANCES.values() for name in pair if name in model.landmarks]
+    rows = np.array([model.landmarks[name] for name in names])
+    points, normals = mesh.vertices[rows], mesh.normals()[rows]
+    for name, at, normal in zip(names, points, normals, strict=True):
+        found = landmarks(model, fit)[name]
+        assert found.std_mm is not None
+        assert (found.std_mm**2).sum() == pytest.approx(2.0 * sliding**2, rel=1e-4)  # nothing along the normal
+        np.testing.assert_allclose(found.std_mm**2, sliding**2 * (1.0 - normal**2), rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(found.position_mm, at, atol=1e-3)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    weights = np.array([scale.amplitude_mm**2 for scale in SCALES])
+    kernel = sum(w * np.exp(-0.5 * (apart / s.length_mm) ** 2) for w, s in zip(weights, SCALES, strict=True))
+    root = np.linalg.cholesky(kernel / weights.sum() + 1e-9 * np.eye(len(points)))
+    draws = sliding * np.einsum("pq,nqc->npc", root, np.random.default_rng(5).standard_normal((4000, len(points), 3)))
+    draws -= (draws * normals).sum(axis=2, keepdims=True) * normals
+    for name, (one, two) in DISTANCES.items():
+        if one in names and two in names:
+            i, j = names.index(one), names.index(two)
+            unit = (points[j] - points[i]) / np.linalg.norm(points[j] - points[i])
+            expected = ((draws[:, j] - draws[:, i]) @ unit).std()
+            found_std = measurements(model, fit)[name].std_mm
+            assert found_std == pytest.approx(expected, rel=0.045)  # 4,000 draws, as above
