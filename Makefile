@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup demo serve test test-slow check coverage format bench dependencies docs sbom audit
+.PHONY: setup demo serve test test-slow check coverage format bench dependencies results pictures docs sbom audit
 BIN := .venv/bin
 UV = $(shell command -v uv || echo $${XDG_CACHE_HOME:-$$HOME/.cache}/eigenhead/uv)
 
@@ -41,6 +41,12 @@ bench: setup ## timings of inner loops
 
 dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
 	$(BIN)/python -m tests.support.dependencies
+
+results: setup ## the documents' tables from docs/results/; with TABLE=name that table's command is run first (it may take hours)
+	$(BIN)/python -m tests.support.results $(TABLE)
+
+pictures: demo ## docs/pictures from what the demo made
+	$(BIN)/python -m tests.support.pictures
 
 docs: ## the documents as a site, out/site
 	@deploy/setup.sh --docs
