@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup demo serve test test-slow check coverage format bench dependencies results pictures docs sbom audit
+.PHONY: setup demo serve test test-slow check coverage format bench dependencies results pictures docs sbom audit mutants
 BIN := .venv/bin
 UV = $(shell command -v uv || echo $${XDG_CACHE_HOME:-$$HOME/.cache}/eigenhead/uv)
 
@@ -58,3 +58,7 @@ sbom: setup ## what an installation is made of: CycloneDX, out/sbom.json
 
 audit: setup ## known faults of the locked packages, asked of osv.dev; fails where it cannot ask
 	$(UV) audit --locked --preview-features audit
+
+mutants: setup ## MODULE=rig/geometry.py: changes it piece by piece and tells what no test notices
+	$(UV) sync --locked --quiet --group docs --group mutants
+	$(BIN)/python -m tests.support.mutants $(MODULE)
