@@ -22,8 +22,7 @@ TESTS = {
     "pipeline/fitting/simplex/xor_objective.py": ["tests/pipeline/fitting/simplex/test_xor_objective.py"],
     "rig/formats/archive.py": ["tests/rig/formats/test_archive.py"],
     "rig/geometry.py": ["tests/rig/test_geometry.py"],
-    "server/http/auth.py": ["tests/server/http/test_auth.py"],
-    "server/services/keys.py": ["tests/server/http/test_auth.py"],
+    "server/http/auth.py": ["tests/server/http/test_callers.py"],
 }
 
 
