@@ -20,7 +20,7 @@ PACKAGES = ("rig", "pipeline", "calibration", "server")
 TESTS = {
     "pipeline/alignment/procrustes.py": ["tests/pipeline/alignment/test_landmarks.py"],
     "pipeline/fitting/simplex/xor_objective.py": ["tests/pipeline/fitting/simplex/test_xor_objective.py"],
-    "rig/formats/archive.py": ["tests/rig/formats/test_archive.py"],
+    "rig/formats/archive.py": ["tests/rig/formats/test_archive.py", "tests/rig/formats/test_archive_rules.py"],
     "rig/geometry.py": ["tests/rig/test_geometry.py"],
     "server/http/auth.py": ["tests/server/http/test_callers.py"],
 }
