@@ -83,7 +83,7 @@ def faults_of_cameras(document: Any) -> list[str]:
     try:
         rig_from_document(document)
     except InputError as error:
-        return error.faults
+        return list(error.faults)
     return []
 
 

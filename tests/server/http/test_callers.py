@@ -78,6 +78,7 @@ def test_pages_of_this_machine_may_ask(door: Door, origin: str) -> None:
         {"origin": "http://evil.example"},
         {"origin": "https://evil.example:8600"},
         {"origin": "http://localhost.evil.example"},
+        {"origin": "http://evil.example://localhost"},
         {"origin": "null"},
         {"host": "evil.example", "origin": "http://localhost"},
     ],
