@@ -11,7 +11,7 @@ import pytest
 from rig.errors import InputError
 from rig.formats import archive as rules
 from rig.formats.archive import ArchiveLimits, extract_archive
-from tests.rig.formats.test_archive import tar_entry, tar_of, zip_entry, zip_of
+from tests.rig.formats.test_archive import encrypted_zip, overlapping_zip, tar_entry, tar_of, zip_entry, zip_of
 
 LIMITS = ArchiveLimits()
 
@@ -50,6 +50,8 @@ WORDS = {
     "alphabets": (tar_of(("\u0430b", b"1")), "'\u0430b' mixes letters of several alphabets in its name"),
     "letters": (tar_of(("x/A", b"1"), ("x/a", b"2")), "'x/a' is the same name as 'x/A' in other letters"),
     "twice": (tar_of(("a", b"1"), ("a", b"2")), "'a' occurs twice"),
+    "encrypted": (encrypted_zip(), "'cameras.json' is encrypted"),
+    "overlap": (overlapping_zip(), "'a.png' overlaps the next member: a zip bomb"),
     "nothing": (zip_of(("folder/", b"")), "holds no files"),
 }
 
@@ -101,6 +103,13 @@ def test_the_ratio_counts_only_above_its_floor(tmp_path: Path) -> None:
     stored = zip_of(("b", bytes(5000)), method=zipfile.ZIP_STORED)
     (tmp_path / "more").mkdir()
     assert unpacked(stored, tmp_path / "more", incompressible) == ("b",)
+
+
+def test_a_file_of_several_blocks_comes_out_whole(tmp_path: Path) -> None:
+    data = bytes(range(256)) * 10_000
+    assert len(data) > 2 * rules.COPY_BYTES
+    assert unpacked(zip_of(("a", data)), tmp_path) == ("a",)
+    assert (tmp_path / "out" / "a").read_bytes() == data
 
 
 def test_the_hundredth_fault_is_the_last_that_is_named(tmp_path: Path) -> None:
