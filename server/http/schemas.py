@@ -262,7 +262,7 @@ class InfoOut(Answer):
     body_bytes_most: int = Field(description="of an upload")
     image_pixels_most: int = Field(description="of one image")
     jobs_per_key_most: int = Field(description="queued and running")
-    settings: JobSettings = Field(description="what a job has where it gives none; the schema says what else may be given")
+    settings: JobSettings = Field(description="what a job has where it gives none; its schema says what it may give")
 
 
 class Ready(Answer):
