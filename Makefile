@@ -1,8 +1,9 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup demo serve test test-slow check coverage format bench dependencies
+.PHONY: setup demo serve test test-slow check coverage format bench dependencies results pictures docs sbom audit mutants
 BIN := .venv/bin
 # The tests start many processes: with compiled modules kept beside them each starts in half the time.
 unexport PYTHONDONTWRITEBYTECODE
+UV = $(shell command -v uv || echo $${XDG_CACHE_HOME:-$$HOME/.cache}/eigenhead/uv)
 
 setup:       ## uv, the locked environment, an EGL; nothing where nothing is missing
 	@deploy/setup.sh
@@ -20,11 +21,13 @@ test: setup  ## the fast tests
 test-slow: setup  ## the tests that take more than a few seconds each
 	$(BIN)/pytest -m slow -n 2 --dist loadfile
 
-check: setup ## ruff, pyright, import-linter
+check: ## ruff, pyright, import-linter, dead links of the documents
+	@deploy/setup.sh --docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 coverage: setup ## what share of the product's lines the fast tests run, child processes included, compiled loops left out
 	@mkdir -p out/coverage && rm -f out/coverage/data*
@@ -41,3 +44,24 @@ bench: setup ## timings of inner loops
 
 dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
 	$(BIN)/python -m tests.support.dependencies
+
+results: setup ## the documents' tables from docs/results/; with TABLE=name that table's command is run first (it may take hours)
+	$(BIN)/python -m tests.support.results $(TABLE)
+
+pictures: demo ## docs/pictures from what the demo made
+	$(BIN)/python -m tests.support.pictures
+
+docs: ## the documents as a site, out/site
+	@deploy/setup.sh --docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+sbom: setup ## what an installation is made of: CycloneDX, out/sbom.json
+	@mkdir -p out
+	$(UV) export --locked --quiet --no-default-groups --all-extras --format cyclonedx1.5 --output-file out/sbom.json >/dev/null
+
+audit: setup ## known faults of the locked packages, asked of osv.dev; fails where it cannot ask
+	$(UV) audit --locked --preview-features audit
+
+mutants: setup ## MODULE=rig/geometry.py: changes it piece by piece and tells what no test notices
+	$(UV) sync --locked --quiet --group docs --group mutants
+	$(BIN)/python -m tests.support.mutants $(MODULE)

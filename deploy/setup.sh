@@ -2,8 +2,9 @@
 # Makes this checkout ready to run: uv, the locked environment in .venv, and an EGL to draw with.
 #
 #   deploy/setup.sh           what `make demo`, `make test` and the service need
-#   deploy/setup.sh --tests   also the Debian packages without which some tests skip
 #   deploy/setup.sh --quick   what `make demo` needs: each command compiles the loops of its own job before it begins
+#   deploy/setup.sh --docs    also what `make docs` and the documents' tests need (dependency group docs)
+#   deploy/setup.sh --tests   that, and the Debian packages without which some tests skip
 #
 # Needs bash and python3 (3.11 or newer), nothing else. As root it installs missing Debian packages; without root it
 # names the one command to run. Says what it did; does nothing, in milliseconds, where nothing is to do.
@@ -20,17 +21,18 @@ TEST_PACKAGES=(nginx-light caddy openssl curl gcc libc6-dev gcc-avr avr-libc sim
 say() { echo "setup: $*" >&2; }
 fail() { say "$*"; exit 1; }
 
-tests="" quick=""
+more="" quick=""
 for argument in "$@"; do
   case "$argument" in
-    --tests) tests=tests ;;
     --quick) quick=quick ;;
-    *) fail "unknown option $argument; it knows --tests and --quick" ;;
+    --docs) more=${more:-docs} ;;
+    --tests) more=tests ;;
+    *) fail "unknown option $argument; it knows --quick, --docs and --tests" ;;
   esac
 done
 
-# The stamp holds what the environment was made from; with --tests it stands for the packages too.
-stamp=".venv/.ready${tests:+-$tests}"
+# A stamp holds what the environment was made from; one for each option, as they ask for more.
+stamp=".venv/.ready${more:+-$more}"
 wanted="$(cat uv.lock pyproject.toml deploy/setup.sh deploy/wheel_imports.py | sha256sum) $PWD"
 for made in "$stamp" ${quick:+.venv/.ready-quick}; do
   if [ -x .venv/bin/python ] && [ "$(cat "$made" 2>/dev/null)" = "$wanted" ]; then
@@ -88,7 +90,7 @@ sys.exit(not any(map(os.path.exists, (os.environ.get("SSL_CERT_FILE", ""), "/etc
 fi
 
 say "environment: $("$uv" --version | cut -d' ' -f1-2) sync of uv.lock into .venv"
-"$uv" sync --locked --quiet
+"$uv" sync --locked --quiet ${more:+--group docs}
 
 # The only sure sign of a working EGL is a context.
 egl_works() { .venv/bin/python -c 'import moderngl; moderngl.create_context(standalone=True, backend="egl").release()' 2>/dev/null; }
@@ -109,11 +111,11 @@ if [ -n "$quick" ]; then
 fi
 env -u PYTHONDONTWRITEBYTECODE .venv/bin/eigenhead prepare >&2 || say "loops will be compiled when a job needs them"
 
-if [ -n "$tests" ]; then
+if [ "$more" = tests ]; then
   mapfile -t missing < <(missing_packages "${TEST_PACKAGES[@]}")
   [ ${#missing[@]} = 0 ] || install_packages "some tests would skip" "${missing[@]}"
 fi
 
-echo "$wanted" >.venv/.ready
-[ -z "$tests" ] || echo "$wanted" >"$stamp"
+echo "$wanted" | tee .venv/.ready "$stamp" >/dev/null
+[ "$more" != tests ] || echo "$wanted" >.venv/.ready-docs
 say "ready"

@@ -19,6 +19,9 @@ if TYPE_CHECKING:  # the product is imported after the hook
     from rig.render.renderer import Renderer
 
 hypothesis.settings.register_profile("eigenhead", deadline=None)  # an example may have to compile its loops first
+hypothesis.settings.register_profile(  # `make mutants`: the first example that fails is enough
+    "mutants", deadline=None, max_examples=25, derandomize=True, database=None, phases=[hypothesis.Phase.generate]
+)
 hypothesis.settings.load_profile("eigenhead")
 
 FAST = "not slow"  # shapes and types of every call are checked in these tests; the slow ones measure time, too

@@ -1,9 +1,12 @@
 """docs/dependencies.md names what uv.lock has, and every package that we ask for has a reason and a licence."""
 
+import json
 import re
+import subprocess
 import tomllib
 
 from tests.support.dependencies import ABSENT, PAGE, ROOT, locked, reasons
+from tests.support.uv import uv
 
 
 def named(requirement: str) -> str:
@@ -40,3 +43,18 @@ def test_every_package_that_is_delivered_states_its_licence() -> None:
     document = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     delivered = {named(requirement) for requirement in document["project"]["dependencies"]}
     assert [name for name in sorted(delivered) if rows()[name][0] in (ABSENT, "see its files")] == []
+
+
+def test_the_bill_of_materials_names_what_is_delivered() -> None:
+    """With `make sbom`'s own options."""
+    (options,) = re.findall(r"\$\(UV\) export (.*) --output-file", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    command = [uv(), "export", "--offline", *options.split()]
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
+    bill = json.loads(told)
+    assert (bill["bomFormat"], bill["metadata"]["component"]["name"]) == ("CycloneDX", "eigenhead")
+    versions = {part["name"]: part["version"] for part in bill["components"]}
+    document = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    delivered = {named(requirement) for requirement in document["project"]["dependencies"]}
+    assert delivered <= set(versions)
+    assert not {"pytest", "mkdocs-material", "mutmut"} & set(versions)
+    assert {(package["name"], package["version"]) for package in locked()} >= set(versions.items())

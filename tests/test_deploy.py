@@ -92,3 +92,15 @@ def test_caddy_accepts_its_file() -> None:
     assert done.returncode == 0, done.stderr
     assert '"127.0.0.1:8600"' in done.stdout
     assert '"heads.example"' in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("step", "status", "told"), [("demo", 0, "try_debian: skipped: "), ("sleep", 2, "unknown step sleep")]
+)
+def test_a_debian_is_tried_only_where_one_can_be_made(step: str, status: int, told: str) -> None:
+    """debootstrap lies in /usr/sbin, which this path leaves out; without root it is not even looked for."""
+    command = ["bash", str(DEPLOY / "try_debian.sh"), step]
+    environment = {"PATH": "/usr/bin:/bin", "HOME": "/nonexistent"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == status
+    assert told in done.stderr

@@ -74,14 +74,6 @@ def test_every_variable_that_is_named_is_read() -> None:
     assert len(named & known) > 15
 
 
-def test_the_readmes_figures_are_those_of_the_results() -> None:
-    table = prose(ROOT / "README.md").partition("## Results")[2].partition("\n## ")[0]
-    pairs = re.findall(r"\| ([\d.]+) \| ([\d.]+) \|$", table, re.MULTILINE)
-    measured = prose(DOCS / "results.md").replace("*", "")
-    assert len(pairs) == 8
-    assert [pair for pair in pairs if " / ".join(pair) not in measured] == []
-
-
 def schema(name: str) -> Any:
     return jsonschema_rs.validator_for(json.loads((DOCS / "schemas" / f"{name}.schema.json").read_text()))
 

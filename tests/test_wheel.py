@@ -1,5 +1,6 @@
 """The wheel carries the packages under a name of its own, and runs beside any folder."""
 
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -7,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import venv
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +18,7 @@ import numpy as np
 import pytest
 
 from tests.support.hostile_folder import hostile_folder
+from tests.support.uv import uv
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -82,19 +85,15 @@ def test_the_checkout_has_the_public_names_too() -> None:
         _ = eigenhead.colour
 
 
-def uv() -> Path:
-    """The program that set this environment up (deploy/setup.sh looks in the same places)."""
-    kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eigenhead" / "uv"
-    return Path(shutil.which("uv") or kept)
-
-
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The folder of programs of an environment that holds the wheel, and the packages it depends on from ours."""
+    """The folder of programs of an environment that holds the wheel, and the packages it depends on from ours. The
+    wheel is built from the source archive, as those do who get that alone."""
     folder = tmp_path_factory.mktemp("wheel")
-    build = [uv(), "build", "--wheel", "--no-build-isolation", "--offline", "--python", sys.executable, "-o", folder]
+    build = [uv(), "build", "--no-build-isolation", "--offline", "--python", sys.executable, "-o", folder]
     environment = os.environ | {"EIGENHEAD_WHEEL_LOOPS": "1"}
     subprocess.run([*build, ROOT], env=environment, check=True, capture_output=True, timeout=600)
+    assert len([*folder.glob("eigenhead-*.tar.gz")]) == 1
     venv.create(folder / "venv", symlinks=True)
     python = folder / "venv" / "bin" / "python"
     install = [uv(), "pip", "install", "--offline", "--no-deps", "--python", python, *folder.glob("*.whl")]
@@ -103,6 +102,16 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (site / "dependencies.pth").write_text(f"{Path(np.__file__).parents[1]}\n")  # without our .pth files: no checkout
     yield python.parent
     shutil.rmtree(folder)
+
+
+def test_a_tagged_commit_has_the_version_of_its_tag() -> None:
+    """The version stands in pyproject.toml: a clone without tags, an archive and an installed wheel know it alike."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert importlib.metadata.version("eigenhead") == project
+    assert f"\n## {project}\n" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    command = ["git", "tag", "--points-at", "HEAD", "--list", "v*"]
+    tags = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False).stdout.split()
+    assert tags in ([], [f"v{project}"])
 
 
 def run(folder: Path, *command: str | Path) -> str:

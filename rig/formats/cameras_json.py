@@ -188,13 +188,13 @@ def _read_numbers(
 
 def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[str]) -> np.ndarray | None:
     try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
+        array = np.array(value, dtype=object)  # float would read "1" and true as numbers
+    except ValueError:
         array = np.zeros(0)
     if array.shape != shape:
         faults.append(f"{where} is missing or not {' x '.join(map(str, shape))} numbers")
         return None
-    if not np.isfinite(array).all():
-        faults.append(f"{where} holds a value that is not finite")
+    if not all(_is_number(entry) for entry in array.flat):
+        faults.append(f"{where} holds a value that is no finite number")
         return None
-    return array
+    return array.astype(float)

@@ -252,6 +252,19 @@ class Health(Answer):
     version: str
 
 
+class InfoOut(Answer):
+    version: str
+    cores: int = Field(description="that this service may use; its workers may run elsewhere")
+    queued: int = Field(description="jobs")
+    running: int = Field(description="jobs")
+    cameras_least: int = Field(description="of a capture")
+    cameras_most: int = Field(description="of a capture")
+    body_bytes_most: int = Field(description="of an upload")
+    image_pixels_most: int = Field(description="of one image")
+    jobs_per_key_most: int = Field(description="queued and running")
+    settings: JobSettings = Field(description="what a job has where it gives none; its schema says what it may give")
+
+
 class Ready(Answer):
     ready: bool
     checks: dict[str, Check]

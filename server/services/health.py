@@ -1,11 +1,18 @@
 """Whether the service, or this machine, can do its work, and what to do where it cannot."""
 
+import os
+from dataclasses import dataclass
+from importlib.metadata import version
+
 import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
+from pipeline.settings import Settings, document_from_settings
+from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from server.services.jobs import STATES, WORKFLOW
 from server.services.service import Check, Service
 from server.storage.database import alive_workers
+from server.storage.records import JsonObject
 from server.tasks.child import WorkFailed
 from server.tasks.egl import try_egl
 
@@ -74,8 +81,45 @@ def _records(service: Service) -> Check:
 
 def exposition(service: Service) -> bytes:
     """The metrics of this moment, in Prometheus' text format."""
+    jobs = _jobs_by_state(service)
+    captures, damaged = len(service.store.ids("captures")), len(service.store.set_aside())
+    return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)
+
+
+@dataclass(frozen=True, slots=True)
+class Info:
+    """What a client may want to know before it sends anything: limits, how much waits, the settings' defaults."""
+
+    version: str
+    cores: int
+    queued: int
+    running: int
+    cameras_least: int
+    cameras_most: int
+    body_bytes_most: int
+    image_pixels_most: int
+    jobs_per_key_most: int
+    settings: JsonObject
+
+
+def about(service: Service) -> Info:
+    jobs, limits = _jobs_by_state(service), service.settings
+    return Info(
+        version("eigenhead"),
+        len(os.sched_getaffinity(0)),
+        jobs["queued"],
+        jobs["running"],
+        CAMERAS_LEAST,
+        CAMERAS_MOST,
+        limits.body_bytes,
+        limits.image_pixels,
+        limits.jobs_per_key,
+        document_from_settings(Settings()),
+    )
+
+
+def _jobs_by_state(service: Service) -> dict[str, int]:
     jobs = dict.fromkeys(set(STATES.values()), 0)
     for row in service.jobs.client.list_workflows(name=WORKFLOW, load_input=False, load_output=False):
         jobs[STATES[row.status]] += 1
-    captures, damaged = len(service.store.ids("captures")), len(service.store.set_aside())
-    return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)
+    return jobs

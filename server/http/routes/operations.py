@@ -10,6 +10,7 @@ from fastapi.responses import FileResponse
 from server.http.auth import ServiceOf, require
 from server.http.schemas import (
     Health,
+    InfoOut,
     KeyList,
     KeyOut,
     ModelList,
@@ -22,7 +23,7 @@ from server.http.schemas import (
     WebhookOut,
 )
 from server.metrics import MEDIA_TYPE
-from server.services.health import exposition, readiness
+from server.services.health import about, exposition, readiness
 from server.services.keys import Caller
 from server.wire.problems import Problem, documented
 
@@ -62,6 +63,12 @@ def readyz(service: ServiceOf, response: Response) -> Ready:
 def metrics(service: ServiceOf, caller: Reader) -> Response:
     """Prometheus text format."""
     return Response(exposition(service), media_type=MEDIA_TYPE)
+
+
+@router.get("/v1/info", tags=["operations"], responses=documented())
+def info(service: ServiceOf, caller: Reader) -> InfoOut:
+    """Version, limits, how many jobs wait, and the settings that a job has by default."""
+    return InfoOut.model_validate(about(service))
 
 
 @router.get("/v1/models", tags=["models"], responses=documented())

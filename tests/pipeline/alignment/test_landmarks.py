@@ -73,8 +73,15 @@ def test_a_mirrored_target_gives_a_rotation_all_the_same() -> None:
 
 def test_points_on_a_line_are_refused() -> None:
     line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
-    with pytest.raises(ValueError, match="line"):
-        procrustes(line, line)
+    for points in (line, np.zeros((5, 3))):
+        with pytest.raises(ValueError, match=r"^points on a line determine no rotation$"):
+            procrustes(points, points)
+
+
+def test_the_unit_of_the_points_does_not_matter() -> None:
+    planted = Similarity(1.0, rotation_from_vector(np.array([0.3, -0.2, 0.5])), np.zeros(3))
+    for unit in (1e-6, 1e6):
+        np.testing.assert_allclose(procrustes(unit * SOURCE, planted.apply(unit * SOURCE)).rotation, planted.rotation)
 
 
 def test_generalised_procrustes_with_equal_covariances_is_procrustes() -> None:

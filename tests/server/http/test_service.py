@@ -415,6 +415,18 @@ def test_health_metrics_models(http: httpx.Client) -> None:
     assert any(model["default"] for model in http.get("/v1/models").json()["models"])
 
 
+def test_info_tells_limits_waiting_jobs_and_default_settings(http: httpx.Client, archive: bytes) -> None:
+    told = http.get("/v1/info").json()
+    assert told["version"] == http.get("/healthz").json()["version"]
+    assert (told["cameras_least"], told["cameras_most"], told["jobs_per_key_most"]) == (3, 64, 200)
+    capture = upload(http, archive).json()["id"]
+    job = http.post("/v1/jobs", json={"capture_id": capture, "settings": told["settings"]}).json()["id"]
+    busy = http.get("/v1/info").json()
+    assert busy["queued"] + busy["running"] >= 1
+    assert await_state(http, job, ("succeeded", "failed"))["state"] == "succeeded"
+    assert await_state(http, job, ("succeeded",))["settings"] == told["settings"]
+
+
 def test_the_page_of_the_api_is_there(http: httpx.Client) -> None:
     assert "openapi.json" in http.get("/docs").text
     assert http.get("/openapi.json").json()["paths"]["/v1/jobs"]["post"]["operationId"] == "submit_job"

@@ -1,0 +1,29 @@
+"""MkDocs hook: the pages at the top of the checkout stand on the site beside those of docs/, README.md as the first,
+and links between the two lead there."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "CHANGELOG.md",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
+    "SECURITY.md": "SECURITY.md",
+}
+_FROM_TOP = re.compile(r"(?<=\]\()docs/")
+_TO_TOP = re.compile(r"(?<=\]\()\.\./(\w+\.md)")
+
+
+def on_files(files: Files, config: Any, **_: Any) -> Files:
+    for name, place in PAGES.items():
+        text = (ROOT / name).read_text(encoding="utf-8")
+        files.append(File.generated(config, place, content=_FROM_TOP.sub("", text)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    return _TO_TOP.sub(lambda link: PAGES.get(link[1], link[0]), markdown)
