@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
+from scipy.ndimage import distance_transform_edt
 
 from pipeline.dense.depth_map import DepthMap, points_world
 from pipeline.dense.surface import grid_kernels
@@ -45,6 +46,7 @@ FACTOR, FINE_FACTOR = 1.8, 1.4  # of over-relaxation
 EVERY = 7  # known pixel is used to tell where a surface may be
 WIDENINGS = 4  # of a grid by one coarse step
 STRAYS = 0.1  # per cent of these that may lie outside of the box
+HORN_MM, AWAY_MM = 30.0, 20.0  # radius of what a guess must hold, and how far from all that is seen it must
 UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
 
 
@@ -154,7 +156,17 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> F
         places = grid.corner + grid.step_mm * grid.index[unseen]
         prior[unseen] = np.maximum(prior[unseen], distance_to_head(places, head_world, seen[::10]))
     prior[grid.outer] = REACH * grid.step_mm
-    return prior.astype(np.float32)
+    return without_horns(prior, votes, grid).astype(np.float32)
+
+
+def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
+    """The guess (mm, negative inside) on a whole box, without what no ball of ``HORN_MM`` fits into: beyond the
+    photographs cones of sight that no outline bounds end in fins and horns. Beside what is seen the guess stays."""
+    radius = HORN_MM / grid.step_mm
+    core = distance_transform_edt((guess < 0).reshape(grid.shape)) > radius
+    filled = distance_transform_edt(~core) <= radius
+    away = distance_transform_edt((votes.weight <= 0).reshape(grid.shape)) > AWAY_MM / grid.step_mm
+    return np.where((away & ~filled).ravel(), np.maximum(guess, 0.5 * grid.step_mm), guess)
 
 
 def _near_points(grid: Grid, points: Points) -> Bool[np.ndarray, "nx ny nz"]:

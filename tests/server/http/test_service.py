@@ -117,7 +117,7 @@ def test_upload_and_job_in_one_call(http: httpx.Client, archive: bytes) -> None:
     [
         ("damaged", "damaged or cut off"),
         ("missing image", "images/cam01.png is missing"),
-        ("nan", "cam02.camera_from_world.translation holds a value that is not finite"),
+        ("nan", "cam02.camera_from_world.translation holds a value that is no finite number"),
         ("no cameras", "holds no cameras.json"),
         ("wrong size", "is 30 x 30 pixels, but its camera is 24 x 24"),
         ("truncated image", "images/cam00.png is damaged"),
