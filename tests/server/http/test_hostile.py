@@ -96,7 +96,7 @@ def features_on_a_line() -> bytes:
 
 
 SPOILT: dict[str, tuple[Callable[[Path], None], str]] = {
-    "NaN in a rotation": (cameras(of_first("camera_from_world.rotation", [[float("nan")] * 3] * 3)), "no finite number"),
+    "NaN in a rotation": (cameras(of_first("camera_from_world.rotation", [[float("nan")] * 3] * 3)), "finite number"),
     "infinite focal length": (cameras(of_first("intrinsics.fx", float("inf"))), "finite number"),
     "huge focal length": (cameras(of_first("intrinsics.fx", 1e300)), "finite number"),
     "negative focal length": (cameras(of_first("intrinsics.fx", -1.0)), "positive"),
