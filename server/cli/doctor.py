@@ -118,7 +118,8 @@ def _data(settings: ServiceSettings) -> tuple[bool, str]:
     if not (there.is_dir() and os.access(there, os.W_OK)):
         return False, f"{there} cannot be written; give it to the user that runs the service"
     free = shutil.disk_usage(there).free
-    detail = f"{settings.data.resolve()}, {free / 1e9:.1f} GB free"
+    held = (f"{len(list((settings.data / name).glob('*')))} {name}" for name in ("captures", "jobs"))
+    detail = f"{settings.data.resolve()}, {', '.join(held)}, {free / 1e9:.1f} GB free"
     detail += "" if there == settings.data.resolve() else "; `eigenhead serve` will make it"
     return free > settings.free_bytes, detail if free > settings.free_bytes else detail + ": delete captures or jobs"
 
@@ -143,6 +144,9 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
     if scheme == "sqlite":
         path = Path(rest.removeprefix("/"))
         if not path.is_file():
+            left = [name for name in ("captures", "jobs") if any((settings.data / name).glob("*"))]
+            if left:
+                return False, f"{path} is not there, but {' and '.join(left)} are: restore its copy beside them"
             return True, f"{path}, `eigenhead serve` will make it; no API key"
         connection = _read_only(path)
     else:

@@ -49,6 +49,7 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
             "session_cookie": "eigenhead_console",
             "same_site": "strict",
             "max_age": COOKIE_DAYS * 86400,
+            "https_only": (settings.public_url or "").startswith("https://"),
         },
     )
     pages.add_static_files("/console/static", Path(__file__).with_name("static"))

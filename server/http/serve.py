@@ -50,7 +50,10 @@ class WorkerProcess:
 
     def _start(self) -> "subprocess.Popen[bytes]":
         command = python_command("cli", "worker", "--until-eof")
-        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=sys.__stderr__, env=self._environment)
+        # In a group of its own: Ctrl-C in a terminal is for the service, which then ends its worker.
+        return subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=sys.__stderr__, env=self._environment, process_group=0
+        )
 
     def _watch(self) -> None:
         pause = WORKER_PAUSE_S

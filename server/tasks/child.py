@@ -12,6 +12,7 @@ import importlib
 import os
 import pickle
 import queue
+import signal
 import socket
 import subprocess
 import sys
@@ -244,5 +245,6 @@ def function_at(address: str) -> Callable[..., Any]:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a terminal; the parent ends its children
     os.nice(int(sys.argv[2]))
     serve(Connection(int(sys.argv[1])))

@@ -74,3 +74,13 @@ def test_it_shows_where_data_models_and_keys_live(
     assert found["data"]["detail"].startswith(str(tmp_path))
     assert found["models"]["detail"].startswith(str(tmp_path / "models"))
     assert found["database"]["detail"].startswith(str(tmp_path / "eigenhead.sqlite"))
+
+
+def test_captures_without_their_database_are_told(examine: Callable[..., dict], tmp_path: Path) -> None:
+    """A copy of a data folder that lacks the database looks like a new one otherwise."""
+    for name in ("captures/a", "captures/b", "jobs/c"):
+        (tmp_path / name).mkdir(parents=True)
+    found = examine(data=tmp_path)
+    assert "2 captures, 1 jobs" in found["data"]["detail"]
+    assert not found["database"]["ok"]
+    assert "captures and jobs are" in found["database"]["detail"]
