@@ -65,5 +65,5 @@ def test_a_default_job_calls_no_loop_that_the_list_lacks(tmp_path: Path) -> None
     for called, dense in ((plain, False), (plain | added, True)):
         missing = sorted(kernel.line for kernel in called - set(listed_kernels(dense=dense)))
         assert not missing, "write the list: python -m tests.support.kernel_recorder pipeline/kernels.txt CAPTURE..."
-    assert len(plain) > 20
+    assert len(plain) > 15  # that something was recorded at all
     assert len(added) > 10
