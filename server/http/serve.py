@@ -50,10 +50,7 @@ class WorkerProcess:
 
     def _start(self) -> "subprocess.Popen[bytes]":
         command = python_command("cli", "worker", "--until-eof")
-        # In a group of its own: Ctrl-C in a terminal is for the service, which then ends its worker.
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=sys.__stderr__, env=self._environment, process_group=0
-        )
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=sys.__stderr__, env=self._environment)
 
     def _watch(self) -> None:
         pause = WORKER_PAUSE_S
