@@ -60,7 +60,7 @@ for place in dev dev/shm dev/pts; do
   if [ -d "/$place" ]; then mount --bind "/$place" "$root/$place" && mounted=("$root/$place" "${mounted[@]}"); fi
 done
 mount -t proc proc "$root/proc" && mounted=("$root/proc" "${mounted[@]}")
-git clone --quiet --no-hardlinks . "$root/root/eigenhead"
+git clone --quiet --no-hardlinks . "$root/srv/eigenhead"
 
 # inside SECONDS COMMAND: in the clone, with no variable of ours but those that lead to the net
 inside() {
@@ -68,7 +68,7 @@ inside() {
   mapfile -t kept < <(env | grep -iE '^(https?_proxy|no_proxy|UV_[A-Z_]*INDEX[A-Z_]*|PIP_INDEX_URL|SSL_CERT_FILE)=' || true)
   say "$2"
   timeout --kill-after=30 "$1" chroot "$root" env -i HOME=/root LANG=C.UTF-8 \
-    PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin "${kept[@]}" bash -euc "cd /root/eigenhead; $2" </dev/null
+    PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin "${kept[@]}" bash -euc "cd /srv/eigenhead; $2" </dev/null
 }
 
 for step in "${steps[@]}"; do
