@@ -164,9 +164,9 @@ def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> F
     from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
 
     radius = HORN_MM / grid.step_mm
-    core = distance_transform_edt((guess < 0).reshape(grid.shape)) > radius
-    filled = distance_transform_edt(~core) <= radius
-    away = distance_transform_edt((votes.weight <= 0).reshape(grid.shape)) > AWAY_MM / grid.step_mm
+    core = np.asarray(distance_transform_edt((guess < 0).reshape(grid.shape))) > radius
+    filled = np.asarray(distance_transform_edt(~core)) <= radius
+    away = np.asarray(distance_transform_edt((votes.weight <= 0).reshape(grid.shape))) > AWAY_MM / grid.step_mm
     return np.where((away & ~filled).ravel(), np.maximum(guess, 0.5 * grid.step_mm), guess)
 
 
