@@ -19,8 +19,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.acquisition.image_checks import disturbed, noise_of
+from rig.acquisition.judgement import examine, judge
 from rig.acquisition.plates import NO_PLATES, Plates, read_plates, write_plates
-from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify, examine, judge
+from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify
 from rig.acquisition.trigger import Fired, TriggerBox, TriggerError
 from rig.drivers.base import Driver, DriverError, Frame
 from rig.drivers.feed import CameraFeed, FeedState
@@ -360,7 +361,7 @@ class RigSession:
         unmet = {name: feed.state().unmet for name, feed in self._feeds.items()}
         notes = [Fault("setting", name, line) for name, lines in unmet.items() for line in lines]
         missing = [name for name in images if name not in self.plates]
-        return notes + [Fault("plates", name, "take clean plates of the empty studio") for name in missing]
+        return notes + [Fault("plates", name, "there are none of it") for name in missing]
 
     def _plate_faults(self, taken: Mapping[str, list[ImageRgb]]) -> list[Fault]:
         faults = []
@@ -374,7 +375,7 @@ class RigSession:
             if self._feeds[name].live and any(np.array_equal(images[0], other) for other in images[1:2]):
                 faults.append(Fault("frozen", name, "two clean plates are equal to the last bit"))
             if disturbed(images, noise_of(images) or 0.0):
-                faults.append(Fault("disturbed", name, "something moved between the clean plates; take them again"))
+                faults.append(Fault("disturbed", name, "something moved between them"))
         first = {name: images[0] for name, images in taken.items() if images}
         dark = judge(first, examine(first, NO_PLATES), NO_PLATES, self.config.shot)
         return faults + [fault for fault in dark if fault.is_error]

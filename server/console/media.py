@@ -74,6 +74,12 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     return FileResponse(path, headers=FOREVER)
 
 
+@pages.get("/console/captures/{capture_id}/checks")
+def checks(who: Reader, capture_id: str) -> Response:
+    """What was measured of a capture's pictures, by camera."""
+    return JSONResponse(who[0].store.checks(capture_id), headers=FOREVER)
+
+
 @pages.get("/console/captures/{capture_id}/{camera}.image")
 def image(who: Reader, request: Request, capture_id: str, camera: str) -> Response:
     return send_file(request, who[0].captures.image(capture_id, "images", camera))

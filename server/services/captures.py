@@ -5,7 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import cast
 
+from rig.acquisition.shot import Fault, ShotDocument
+from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
@@ -59,7 +62,8 @@ class Captures:
             shot = self._rig.capture(capture, seed=seed, board=board)
             with self._children.one() as child:
                 ingest = child.remote(ingest_board if board else ingest_folder)
-                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels)
+                judged = {} if board else {"measured": "checks" in shot}
+                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
             return self._add(capture, "rig", content, about, shot)
 
     def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
@@ -161,6 +165,8 @@ class Captures:
     ) -> CaptureRecord:
         if about.session is not None:
             self._store.session(about.session)
+        faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
+        self._store.put_checks(folder, all_checks(shot, content))
         record = CaptureRecord(
             id=new_id(),
             created=datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
@@ -175,6 +181,21 @@ class Captures:
             board=content.board,
             features="features.json" in content.inputs,
             shot=shot,
+            verdict=None if content.board else verdict_of(faults, [camera.name for camera in content.cameras]),
+            faults=faults,
         )
         self._store.add_capture(folder, record)
         return record
+
+
+def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
+    """The faults in a real rig's certificate; the simulated studio's pictures are judged as uploads are."""
+    if shot is None or "checks" not in shot:
+        return ()
+    return tuple(Fault(f["code"], f["camera"], f["detail"]) for f in cast(ShotDocument, shot)["faults"])
+
+
+def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
+    """What the shot and the check of its files measured of each camera."""
+    taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
+    return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

@@ -1,7 +1,10 @@
 // Sessions and captures at the left, the pictures of the chosen one at the right.
+import { Outline, Verdict, checksOf, faultsOf, verdictTag } from "/console/static/verdict.js";
 import { clock, keepSession, openSession, send, size } from "/console/static/words.js";
 
 export default {
+  mixins: [checksOf],
+  components: { Outline, Verdict },
   props: { state: Object },
   emits: ["act"],
   data: () => ({ chosen: null, outlines: false, drawing: 0, large: null, over: false, uploads: [], busy: "", session: openSession(), form: null, erasing: false, draft: {}, writing: false, method: "", model: "" }),
@@ -19,6 +22,7 @@ export default {
       else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
     }, immediate: true },
     session(id) { keepSession(id); this.erasing = false; this.large = null; },
+    "current.id": { handler(id) { this.readChecks(id); }, immediate: true },
     current: { handler(c) { if (!this.writing) this.draft = c ? { label: c.label, expression: c.expression, session: c.session || "" } : {}; }, immediate: true },
   },
   template: `
@@ -60,7 +64,7 @@ export default {
           </div>
           <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures">
             <button v-for="c in captures" :key="c.id" class="row-button" :aria-current="current && c.id === current.id" @click="chosen = c.id">
-              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
+              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
               <span class="small muted">{{ clock(c.created) }} &middot; {{ c.source === 'rig' ? 'rig' : 'upload' }} &middot; {{ c.cameras.length }} cameras &middot; {{ size(c.bytes) }}</span>
               <span v-if="c.session || c.expression || c.features" class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression, c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
             </button>
@@ -77,11 +81,13 @@ export default {
             <label class="field">Solver<select v-model="method" id="method"><option value="">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
             <label v-if="models.length > 1" class="field">Model<select v-model="model" id="model"><option value="">default</option><option v-for="m in models.filter(m => m !== 'default')" :key="m">{{ m }}</option></select></label>
           </form>
+          <verdict v-if="current && large === null && !current.board" :capture="current" style="margin-bottom: .7rem"></verdict>
           <div v-if="current && large === null" class="thumbs four">
             <button v-for="(camera, i) in current.cameras" :key="current.id + camera" class="thumb" style="padding: 0; border: 0; cursor: zoom-in" :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }" :aria-label="'Enlarge ' + camera" @click="large = i">
               <img :src="address(camera, '.jpg')" :alt="'Picture of ' + camera" loading="lazy">
               <img v-if="outlines && !current.board" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
-              <span>{{ camera }}{{ camera === current.front ? ' · front' : '' }}</span></button>
+              <outline v-else :view="view(current.id, camera)" :size="current.sizes[camera]"></outline>
+              <span>{{ camera }}{{ camera === current.front ? ' · front' : '' }} <b v-if="faultsOf(current, camera).length" class="warn">{{ faultsOf(current, camera).join(', ') }}</b><small v-else class="muted">{{ measures(current.id, camera) }}</small></span></button>
           </div>
           <div v-else-if="current" style="height: 100%; display: grid; grid-template-rows: auto minmax(0, 1fr); gap: .6rem">
             <div class="line"><strong>{{ current.cameras[large] }}</strong><span class="push group"><button class="b" @click="step(-1)" aria-label="Previous camera">&larr;</button><button class="b" @click="step(1)" aria-label="Next camera">&rarr;</button></span><button class="b" @click="large = null">All cameras <kbd>Esc</kbd></button></div>
@@ -90,7 +96,7 @@ export default {
         </div>
       </div>
     </section>`,
-  created() { this.clock = clock; this.size = size; },
+  created() { Object.assign(this, { clock, size, faultsOf, verdictTag }); },
   mounted() { window.addEventListener("keydown", this.key); },
   unmounted() { window.removeEventListener("keydown", this.key); },
   methods: {

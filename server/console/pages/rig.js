@@ -1,5 +1,6 @@
 // Eleven tiles. Pictures and their exposure and sharpness come by one stream; the rest is the page's state.
 import { liveView } from "/console/static/live.js";
+import { Outline, Verdict, checksOf, faultsOf } from "/console/static/verdict.js";
 import { clock, fixed, keepSession, openSession, typing } from "/console/static/words.js";
 
 const COUNT_S = 3;
@@ -8,12 +9,14 @@ const EXPOSURE = { dark: 50, bright: 205, clipped: 0.02 }; // mean grey level of
 const SOFT_PX = 2.0; // spread of an edge from which a contour is measurably worse
 
 export default {
-  mixins: [liveView],
+  mixins: [liveView, checksOf],
+  components: { Outline, Verdict },
   props: { state: Object },
   emits: ["act"],
   data: () => ({ now: Date.now(), count: 0, busy: "", session: openSession(), label: "", expression: "" }),
   watch: {
     session(id) { keepSession(id); },
+    "state.shot.id": { handler(id) { this.readChecks(id); }, immediate: true },
     "state.sessions": { handler(all) { if (all && this.session && !this.open) this.session = ""; }, immediate: true },
   },
   computed: {
@@ -47,6 +50,7 @@ export default {
       const sharp = this.cameras.filter((c) => typeof this.live[c.name].blur_px === "number").length;
       return `Exposure is in order. ${sharp ? `So is sharpness, in the ${sharp} of ${this.cameras.length} judged so far.` : "Sharpness is looked at next."} ${this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot."}`;
     },
+    shot() { return this.state.shot; },
     columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
   },
   template: `
@@ -56,7 +60,17 @@ export default {
         <button class="b" :disabled="!!busy" @click="plates">{{ busy === 'plates' ? 'Taking plates ...' : 'Clean plates' }} <kbd>B</kbd></button>
         <button class="b main-action" id="capture" :disabled="!!busy" style="min-width: 10.5rem; justify-content: center" @click="start">{{ busy === 'capture' ? 'Capturing ...' : count ? 'Stop' : 'Capture' }} <kbd>{{ count ? 'Esc' : 'Space' }}</kbd></button>
       </header>
-      <div class="tiles" :style="{ gridTemplateColumns: 'repeat(' + columns + ', minmax(0, 1fr))', gridTemplateRows: 'repeat(' + Math.ceil((cameras.length + 1) / columns) + ', minmax(0, 1fr))' }">
+      <div v-if="shot" class="panel pad scroll stack grow" tabindex="0" role="region" aria-label="The shot" :data-shot="shot.id">
+        <div class="line wrap" style="align-items: start"><verdict :capture="shot" class="grow"></verdict>
+          <span class="line wrap"><button class="b" :class="{ 'main-action': shot.verdict === 'usable' }" id="keep" :disabled="!!busy" @click="decide('keep')">Keep <kbd>K</kbd></button>
+          <button class="b" :class="{ 'main-action': shot.verdict === 'poor' }" id="retake" :disabled="!!busy" title="Removes this shot (it can be taken back) and counts down to the next" @click="decide('retake')">Retake <kbd>R</kbd></button>
+          <button class="b" :class="{ 'main-action': shot.verdict === 'good' }" id="reconstruct" :disabled="!!busy" @click="decide('reconstruct')">Reconstruct <kbd>Enter</kbd></button></span></div>
+        <div class="thumbs four"><div v-for="camera in shot.cameras" :key="shot.id + camera" class="thumb" :data-camera="camera" :style="{ aspectRatio: shot.sizes[camera][0] + ' / ' + shot.sizes[camera][1] }">
+          <img :src="'/console/captures/' + shot.id + '/' + encodeURIComponent(camera) + '.jpg'" :alt="'Picture of ' + camera">
+          <outline :view="view(shot.id, camera)" :size="shot.sizes[camera]"></outline>
+          <span>{{ camera }}{{ camera === shot.front ? ' · front' : '' }} <b v-if="faultsOf(shot, camera).length" class="warn">{{ faultsOf(shot, camera).join(', ') }}</b><small v-else class="muted">{{ measures(shot.id, camera) }}</small></span></div></div>
+      </div>
+      <div v-show="!shot" class="tiles" :style="{ gridTemplateColumns: 'repeat(' + columns + ', minmax(0, 1fr))', gridTemplateRows: 'repeat(' + Math.ceil((cameras.length + 1) / columns) + ', minmax(0, 1fr))' }">
         <article v-for="camera in cameras" :key="camera.name" class="panel tile" :data-camera="camera.name" :data-frames="live[camera.name]?.frames || 0" :aria-label="camera.name">
           <div class="picture"><canvas :ref="el => keep(camera.name, el)" width="320" height="240" role="img" :aria-label="'Live picture of ' + camera.name"></canvas>
             <p v-if="waiting(camera)">{{ waiting(camera) }}</p></div>
@@ -84,7 +98,7 @@ export default {
       </div>
       <div v-if="count" class="countdown" role="alert"><span>{{ count }}</span></div>
     </section>`,
-  created() { this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; },
+  created() { this.faultsOf = faultsOf; this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; },
   mounted() {
     window.addEventListener("keydown", this.key);
     this.clockTimer = setInterval(() => (this.now = Date.now()), 500);
@@ -121,11 +135,18 @@ export default {
     stop() { clearInterval(this.counter); this.count = 0; },
     plates() { if (!this.busy) this.act("plates"); },
     act(name) { this.busy = name; this.$emit("act", { name, label: this.label, expression: this.expression, session: this.open?.id }); },
-    acted() { this.busy = ""; },
+    acted(name) {
+      this.busy = "";
+      if (name === "retake" && !this.shot) this.countDown();
+    },
+    decide(name) { if (this.shot && !this.busy) { this.busy = name; this.$emit("act", { name, id: this.shot.id }); } },
     key(event) {
       if (typing(event)) return;
       if (event.key === " ") { event.preventDefault(); if (!event.repeat) this.start(); }
       else if (event.key === "Escape") this.stop();
+      else if (this.shot && "kK".includes(event.key)) this.decide("keep");
+      else if (this.shot && "rR".includes(event.key)) this.decide("retake");
+      else if (this.shot && event.key === "Enter" && event.target.tagName !== "BUTTON") this.decide("reconstruct");
       else if (event.key === "b" || event.key === "B") this.plates();
     },
   },

@@ -2,20 +2,32 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TypedDict, cast
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.results.report import Report
-from rig.acquisition.shot import CameraSyncDocument, SyncDocument
+from rig.acquisition.shot import CameraSyncDocument
 from server.console.media import live_view
-from server.console.page import Action, Page, shared, show
-from server.console.pages.captures import SessionLine, sessions_list
+from server.console.page import Action, Chosen, Page, shared, show
+from server.console.pages.captures import (
+    CaptureLine,
+    SessionLine,
+    WorkForm,
+    capture_line,
+    discard,
+    reconstruct,
+    sessions_list,
+    sync_of,
+)
+from server.console.removal import removals
+from server.errors import NotFound
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
-from server.tasks.simulate import SimulatedCertificate, SimulatedSync
+from server.tasks.simulate import SimulatedSync
 
 
 class Tile(TypedDict):
@@ -53,9 +65,25 @@ class RigShown(TypedDict):
     last: LastCapture | None
 
 
+class RigPageShown(RigShown):
+    """``shot``: the capture that was taken on this page and waits for the operator's decision."""
+
+    shot: CaptureLine | None
+
+
 class RigPage(Page, component="rig.js"):
-    def look(self) -> RigShown:
-        return shared.get("rig", 0.4, lambda: rig_state(self.service))
+    def look(self) -> RigPageShown:
+        state: RigShown = shared.get("rig", 0.4, lambda: rig_state(self.service))
+        return {**state, "shot": shot_taken(self.service, self.choice.get("shot"))}
+
+
+def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
+    """The capture to judge; None where there is none, or it was removed meanwhile."""
+    if identity is None or identity in removals:
+        return None
+    with suppress(NotFound):
+        return capture_line(service.store.capture(identity), None)
+    return None
 
 
 def rig_state(service: Service) -> RigShown:
@@ -84,12 +112,6 @@ def rig_state(service: Service) -> RigShown:
         "sessions": sessions_list(service),
         "last": None if last is None else {"id": last.id, "created": last.created, "source": last.source},
     }
-
-
-def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
-    """Status and skew of each camera in a capture's certificate, of a real rig or of the simulated studio."""
-    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
-    return certificate.get("cameras", {})
 
 
 def calibration_in_use(service: Service) -> InUse | None:
@@ -131,7 +153,26 @@ def read_report(service: Service, job_id: str) -> Report | None:
 
 def capture(page: Page, event: Mapping[str, str | None]) -> str:
     record = page.service.captures.take(About.of(event))
-    return f"Captured {len(record.cameras)} pictures. They are on the page Captures."
+    page.choice["shot"] = record.id
+    shared.forget("rig")
+    worth = "" if record.verdict is None else f" Verdict: {record.verdict}."
+    return f"Captured {len(record.cameras)} pictures.{worth}"
+
+
+def keep(page: Page, event: object) -> None:
+    page.choice["shot"] = None
+
+
+def retake(page: Page, event: Chosen) -> None:
+    """Lets go of a shot that is not worth keeping; the page then counts down to the next one."""
+    discard(page, event)
+    page.choice["shot"] = None
+
+
+def reconstruct_shot(page: Page, event: WorkForm) -> str:
+    told = reconstruct(page, event)
+    page.choice["shot"] = None
+    return told
 
 
 def plates(page: Page, event: object) -> str:
@@ -141,7 +182,13 @@ def plates(page: Page, event: object) -> str:
     return f"{taken.plates} clean plates of {len(taken.cameras)} cameras.{note}"
 
 
-RigPage.actions = {"capture": Action("capture", capture), "plates": Action("capture", plates)}
+RigPage.actions = {
+    "capture": Action("capture", capture),
+    "plates": Action("capture", plates),
+    "keep": Action("read", keep),
+    "retake": Action("capture", retake),
+    "reconstruct": Action("submit", reconstruct_shot),
+}
 
 
 @ui.page("/")

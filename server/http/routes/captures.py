@@ -9,6 +9,7 @@ from fastapi.responses import FileResponse
 
 from rig.errors import InputError
 from server.http.auth import ServiceOf, require
+from server.http.rig_schemas import CaptureChecks
 from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures
 from server.services.captures import About
 from server.services.jobs import Work
@@ -63,6 +64,12 @@ def list_captures(
 def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureOut:
     """A capture: its cameras, its files with their sha256, and the rig's certificate of the shot."""
     return CaptureOut.model_validate(service.store.capture(capture_id))
+
+
+@router.get("/captures/{capture_id}/checks", responses=documented(404))
+def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureChecks:
+    """What the verdict follows from: exposure, sharpness, the camera's place and the subject's outline by camera."""
+    return CaptureChecks.model_validate({"cameras": service.store.checks(capture_id)})
 
 
 @router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))

@@ -59,6 +59,18 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         assert {camera["state"] for camera in state["cameras"]} == {"open"}
         assert _decoded(client.get("/v1/rig/cameras/cam03/preview.jpg").content).shape == (240, 320, 3)
 
+        assert (capture["verdict"], capture["faults"]) == ("good", [])
+        checks = client.get(f"/v1/captures/{capture['id']}/checks").json()["cameras"]
+        assert all(check["blur_px"] < 2.5 and len(check["subject"]["outline"]) > 10 for check in checks.values())
+        studio.inject(DeviceFault("bumped", "cam03"))
+        moved = client.post("/v1/captures", json={}).json()
+        studio.clear()
+        assert moved["verdict"] == "usable"
+        assert [(fault["code"], fault["camera"]) for fault in moved["faults"]] == [("moved", "cam03")]
+        assert "calibrate again" in moved["faults"][0]["remedy"]
+        assert client.get("/v1/captures").json()["captures"][0]["verdict"] == "usable"
+        client.delete(f"/v1/captures/{moved['id']}")
+
         studio.inject(DeviceFault("hung", "cam02"))
         failed = client.post("/v1/captures", json={})
         assert failed.status_code == 503
