@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from server.http.schemas import Answer
+from server.http.schemas import Answer, Moment, Received
 
 
 class SubjectOut(Answer):
@@ -24,3 +24,32 @@ class ViewChecksOut(Answer):
 
 class CaptureChecks(Answer):
     cameras: dict[str, ViewChecksOut]
+
+
+class HoldingsOut(Answer):
+    """What there is of a capture: a removal takes the pictures, an erasure all of it."""
+
+    pictures: int
+    bytes: int = Field(description="of images, clean plates and caches")
+    heads: list[str] = Field(description="jobs whose results stay after a removal, photographs in their overlays too")
+    head_bytes: int
+    jobs: list[str] = Field(description="the other jobs")
+    active: list[str] = Field(description="jobs that are queued or running: a removal is refused, an erasure ends them")
+
+
+class PlatesOut(Answer):
+    """Clean plates that are kept."""
+
+    id: str
+    taken: Moment
+    cameras: list[str]
+    refused: list[str] = Field(description="why they were not put to use")
+    in_use: bool
+
+
+class PlatesList(Answer):
+    versions: list[PlatesOut]
+
+
+class UsePlates(Received):
+    version: str = Field(max_length=64, description="an id of GET /v1/rig/background")

@@ -12,6 +12,7 @@ from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequenc
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
+from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs, refuse_board
 from server.services.rigs import SHOT_BYTES, RigBackend
 from server.settings import ServiceSettings
@@ -55,8 +56,8 @@ class Captures:
     def take(self, about: About, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
         """Triggers the rig now. ``board``: pictures of the calibration board. Raises Unavailable, and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
-        if about.session is not None:
-            self._store.session(about.session)
+        if not board:
+            self._check_consent(about.session)
         with self._store.incoming() as folder:
             capture = folder / "capture"
             shot = self._rig.capture(capture, seed=seed, board=board)
@@ -68,7 +69,8 @@ class Captures:
 
     def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
         """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
-        fault."""
+        fault, Conflict where the service asks for consent."""
+        self._check_consent(about.session)
         limits = self.archive_limits(archive)
         (folder / "capture").mkdir()
         with self._children.one() as child:
@@ -155,6 +157,26 @@ class Captures:
         self.check_unused(identity)
         self._store.remove_capture(identity)
 
+    def holdings(self, identity: str) -> Holdings:
+        """What a removal would take and what would stay. Raises NotFound."""
+        return holdings(self._store, self._jobs, identity)
+
+    def erase(self, identity: str) -> None:
+        """Cancels the capture's jobs, then removes its images, heads, caches and what the job database holds of them,
+        with or without a session. Raises NotFound, and Unavailable while a worker still writes."""
+        self._store.capture(identity)
+        erase_captures(self._store, self._jobs, [identity])
+
+    def _check_consent(self, session: str | None) -> None:
+        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it."""
+        consent = "" if session is None else self._store.session(session).consent
+        if self._settings.ask_consent and not consent.strip():
+            detail = (
+                "Consent comes before the first picture: begin a session of the subject with a note of who agreed to "
+                "what and when, and take or upload into it."
+            )
+            raise Conflict("consent-missing", detail)
+
     def _add(
         self,
         folder: Path,
@@ -163,8 +185,8 @@ class Captures:
         about: About,
         shot: Mapping[str, object] | None = None,
     ) -> CaptureRecord:
-        if about.session is not None:
-            self._store.session(about.session)
+        if not content.board:
+            self._check_consent(about.session)
         faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
         self._store.put_checks(folder, all_checks(shot, content))
         record = CaptureRecord(

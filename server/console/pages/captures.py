@@ -204,10 +204,18 @@ def erase(page: Page, event: Chosen) -> str:
     return "Erased: images, heads, jobs and all that was kept of them."
 
 
+def erase_capture(page: Page, event: Chosen) -> str:
+    page.service.captures.erase(event["id"])
+    shared.clear()
+    return "Erased for good: the capture, its heads, jobs and all that was kept of them."
+
+
 def discard(page: Page, event: Chosen) -> None:
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
-    title = f"capture {record.label or identity[-6:]}"
+    heads = len(service.captures.holdings(identity).heads)
+    stays = f"; {heads} {'head' if heads == 1 else 'heads'} with overlay photographs stay" if heads else ""
+    title = f"the {len(record.cameras)} pictures of capture {record.label or identity[-6:]}{stays}"
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 
@@ -225,6 +233,7 @@ CapturesPage.actions = {
     "new_session": Action("capture", new_session),
     "edit_session": Action("capture", edit_consent),
     "erase": Action("capture", erase),
+    "erase_capture": Action("capture", erase_capture),
     "remove": Action("capture", discard),
 }
 

@@ -9,21 +9,26 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.results.report import Report
+from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import CameraSyncDocument
 from server.console.media import live_view
 from server.console.page import Action, Chosen, Page, shared, show
 from server.console.pages.captures import (
     CaptureLine,
+    SessionEditForm,
+    SessionForm,
     SessionLine,
     WorkForm,
     capture_line,
     discard,
+    edit_consent,
+    new_session,
     reconstruct,
     sessions_list,
     sync_of,
 )
 from server.console.removal import removals
-from server.errors import NotFound
+from server.errors import Conflict, NotFound
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
@@ -54,6 +59,20 @@ class LastCapture(TypedDict):
     source: str
 
 
+class PlatesLine(TypedDict):
+    id: str
+    taken: str
+    faults: list[str]
+
+
+class PlatesShown(TypedDict):
+    """The clean plates in use, those before them, and newer ones that were refused."""
+
+    taken: str
+    before: PlatesLine | None
+    refused: PlatesLine | None
+
+
 class RigShown(TypedDict):
     kind: str
     ready: bool
@@ -63,6 +82,8 @@ class RigShown(TypedDict):
     in_use: InUse | None
     sessions: list[SessionLine]
     last: LastCapture | None
+    plates: PlatesShown | None
+    ask_consent: bool
 
 
 class RigPageShown(RigShown):
@@ -111,7 +132,23 @@ def rig_state(service: Service) -> RigShown:
         "in_use": calibration_in_use(service),
         "sessions": sessions_list(service),
         "last": None if last is None else {"id": last.id, "created": last.created, "source": last.source},
+        "plates": plates_shown(service.rig.plates()),
+        "ask_consent": service.settings.ask_consent,
     }
+
+
+def plates_shown(kept: list[PlatesVersion]) -> PlatesShown | None:
+    """None where there are none, or the rig takes them with every shot."""
+    in_use = next((version for version in kept if version.in_use), None)
+    if in_use is None:
+        return None
+    before = next((version for version in kept if not version.in_use and not version.refused), None)
+    refused = kept[0] if kept[0].refused and not kept[0].in_use else None
+    return {"taken": in_use.taken, "before": _plates_line(before), "refused": _plates_line(refused)}
+
+
+def _plates_line(version: PlatesVersion | None) -> PlatesLine | None:
+    return None if version is None else {"id": version.id, "taken": version.taken, "faults": [*version.refused]}
 
 
 def calibration_in_use(service: Service) -> InUse | None:
@@ -175,17 +212,42 @@ def reconstruct_shot(page: Page, event: WorkForm) -> str:
     return told
 
 
-def plates(page: Page, event: object) -> str:
+def plates(page: Page, event: object) -> str | None:
     page.service.store.reserve(0, page.service.settings.free_bytes)
-    taken = page.service.rig.take_background()
+    try:
+        taken = page.service.rig.take_background()
+    except Conflict:  # the page asks what is to become of them
+        return None
+    finally:
+        shared.forget("rig")
     note = f" Note: {taken.note}." if taken.note else ""
     return f"{taken.plates} clean plates of {len(taken.cameras)} cameras.{note}"
+
+
+def use_plates(page: Page, event: Chosen) -> str:
+    page.service.rig.use_plates(event["id"])
+    shared.forget("rig")
+    return "These clean plates are in use now. The ones before are kept."
+
+
+def begin_session(page: Page, event: SessionForm) -> str:
+    told = new_session(page, event)
+    shared.forget("rig")
+    return told
+
+
+def note_consent(page: Page, event: SessionEditForm) -> None:
+    edit_consent(page, event)
+    shared.forget("rig")
 
 
 RigPage.actions = {
     "capture": Action("capture", capture),
     "plates": Action("capture", plates),
+    "use_plates": Action("capture", use_plates),
     "keep": Action("read", keep),
+    "new_session": Action("capture", begin_session),
+    "edit_session": Action("capture", note_consent),
     "retake": Action("capture", retake),
     "reconstruct": Action("submit", reconstruct_shot),
 }

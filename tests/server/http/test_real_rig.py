@@ -85,9 +85,22 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         plates = client.post("/v1/rig/background").json()
         assert (plates["cameras"], plates["plates"]) == (list(NAMES), 5)
         studio.seat(True)
+        in_use, before = client.get("/v1/rig/background").json()["versions"]
+        assert (in_use["in_use"], before["in_use"], before["refused"]) == (True, False, [])
+        refused = client.post("/v1/rig/background")  # with the sitter in them
+        assert (refused.status_code, refused.json()["type"].endswith("plates-occupied")) == (409, True)
+        assert len(refused.json()["errors"]) == len(NAMES)
+        kept = client.get("/v1/rig/background").json()["versions"]
+        assert [version["id"] for version in kept if version["in_use"]] == [in_use["id"]]
+        assert client.post("/v1/captures", json={}).json()["verdict"] == "good", "the old plates are still in use"
+        used = client.put("/v1/rig/background", json={"version": kept[0]["id"]}).json()["versions"]
+        assert (used[0]["in_use"], len(used[0]["refused"])) == (True, len(NAMES))
+        assert client.post("/v1/captures", json={}).json()["verdict"] == "poor", "nobody differs from themselves"
+        assert client.put("/v1/rig/background", json={"version": in_use["id"]}).status_code == 200
+        assert client.put("/v1/rig/background", json={"version": "../../secret"}).status_code == 404
         assert client.post("/v1/captures", json={}).status_code == 201
         assert client.post("/v1/captures", json={"seed": 1}).status_code == 422
-        assert len(client.get("/v1/captures").json()["captures"]) == 2
+        assert len(client.get("/v1/captures").json()["captures"]) == 4
 
 
 @pytest.mark.timeout(600)
