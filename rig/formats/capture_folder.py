@@ -17,7 +17,7 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, Features
 from rig.errors import InputError
-from rig.formats.cameras_file import find_rig_file, read_rig_file, rig_file_parts
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import decode_image_file, write_image
@@ -31,12 +31,13 @@ PLATES_MOST = 32  # clean plates read per camera
 
 
 def read_capture(folder: Path) -> tuple[Capture, Rig]:
-    """Reads a capture folder. Raises InputError that names every fault in it."""
+    """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Raises InputError
+    that names every fault in it."""
     faults: list[str] = []
     folder = capture_root(folder)
     rig_file = find_rig_file(folder)
     if rig_file is None:
-        raise InputError(folder.name, ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+        raise InputError(folder.name, [NO_RIG])
     try:
         rig = read_rig_file(rig_file)
     except InputError as error:
@@ -96,12 +97,13 @@ def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
     if (folder / "features.json").is_file():
         data = (folder / "features.json").read_bytes()
         digests["features.json"] = hashlib.sha256(data).hexdigest()
-        features = features_from_bytes(data, rig, faults)
+        features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
     return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
-    """Writes a capture folder of PNG files; every file under a temporary name first."""
+    """Writes a capture folder of PNG files, the pictures as ``rig``'s cameras took them; every file under a temporary
+    name first."""
     write_rig(rig, folder / "cameras.json")
     files: list[tuple[Path, np.ndarray]] = []
     for name, image in capture.images.items():
@@ -119,6 +121,16 @@ def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
         write_atomically(folder / "features.json", text.encode())
 
 
+def _in_read_pictures(features: Features, rig: Rig) -> Features:
+    """Points that were picked in the files, where the pictures are undistorted as they are read."""
+
+    def moved(name: str, pixel: np.ndarray) -> np.ndarray:
+        lens = rig[name].recorded
+        return pixel if lens is None else lens.undistorted(pixel[None], rig[name].intrinsics.matrix())[0]
+
+    return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
+
+
 def _decode(folder: Path, kind: str, name: str, path: Path, *, rig: Rig) -> tuple[np.ndarray | None, str, str]:
     k = rig[name].intrinsics
     where = path.relative_to(folder).as_posix()
@@ -126,6 +138,8 @@ def _decode(folder: Path, kind: str, name: str, path: Path, *, rig: Rig) -> tupl
     if pixels is not None and pixels.shape[:2] != (k.height, k.width):
         height, width = pixels.shape[:2]
         return None, "", size_fault(where, (width, height), (k.width, k.height))
+    if pixels is not None and (lens := rig[name].recorded) is not None:
+        pixels = lens.undistort(pixels, k.matrix(), smooth=kind != "masks")
     if pixels is not None and kind == "masks":
         pixels = pixels > 0
         if not pixels.any():

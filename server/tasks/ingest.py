@@ -17,7 +17,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
 from rig.formats.capture_folder import IMAGE_SUFFIXES, capture_root, read_shot, size_fault, stray_faults
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_FORMATS
@@ -78,7 +78,7 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
 def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureContent:
     rig_file = find_rig_file(root)
     if rig_file is None:
-        raise InputError("capture", ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+        raise InputError("capture", [NO_RIG])
     try:
         rig = read_rig_file(rig_file)
     except InputError as error:
