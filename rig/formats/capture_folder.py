@@ -1,7 +1,7 @@
 """One synchronised shot of every camera, and the folder that holds it.
 
 cameras.json                       (or a COLMAP, caliscope or aniposelib file: rig.formats.cameras_file)
-images/<camera>.png|jpg|jpeg|tif|webp
+images/<camera>.png|jpg|jpeg|tif|webp, RAW, DNG or HEIC
 background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
 features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
@@ -20,12 +20,9 @@ from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import decode_image_file, write_image
+from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, write_image
 from rig.plausibility import rig_faults
 from rig.rig import Rig
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
-
 
 PLATES_MOST = 32  # clean plates read per camera
 
@@ -69,7 +66,7 @@ def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
         mask = _image_file(folder / "masks", camera.name, faults)
         plates = _plate_files(folder / "background", camera.name, faults)
         if image is None:
-            faults.append(f"images/{camera.name}.png is missing (or .jpg, .jpeg, .tif, .webp)")
+            faults.append(f"images/{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)")
         if not plates and mask is None:
             faults.append(
                 f"background/{camera.name}.png is missing: a clean plate, or masks/{camera.name}.png, is needed"

@@ -8,11 +8,10 @@ from typing import Any, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from rig.errors import InputError
 from rig.formats.cameras_json import FORMAT, name_fault, rig_from_document
-from rig.formats.images import IMAGE_FORMATS
+from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.recorded_lens import COEFFICIENTS, LensModel
 from rig.rig import Rig
 
@@ -87,24 +86,18 @@ def xml_root(data: bytes) -> ElementTree.Element:
         raise ValueError(f"is no XML: {error}") from None
 
 
-def picture_size(folder: Path, name: str) -> tuple[int, int] | None:
-    """Width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold them."""
+def sized(folder: Path, name: str, faults: list[str]) -> tuple[int, int]:
+    """Width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold them.
+    Where there is none, a fault that says where to put it."""
     for place in (folder, folder / "images", folder.parent / "images"):
         for path in sorted(place.glob(f"{name}.*")) if name_fault(name) is None else ():
-            try:
-                with Image.open(path, formats=IMAGE_FORMATS) as header:
-                    return header.size
-            except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-                continue
-    return None
-
-
-def sized(folder: Path, name: str, faults: list[str]) -> tuple[int, int]:
-    """``picture_size``, or a fault that says where to put the picture."""
-    size = picture_size(folder, name)
-    if size is None:
-        faults.append(f"{name}: its picture is wanted beside the file or in images/, which tells the size in pixels")
-    return size or (1024, 1024)
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                try:
+                    return picture_size(path)
+                except InputError as error:
+                    faults.append(f"{path.name} {error.faults[0]}")
+    faults.append(f"{name}: its picture is wanted beside the file or in images/, which tells the size in pixels")
+    return 1024, 1024
 
 
 def brown_conrady(radial: Sequence[float], radius: float, focal: float, where: str, faults: list[str]) -> list[float]:
