@@ -51,11 +51,13 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
     corner = points.min(axis=0)
     cell = np.floor((points - corner) / CELL_MM).astype(np.int64)
     size = cell.max(axis=0) + 1
-    keys, group = np.unique(_keys(cell, size), return_inverse=True)
-    count = np.bincount(group)[:, None]
+    group = _keys(cell, size)
+    count = np.bincount(group)  # a body has a few million such cells: counted sooner than sorted
+    keys = np.flatnonzero(count)
+    count = count[keys, None]
 
     def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
-        return np.stack([np.bincount(group, values[:, k]) for k in range(3)], axis=1) / count
+        return np.stack([np.bincount(group, values[:, k])[keys] for k in range(3)], axis=1) / count
 
     return PartVotes(corner, size, keys, mean(points), mean(shown))
 
