@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap, points_world
 from pipeline.dense.parts import PartMap
+from pipeline.imaging.projection import project_points
 from rig.rig import Rig
 
 UNSEEN, SKIN, HAIR, CLOTHES = 0, 1, 2, 3
@@ -64,7 +65,7 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
 
 def _shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
     height, width = part.probability.shape[:2]
-    column, row = np.rint(np.nan_to_num(rig[part.camera].project(points), nan=-1.0)).astype(int).T
+    column, row = np.rint(np.nan_to_num(project_points(rig[part.camera], points), nan=-1.0)).astype(int).T
     framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return part.probability[np.where(framed, row, 0), np.where(framed, column, 0)] * framed[:, None]
 

@@ -20,8 +20,8 @@ BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken f
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def propagate(sight, parity, steps, same_mm, depth, slopes, cost):
     """Every pixel of one colour of the chequerboard tries the planes of its neighbours of the other colour, ``steps``
-    pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known. Planes that differ by less
-    than ``same_mm``, in depth and a pixel beside it, are the same."""
+    pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known. Planes that differ by
+    less than ``same_mm``, in depth and a pixel beside it, are the same."""
     height, width = depth.shape
     ways, window = sight.ways, np.empty((2, sight.pattern.shape[1]), np.float32)
     scores, place = np.empty(len(ways)), np.empty(8)

@@ -42,13 +42,13 @@ def first_fields(
 
 
 def label_strides(room: Room, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
-    """One in how many labels is matched: 1, 2, 4 ..., so that places are never farther apart than in the deepest room."""
+    """One in how many labels is matched: 1, 2, 4 ..., so that places lie no farther apart than in the deepest room."""
     depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
     return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
 
 
 def _cheapest(cost: Float32[np.ndarray, "h w d"], room: Room, strides: Int32[np.ndarray, "h w"]) -> Field:
-    """The label of the cheapest paths, and within its stride the least of the pixel's own costs: paths are no likeness."""
+    """The label of the cheapest paths, and within a stride the least of its own costs: paths are no likeness."""
     paths = np.empty_like(cost)
     aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)
     labels = cost.shape[2]

@@ -46,8 +46,8 @@ def cost_of(sight, loaded, z, z_x, z_y, reach, place, scores):
 def sweep_view(sight, near, far, slopes, strides, cost):
     """Fills ``cost`` (h, w, labels): 1 minus the likeness at ``near + share (far - near)``, mm.
 
-    ``slopes`` (h, w, 4): of near by x and y, of far by x and y, mm a pixel. ``strides`` (h, w): one in so many labels is
-    matched, and the last; costs run linearly between.
+    ``slopes`` (h, w, 4): of near by x and y, of far by x and y, mm a pixel. ``strides`` (h, w): one in so many labels
+    is matched, and the last; costs run linearly between.
     """
     height, width, labels = cost.shape
     window = np.empty((2, sight.pattern.shape[1]), np.float32)

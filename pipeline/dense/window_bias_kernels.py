@@ -20,7 +20,7 @@ def windowed_heights(
     first: int,
     last: int,
 ) -> None:
-    """Fills ``height_mm`` of the ``wanted`` vertices: how far along its normal the mean of those about it lies above it.
+    """Fills ``height_mm`` of the ``wanted`` vertices: how far along its normal the mean of those about each lies above.
 
     Weights are a Gaussian of ``window_mm`` that ends at ``reach_mm``, times the cosine between the normals where that
     is positive. ``order``, ``keys`` and ``spans`` as ``cells.Cells`` has them, cells as wide as the reach; ``first``

@@ -1,7 +1,8 @@
 """Triangles of a mesh that cross each other (compiled).
 
 Triangles are sorted into cubic cells by the middles of their boxes; a cell is as wide as the widest box, so that those
-which meet lie in neighbouring cells. Two cross if an edge of one goes through the other (strictly: touching is no crossing).
+which meet lie in neighbouring cells. Two cross if an edge of one goes through the other (strictly: touching is no
+crossing).
 """
 
 import numpy as np
