@@ -12,7 +12,7 @@ from pipeline.compiled import njit
 from pipeline.dense.surface.view_stack import ViewStack
 from pipeline.dense.surface.vote_kernels import CENTRE, DEPTH, FRAME, OUTLINE, SIGMA, nearest_pixel, seen_at
 from pipeline.imaging.projection_kernels import LENS, NEAREST_MM
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import map_in_threads
 
 BLOCK = 4  # pixels along the side of what is decided at once
 STRIDE = 3  # every third pixel of every third row stands for the others
@@ -24,22 +24,22 @@ SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
 def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
     """The views without the outlines that others contradict, and by view the share of its crop that was."""
-    shares = np.zeros(len(views.cameras))
+
+    def wrong_blocks(v: int) -> np.ndarray:
+        height, width = views.sizes[v]
+        blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
+        _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
+        return cv2.dilate((np.bitwise_count(blocks) >= VIEWS_LEAST).view(np.uint8), np.ones((3, 3), np.uint8))
+
+    wrong = map_in_threads(wrong_blocks, len(views.cameras))
+    shares = np.array([blocks.mean() for blocks in wrong])
+    if not shares.any():  # as usual: a hundred megabytes need no copy
+        return views, shares
     pixels = views.pixels.copy()
-
-    def one(first: int, last: int) -> None:
-        for v in range(first, last):
-            height, width = views.sizes[v]
-            blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
-            _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
-            wrong = cv2.dilate((np.bitwise_count(blocks) >= VIEWS_LEAST).view(np.uint8), np.ones((3, 3), np.uint8))
-            shares[v] = wrong.mean()
-            if wrong.any():
-                whole = np.kron(wrong, np.ones((BLOCK, BLOCK), np.uint8))[:height, :width].ravel()
-                own = pixels[views.starts[v] : views.starts[v] + height * width]
-                own[whole > 0, OUTLINE] = SILENT_PX
-
-    in_threads(len(views.cameras), one)
+    for v in np.flatnonzero(shares):
+        height, width = views.sizes[v]
+        whole = np.kron(wrong[v], np.ones((BLOCK, BLOCK), np.uint8))[:height, :width].ravel()
+        pixels[views.starts[v] : views.starts[v] + height * width][whole > 0, OUTLINE] = SILENT_PX
     return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
 
 
