@@ -190,7 +190,7 @@ class JobOut(Answer):
     progress: float = Field(ge=0, le=1)
     eta_s: float | None
     error: JobError | None
-    notice: str | None = Field(None, description="why a queued job cannot begin, and what to do")
+    notice: str | None = Field(None, description="why a queued job cannot begin or a result is gone; what to do")
     capture_id: str | None
     session: str | None
     model: str | None

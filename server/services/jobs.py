@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import cast
 
 import sqlalchemy as sa
@@ -223,18 +224,31 @@ class Jobs:
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
-        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict where there is no result."""
+        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict where there is no result, or
+        where its files are gone."""
         job = self.get(job_id)
         if job.state != "succeeded":
             raise Conflict("no-result", f"The job is {job.state}; it has no result.")
+        if job.notice is not None:
+            raise Conflict("result-missing", job.notice)
         return job.files
+
+    def without_result(self) -> list[str]:
+        """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
+        rows = self.client.list_workflows(
+            name=WORKFLOW, status=STATUSES["succeeded"], sort_desc=True, load_input=False, load_output=False
+        )
+        return [row.workflow_id for row in rows if not self._result(row.workflow_id).is_dir()]
+
+    def _result(self, job_id: str) -> Path:
+        return self._store.folder("jobs", job_id) / "result"
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
         """A file of a result, found in the job's record. Raises NotFound, Conflict."""
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound("file", name, f"GET /v1/jobs/{job_id}/result lists what there is")
-        return StoredFile(self._store.folder("jobs", job_id) / "result" / name, file["sha256"])
+        return StoredFile(self._result(job_id) / name, file["sha256"])
 
     def restart(self, job_id: str, wanted: Work, *, key: str = "local") -> Job:
         """A new job for the same capture, which names the old one. What is None is as in that. Raises InputError,
@@ -282,8 +296,12 @@ class Jobs:
             detail = f"{active} jobs are queued or running for this key, which is the most; wait for one to end."
             raise TooMany("too-many-jobs", detail, retry_after_s=10)
 
-    def _notice(self, queue: str | None) -> str | None:
-        """What keeps a queued job from beginning."""
+    def _notice(self, job_id: str, state: str, queue: str | None) -> str | None:
+        """What keeps a queued job from beginning, or that the files of one that succeeded are gone."""
+        if state == "succeeded" and not self._result(job_id).is_dir():
+            return "Its result is not in the data folder any more: restore it from a backup, or restart the job."
+        if state != "queued":
+            return None
         with self._engine.connect() as connection:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
@@ -313,7 +331,7 @@ class Jobs:
             progress=1.0 if state == "succeeded" else progress.get("progress", 0.0),
             eta_s=progress.get("eta_s"),
             error=failure(row) if state == "failed" else None,
-            notice=self._notice(row.queue_name) if state == "queued" else None,
+            notice=self._notice(row.workflow_id, state, row.queue_name),
             capture_id=None if request is None else request["capture_id"],
             session=attributes.get("session"),
             model=None if request is None else request.get("model"),

@@ -17,7 +17,8 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job at this moment. ``notice`` says why a queued one cannot begin; ``files`` are those of a result, by name."""
+    """A job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone;
+    ``files`` are those of a result, by name."""
 
     id: str
     state: str
