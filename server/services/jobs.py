@@ -21,11 +21,13 @@ from sqlalchemy.exc import IntegrityError
 from pipeline.settings import settings_from_document
 from rig.errors import EigenheadError, InputError
 from server.errors import URN, Conflict, NotFound, TooMany
+from server.log import log_file
+from server.origins import target
 from server.services.records import Failure, Job
 from server.settings import ServiceSettings
 from server.storage.database import alive_workers, job_index, workers
 from server.storage.events import EventLog, JobEvent
-from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest
+from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
 from server.storage.store import Store, StoredFile, is_id, new_id
 
 APPLICATION = "eigenhead"
@@ -49,10 +51,13 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None."""
+    """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None; what
+    people call it, and who is told of its end beside the service's webhooks."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None
+    name: str = ""
+    webhook: JobWebhook | None = None
 
     def check(self) -> None:
         """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""
@@ -125,8 +130,8 @@ class Jobs:
     ) -> Job:
         """Queues a reconstruction of a capture and returns the job. A known idempotency key returns the first job.
 
-        Raises InputError for work that cannot be done, NotFound, DiskFull, Conflict where the key's first request was
-        another one, TooMany.
+        Raises InputError for work that cannot be done, Unusable for a webhook that may not be called, NotFound,
+        DiskFull, Conflict where the key's first request was another one, TooMany.
         """
         wanted.check()
         capture = self._store.capture(capture_id)
@@ -139,6 +144,11 @@ class Jobs:
             "model": wanted.model,
             "settings": wanted.settings or {},
         }
+        if wanted.name:
+            request["name"] = wanted.name
+        if wanted.webhook is not None:
+            target(wanted.webhook["url"], self._settings.webhook_origins)
+            request["webhook"] = wanted.webhook
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def submit_session(self, session: str, wanted: Work, *, key: str, priority: int) -> list[Job]:
@@ -181,6 +191,10 @@ class Jobs:
     def get(self, job_id: str) -> Job:
         """Raises NotFound."""
         return self._job(self._known(job_id))
+
+    def webhook(self, job_id: str) -> JobWebhook | None:
+        """The job's own, if it was given one. Raises NotFound."""
+        return (_request(self._known(job_id)) or {}).get("webhook")
 
     def state(self, job_id: str) -> str:
         return STATES[self._known(job_id, load=False).status]
@@ -232,6 +246,14 @@ class Jobs:
         if job.notice is not None:
             raise Conflict("result-missing", job.notice)
         return job.files
+
+    def log(self, job_id: str) -> str:
+        """What its workers said of the job. Raises NotFound."""
+        self.state(job_id)
+        try:
+            return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError as error:
+            raise NotFound("log of the job", job_id, "it has not begun, or was cancelled") from error
 
     def without_result(self) -> list[str]:
         """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
@@ -326,6 +348,7 @@ class Jobs:
         attributes = row.attributes or {}
         return Job(
             id=row.workflow_id,
+            name="" if request is None else request.get("name", ""),
             state=state,
             stage=progress.get("stage") or ("done" if state == "succeeded" else state),
             progress=1.0 if state == "succeeded" else progress.get("progress", 0.0),

@@ -21,6 +21,7 @@ class Job:
     ``files`` are those of a result, by name."""
 
     id: str
+    name: str
     state: str
     stage: str
     progress: float

@@ -107,6 +107,13 @@ CALIBRATION = RecordFormat(CalibrationRecord, "eigenhead-calibration/1")
 UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
 
 
+class JobWebhook(TypedDict):
+    """The address that is told of one job; ``secret`` signs the messages."""
+
+    url: str
+    secret: str | None
+
+
 class JobRequest(TypedDict):
     """What a job is asked for, as the job engine keeps it."""
 
@@ -114,6 +121,8 @@ class JobRequest(TypedDict):
     model: str | None
     settings: Mapping[str, object]
     restart_of: NotRequired[str]
+    name: NotRequired[str]
+    webhook: NotRequired[JobWebhook]
 
 
 class FileEntry(TypedDict):
@@ -134,9 +143,10 @@ class CalibrationOutcome(TypedDict):
 
 
 class WebhookMessage(TypedDict):
-    """One delivery, as the job engine keeps it."""
+    """One delivery, as the job engine keeps it, to a webhook of the service or to a job's own."""
 
     webhook: str
+    own: NotRequired[JobWebhook]
     type: str
     job_id: str
     id: str
