@@ -358,6 +358,31 @@ class RigOut(Answer):
     calibration: str | None
 
 
+class CameraSettingsEdit(Received):
+    """What is not given stays as it is; null leaves it as the camera has it."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"exposure_ms": 8.0, "gain_db": 0.0}]})
+
+    exposure_ms: float | None = Field(None, ge=0.001, le=60_000)
+    gain_db: float | None = Field(None, ge=-60, le=60)
+    white_balance_k: int | None = Field(None, ge=1000, le=20_000)
+
+
+class CameraSettingsOut(Answer):
+    exposure_ms: float | None
+    gain_db: float | None
+    white_balance_k: int | None
+    unmet: list[str] = Field(description="what the camera did not take, and why")
+
+
+class Lights(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"outputs": [0, 1]}]})
+
+    outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
+        max_length=4, description="light outputs of the trigger box that are on during a shot"
+    )
+
+
 class BackgroundOut(Answer):
     cameras: list[str]
     plates: int

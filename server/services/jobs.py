@@ -238,8 +238,7 @@ class Jobs:
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
-        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict where there is no result, or
-        where its files are gone."""
+        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict without a result."""
         job = self.get(job_id)
         if job.state != "succeeded":
             raise Conflict("no-result", f"The job is {job.state}; it has no result.")

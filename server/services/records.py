@@ -90,6 +90,16 @@ class RigState:
 
 
 @dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What a camera was set to (None: left as the camera has it); ``unmet`` has a line for each it did not take."""
+
+    exposure_ms: float | None
+    gain_db: float | None
+    white_balance_k: int | None
+    unmet: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class CleanPlates:
     """The cameras of which clean plates were taken, and how many of each."""
 

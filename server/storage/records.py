@@ -85,6 +85,14 @@ class UploadRecord:
     capture: str | None
 
 
+@dataclass(frozen=True, slots=True)
+class RigAdjustment:
+    """What differs from rig.toml: settings of cameras by name, and the lamps that are on during a shot."""
+
+    cameras: dict[str, dict[str, float | None]]
+    lights: tuple[int, ...] | None = None
+
+
 class RecordFormat(Generic[T]):
     """How records of one kind are written: an object that names its format."""
 
@@ -104,6 +112,7 @@ class RecordFormat(Generic[T]):
 CAPTURE = RecordFormat(CaptureRecord, "eigenhead-capture/1")
 SESSION = RecordFormat(SessionRecord, "eigenhead-session/1")
 CALIBRATION = RecordFormat(CalibrationRecord, "eigenhead-calibration/1")
+RIG_ADJUSTMENT = RecordFormat(RigAdjustment, "eigenhead-rig-adjustment/1")
 UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
 
 
