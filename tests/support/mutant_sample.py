@@ -1,10 +1,10 @@
-"""Mutation testing of compiled loops: `make mutants SAMPLE=50` changes 50 places of them, drawn at random, one at a time,
-and tells which changes no test noticed. Ends with status 1 where fewer than 85 of 100 are noticed.
+"""Mutation testing of compiled loops: `make mutants SAMPLE=50` changes 50 places of them, drawn at random, one at a
+time, and tells which changes no test noticed. Ends with status 1 where fewer than 85 of 100 are noticed.
 
 mutmut leaves functions with a decorator as they are, and compiled loops have one. Here each mutant is a copy of the
 module with one operator or number changed, compiled as the loop itself is and run by the module's tests in a process
-forked from one that has loaded the libraries. A mutant that takes five times the tests' own time, or ends the process, is
-noticed.
+forked from one that has loaded the libraries. A mutant that takes five times the tests' own time, or ends the process,
+is noticed.
 """
 
 import argparse
@@ -178,11 +178,11 @@ def run_tests(folder: Path, tests: list[str], patience_s: float) -> int:
 
 
 def copied(folder: Path) -> None:
-    """The checkout as git knows it, with what lies beside it (the shared captures that some tests read)."""
-    files = subprocess.run(["git", "ls-files", "-z", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True)
-    subprocess.run(
-        ["cp", "--parents", "-t", str(folder), *files.stdout.decode().split("\0")[:-1]], cwd=ROOT, check=True
-    )
+    """The checkout as git knows it."""
+    listed = ["git", "ls-files", "-z", "-co", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
+    there = [name for name in names if name and (ROOT / name).is_file()]
+    subprocess.run(["cp", "--parents", "-t", str(folder), *there], cwd=ROOT, check=True)
 
 
 def main() -> None:
