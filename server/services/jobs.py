@@ -15,7 +15,7 @@ from typing import cast
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions, WorkflowStatus
+from dbos import DBOS, DBOSClient, EnqueueOptions, WorkflowStatus
 from sqlalchemy.exc import IntegrityError
 
 from pipeline.settings import settings_from_document
@@ -86,18 +86,6 @@ class JobFailed(EigenheadError):
 
     def __str__(self) -> str:
         return self.detail
-
-
-def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
-    return {
-        "name": APPLICATION,
-        "system_database_url": settings.url,
-        "application_version": APPLICATION_VERSION,
-        "executor_id": executor_id,
-        "enable_otlp": False,
-        "log_level": "WARNING",
-        "notification_listener_polling_interval_sec": 1.0,
-    }
 
 
 def migrate(settings: ServiceSettings) -> None:

@@ -35,7 +35,7 @@ from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
 from server.errors import Refused, unusable_input
 from server.services import calibrations
-from server.services.jobs import DELIVERY, WORKFLOW, JobFailed, engine_config
+from server.services.jobs import DELIVERY, WORKFLOW, JobFailed
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
@@ -47,7 +47,7 @@ from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
-from server.worker.engine import take_over
+from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers, process_identity
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see

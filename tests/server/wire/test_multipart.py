@@ -40,7 +40,9 @@ def received(
 
     async def receive() -> tuple[Path, dict[str, str]]:
         request = cast(Request, SimpleNamespace(headers={"content-type": content_type}, stream=stream))
-        return await receive_multipart(request, folder, ServiceSettings(data=folder, **settings), Threads())
+        return await receive_multipart(
+            request, folder, ServiceSettings.model_validate({"data": folder, **settings}), Threads()
+        )
 
     path, fields = asyncio.run(receive())
     return path.read_bytes(), fields
