@@ -1,12 +1,15 @@
 """Outlines that the depth of other views contradicts: a mask that leaves out what two of them see solid is wrong there.
 
 A surface lies inside every silhouette, hidden or not. Where points of two views fall outside a third one's, that one's
-outline says nothing any more, so that one bad mask cuts no hole through what the others know.
+outline says nothing any more, so that one bad mask cuts no hole through what the others know. Near an outline it is the
+depth that errs: matching windows make what is thin (frames of glasses, a collar's edge) wider by their own size, in
+every view alike.
 """
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import ndimage
 
 from pipeline.compiled import njit
 from pipeline.dense.surface.view_stack import ViewStack
@@ -19,6 +22,7 @@ STRIDE = 3  # every third pixel of every third row stands for the others
 CLEAR_PX = 2.5  # a point nearer to the outline is ordinary: blur, hair, calibration
 SURE_MM = 1.0  # points with a larger deviation do not count
 VIEWS_LEAST = 2  # that see something solid
+WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
 SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
 
@@ -32,15 +36,30 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
             height, width = views.sizes[v]
             blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
             _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
-            wrong = cv2.dilate((np.bitwise_count(blocks) >= VIEWS_LEAST).view(np.uint8), np.ones((3, 3), np.uint8))
-            shares[v] = wrong.mean()
-            if wrong.any():
-                whole = np.kron(wrong, np.ones((BLOCK, BLOCK), np.uint8))[:height, :width].ravel()
-                own = pixels[views.starts[v] : views.starts[v] + height * width]
-                own[whole > 0, OUTLINE] = SILENT_PX
+            solid = np.bitwise_count(blocks) >= VIEWS_LEAST
+            if solid.any():
+                own = pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
+                wrong = _beyond_windows(solid, own.reshape(height, width))
+                own[wrong.ravel()] = SILENT_PX
+                shares[v] = wrong.mean()
 
     in_threads(len(views.cameras), one)
     return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
+
+
+def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels in and next to solid blocks, of those connected ones that reach farther beyond the outline than windows
+    make anything wider."""
+    height, width = outline_px.shape
+    count, labels = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
+    middle = BLOCK // 2
+    rows, columns = (
+        np.minimum(middle + BLOCK * np.arange(n), size - 1)
+        for n, size in zip(solid.shape, (height, width), strict=True)
+    )
+    farthest = ndimage.maximum(np.where(solid, outline_px[np.ix_(rows, columns)], 0.0), labels, np.arange(count))
+    wrong = np.asarray(farthest)[labels] > WIDENED_PX
+    return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
