@@ -199,6 +199,7 @@ def reconstruct(
         detail=detail,
         atlas=atlas,
         bust=bust,
+        parts=parts,
     )
 
 
