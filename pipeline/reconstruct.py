@@ -27,7 +27,7 @@ from pipeline.fitting.fine.refine import Displaced, refine_to_surface
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.refine import refine_with_photographs
-from pipeline.fitting.posterior import vertex_deviation_mm, with_estimated_prior
+from pipeline.fitting.posterior import RELIEF_OF_OUTLINES, vertex_deviation_mm, with_estimated_prior
 from pipeline.fitting.simplex.hierarchy import fit_simplex
 from pipeline.fitting.span_misfit import with_span_misfit
 from pipeline.imaging.cpu_raster import depth_maps
@@ -283,6 +283,8 @@ def fit_head(
     if detail.level == "span":
         wider = _basis(model, eigenheads, kernel=True)
         return with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, parts
+    if detail.level == "kernel":
+        relief_mm *= RELIEF_OF_OUTLINES
     return with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm), model, detail, parts
 
 
