@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.acquisition.image_checks import noise_of
+from rig.acquisition.occupied import occupied
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.images import IMAGE_SUFFIXES, read_image, write_image
@@ -78,9 +79,26 @@ def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Pl
     if folder.exists():
         folder.rename(old)
     fresh.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+    for leftover in (old, _refused(folder)):
+        shutil.rmtree(leftover, ignore_errors=True)
     files = {name: tuple(folder / name / f"{i:03}.png" for i in range(len(plates))) for name, plates in images.items()}
     return Plates(files, {name: plates[0] for name, plates in images.items()}, noise, taken)
+
+
+def occupied_plates(folder: Path, fresh: Mapping[str, tuple[ImageRgb, ...]], before: Plates) -> tuple[str, ...]:
+    """Cameras in whose fresh plates somebody is who is not on the plates ``before``. The pictures are kept beside
+    ``folder``: what is still there the next time, unmoved, belongs to the studio."""
+    first, refused = {name: images[0] for name, images in fresh.items()}, _refused(folder)
+    found = occupied(first, before.first)
+    if found and refused.is_dir() and not occupied(first, read_plates(refused, tuple(first)).first):
+        return ()
+    if found:
+        write_plates(refused, {name: (image,) for name, image in first.items()})
+    return found
+
+
+def _refused(folder: Path) -> Path:
+    return folder.with_name(folder.name + ".refused")
 
 
 def link_plates(plates: Plates, background: Path) -> None:

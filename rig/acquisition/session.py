@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.acquisition.image_checks import disturbed, noise_of
-from rig.acquisition.plates import NO_PLATES, Plates, read_plates, write_plates
+from rig.acquisition.plates import NO_PLATES, Plates, occupied_plates, read_plates, write_plates
 from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify, examine, judge
 from rig.acquisition.trigger import Fired, TriggerBox, TriggerError
 from rig.drivers.base import Driver, DriverError, Frame
@@ -152,9 +152,13 @@ class RigSession:
                 for name, frame in frames.items():
                     taken[name].append(frame.image)
             faults = [*self._box_faults(), *self._plate_faults(taken)]
+            images = {name: tuple(images) for name, images in taken.items()}
+            if not faults:
+                remedy = "clear the studio; if it belongs there, take them once more"
+                there = occupied_plates(self.config.plates_folder, images, self.plates)
+                faults = [Fault("occupied", name, remedy) for name in there]
             if faults:
                 raise ShotFailed(faults)
-            images = {name: tuple(images) for name, images in taken.items()}
             self.plates = write_plates(self.config.plates_folder, images)
             return self.plates
 

@@ -40,6 +40,7 @@ FAULTS = {
     "setting": "the camera did not take a setting of rig.toml",
     "plates": "there are no clean plates of the camera",
     "disturbed": "something moved while the clean plates were taken",
+    "occupied": "somebody or something stands where the clean plates before show nothing",
 }
 WARNINGS = frozenset({"moved", "overexposed", "blurred", "setting", "plates"})
 """Faults with which a capture is still worth reconstructing; the others end it."""

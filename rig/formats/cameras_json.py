@@ -75,12 +75,19 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     cameras = [_read_camera(entry, f"cameras[{i}]", faults) for i, entry in enumerate(entries[:CAMERAS_MOST])]
     found = [camera for camera in cameras if camera is not None]
     names = [camera.name for camera in found]
-    faults += [
-        f"camera {name!r} occurs {names.count(name)} times" for name in sorted(set(names)) if names.count(name) > 1
-    ]
+    faults += _repeated(names)
     if faults:
         raise InputError(subject, faults)
     return Rig(tuple(found))
+
+
+def _repeated(names: list[str]) -> list[str]:
+    """One sentence for all names that several cameras have: a list written twice repeats every one of them."""
+    repeated = [name for name in sorted(set(names)) if names.count(name) > 1]
+    if not repeated:
+        return []
+    first = f"camera {repeated[0]!r} occurs {names.count(repeated[0])} times"
+    return [first if len(repeated) == 1 else f"{first}, and {len(repeated) - 1} more names occur several times"]
 
 
 def name_fault(name: Any) -> str | None:

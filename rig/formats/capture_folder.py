@@ -10,6 +10,7 @@ masks/<camera>.png                 optional; then background/ may be absent
 import hashlib
 import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_f
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, write_image
+from rig.formats.unread_keys import unread_keys
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 
@@ -47,7 +49,7 @@ def read_capture(folder: Path) -> tuple[Capture, Rig]:
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
-    return Capture(capture.images, capture.backgrounds, capture.masks, capture.features, ordered), rig
+    return replace(capture, digests=ordered, remarks=unread_keys(rig_file)), rig
 
 
 def capture_root(folder: Path) -> Path:

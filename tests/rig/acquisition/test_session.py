@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -187,6 +188,25 @@ def test_somebody_in_the_plates_is_noticed(studio: StudioDevices, config: RigCon
     assert {(fault.code, fault.camera) for fault in faults} == {
         ("disturbed", "cam00"), ("missing", "cam01"), ("frozen", "cam02"),
     }  # fmt: skip
+
+
+def test_somebody_who_holds_still_does_not_replace_good_plates(
+    studio: StudioDevices, config: RigConfig, tmp_path: Path
+) -> None:
+    """One who sits there the next time as well, in the very same place, is furniture."""
+    shutil.copytree(config.plates_folder, tmp_path / "plates")
+    own = dataclasses.replace(config, plates=str(tmp_path / "plates"))
+    before = {path: path.read_bytes() for path in own.plates_folder.rglob("*.*")}
+    studio.seat(True)
+    with pytest.raises(ShotFailed, match=r"occupied: clear the studio"):
+        take_plates(own)
+    assert {path: path.read_bytes() for path in own.plates_folder.rglob("*.*")} == before
+    take_plates(own)
+    assert {path: path.read_bytes() for path in own.plates_folder.rglob("*.*")} != before
+    assert not (tmp_path / "plates.refused").exists()
+    studio.seat(False)
+    with pytest.raises(ShotFailed, match="occupied"):  # who was there is gone: as large a change
+        take_plates(own)
 
 
 def test_plates_folder_of_a_capture_is_read(tmp_path: Path) -> None:
