@@ -3,6 +3,7 @@ attributes of results. Each asks who the browser's session is, as the API asks f
 
 import asyncio
 import threading
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,6 +72,18 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     if not path.is_file():
         make_thumbnail(service.store.folder("captures", capture_id) / "files" / name, path)
     return FileResponse(path, headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/checks")
+def checks(who: Reader, capture_id: str) -> Response:
+    """What was measured of a capture's pictures, by camera."""
+    return JSONResponse(who[0].store.checks(capture_id), headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/holdings")
+def holdings(who: Reader, capture_id: str) -> Response:
+    """What a removal of the capture takes, and what stays."""
+    return JSONResponse(asdict(who[0].captures.holdings(capture_id)), headers={"Cache-Control": "no-store"})
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.image")

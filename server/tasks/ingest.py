@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
+from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.capture import Capture
@@ -20,6 +21,7 @@ from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
 from rig.formats.capture_folder import capture_root, read_shot, size_fault, stray_faults
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, picture_size
+from rig.formats.rig_toml import ShotConfig
 from rig.plausibility import rig_faults
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import Bench, Report
@@ -46,9 +48,11 @@ def ingest_archive(
     return described
 
 
-def ingest_folder(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> CaptureContent:
-    """The same for a folder of our own making (a shot of the rig)."""
-    return check_capture(Path(folder), image_pixels, report)
+def ingest_folder(
+    bench: Bench, report: Report, *, folder: str, image_pixels: int, measured: bool = False
+) -> CaptureContent:
+    """The same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was taken."""
+    return check_capture(Path(folder), image_pixels, report, measured=measured)
 
 
 def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> CaptureContent:
@@ -73,7 +77,7 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
     )
 
 
-def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureContent:
+def check_capture(root: Path, image_pixels: int, report: Report, *, measured: bool = False) -> CaptureContent:
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", [NO_RIG])
@@ -84,6 +88,7 @@ def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureConte
     faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)] + stray_faults(root, rig)
     digests: dict[str, str] = {}
     empty: list[str] = []
+    views: dict[str, ViewCheck] = {}
     for number, camera in enumerate(rig):
         report("check", number / len(rig))
         of_camera = _size_faults(root, camera, image_pixels)
@@ -91,6 +96,7 @@ def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureConte
             shot = read_shot(root, rig.subset([camera.name]), of_camera)
             digests |= shot.digests
             empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
+            views |= _view_of(shot, camera.name, measured)
         faults += [fault for fault in of_camera if not fault.startswith("features.json")]  # judged below, for all
     if (root / "features.json").is_file():
         features = features_from_bytes((root / "features.json").read_bytes(), rig, faults)
@@ -106,7 +112,18 @@ def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureConte
         front=rig.front_camera(),
         inputs=dict(sorted(digests.items())),
         bytes=sum((root / name).stat().st_size for name in digests),
+        faults=tuple(view_faults(views, ShotConfig())),
+        checks={name: view.document() for name, view in views.items()},
     )
+
+
+def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
+    """The camera's picture, judged; nothing where it cannot be read."""
+    image = shot.images.get(name)
+    if image is None:
+        return {}
+    plates = shot.backgrounds.get(name, ())
+    return {name: check_view(image, plates[0] if plates else None, shot.masks.get(name), place_only=measured)}
 
 
 def _shows_its_plate(shot: Capture, name: str) -> bool:
