@@ -23,8 +23,7 @@ from jaxtyping import UInt8
 from rig.acquisition.image_checks import noise_of
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.capture_folder import IMAGE_SUFFIXES
-from rig.formats.images import read_image, write_image
+from rig.formats.images import IMAGE_SUFFIXES, read_image, write_image
 
 FORMAT = "eigenhead-plates/1"
 VERSIONS_MOST = 6

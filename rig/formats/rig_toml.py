@@ -150,6 +150,22 @@ def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject:
     return dataclasses.replace(config, folder=folder)
 
 
+def adjusted(
+    config: RigConfig, cameras: Mapping[str, Mapping[str, float | None]], outputs: tuple[int, ...] | None
+) -> RigConfig:
+    """The rig with other ``exposure_ms``, ``gain_db`` and ``white_balance_k`` of cameras, and other lamps (None: those
+    of rig.toml). Raises InputError that names every fault."""
+    changed = dataclasses.replace(
+        config,
+        cameras=tuple(dataclasses.replace(camera, **cameras.get(camera.name, {})) for camera in config.cameras),
+        lights=config.lights if outputs is None else dataclasses.replace(config.lights, outputs=outputs),
+    )
+    faults = _rig_faults(changed)
+    if faults:
+        raise InputError("rig", faults)
+    return changed
+
+
 def _rig_faults(config: RigConfig) -> list[str]:
     faults: list[str] = []
     if not config.cameras:

@@ -12,10 +12,9 @@ import numpy as np
 from fastapi import Depends, Request, Response
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from nicegui import app as pages
-from PIL import Image
 
 from rig.errors import EigenheadError
-from rig.formats.images import IMAGE_FORMATS, read_image, write_image
+from rig.formats.images import open_picture, read_image, write_image
 from server.console import comparison
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
@@ -200,7 +199,7 @@ def cameras_file(who: Reader, calibration_id: str) -> Response:
 def make_thumbnail(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = target.with_suffix(f".{threading.get_ident()}")
-    with Image.open(source, formats=IMAGE_FORMATS) as picture:
+    with open_picture(source) as picture:
         picture.draft("RGB", (THUMBNAIL_WIDTH * 2, THUMBNAIL_WIDTH * 2))  # JPEG decodes at a fraction of its size
         picture = picture.convert("RGB")
         picture.thumbnail((THUMBNAIL_WIDTH, THUMBNAIL_WIDTH * 2), reducing_gap=2.0)

@@ -93,6 +93,14 @@ class UploadRecord:
     capture: str | None
 
 
+@dataclass(frozen=True, slots=True)
+class RigAdjustment:
+    """What differs from rig.toml: settings of cameras by name, and the lamps that are on during a shot."""
+
+    cameras: dict[str, dict[str, float | None]]
+    lights: tuple[int, ...] | None = None
+
+
 class RecordFormat(Generic[T]):
     """How records of one kind are written: an object that names its format."""
 
@@ -112,7 +120,15 @@ class RecordFormat(Generic[T]):
 CAPTURE = RecordFormat(CaptureRecord, "eigenhead-capture/1")
 SESSION = RecordFormat(SessionRecord, "eigenhead-session/1")
 CALIBRATION = RecordFormat(CalibrationRecord, "eigenhead-calibration/1")
+RIG_ADJUSTMENT = RecordFormat(RigAdjustment, "eigenhead-rig-adjustment/1")
 UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
+
+
+class JobWebhook(TypedDict):
+    """The address that is told of one job; ``secret`` signs the messages."""
+
+    url: str
+    secret: str | None
 
 
 class JobRequest(TypedDict):
@@ -122,6 +138,8 @@ class JobRequest(TypedDict):
     model: str | None
     settings: Mapping[str, object]
     restart_of: NotRequired[str]
+    name: NotRequired[str]
+    webhook: NotRequired[JobWebhook]
 
 
 class FileEntry(TypedDict):
@@ -142,9 +160,10 @@ class CalibrationOutcome(TypedDict):
 
 
 class WebhookMessage(TypedDict):
-    """One delivery, as the job engine keeps it."""
+    """One delivery, as the job engine keeps it, to a webhook of the service or to a job's own."""
 
     webhook: str
+    own: NotRequired[JobWebhook]
     type: str
     job_id: str
     id: str

@@ -3,7 +3,7 @@
     <data>/captures/<id>/record.json  files/...          one folder a capture, as the contract lays it out; checks.json
                                                          has what was measured of each camera's picture
     <data>/sessions/<id>.json
-    <data>/jobs/<id>/result/...                          and attempt-*/ while a worker writes
+    <data>/jobs/<id>/result/...  log.txt                 and attempt-*/ while a worker writes
     <data>/cache/captures/<id>/...                       what is worth keeping of a capture, and can be made anew
     <data>/calibrations/<id>/...  rig/...                 see server.services.calibrations, server.services.rigs
     <data>/incoming/<id>/                                what is being received; swept after a crash

@@ -9,7 +9,6 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
@@ -18,10 +17,10 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import find_rig_file, read_rig_file
-from rig.formats.capture_folder import IMAGE_SUFFIXES, capture_root, read_shot, size_fault, stray_faults
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
+from rig.formats.capture_folder import capture_root, read_shot, size_fault, stray_faults
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
-from rig.formats.images import IMAGE_FORMATS
+from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
 from rig.plausibility import rig_faults
 from server.storage.records import CameraSize, CaptureContent
@@ -65,8 +64,7 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
     files = sorted((root / "images").iterdir())
     sizes = {}
     for path in files:
-        with Image.open(path, formats=IMAGE_FORMATS) as header:
-            sizes[path.stem] = header.size
+        sizes[path.stem] = picture_size(path)
     huge = [f"{name} is {w} x {h} pixels" for name, (w, h) in sizes.items() if w * h > image_pixels]
     if huge:
         raise InputError("capture", [f"{fault}; at most {image_pixels:,} are accepted" for fault in huge])
@@ -82,7 +80,7 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
 def check_capture(root: Path, image_pixels: int, report: Report, *, measured: bool = False) -> CaptureContent:
     rig_file = find_rig_file(root)
     if rig_file is None:
-        raise InputError("capture", ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+        raise InputError("capture", [NO_RIG])
     try:
         rig = read_rig_file(rig_file)
     except InputError as error:
@@ -156,13 +154,9 @@ def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
     for path in _images_of(root, camera.name):
         name = path.relative_to(root).as_posix()
         try:
-            with Image.open(path, formats=IMAGE_FORMATS) as header:
-                width, height = header.size
-        except Image.DecompressionBombError:
-            faults.append(f"{name} claims to be huge; at most {image_pixels:,} pixels are accepted")
-            continue
-        except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
-            faults.append(f"{name} is damaged or no PNG, JPEG, TIFF or WebP image")
+            width, height = picture_size(path)
+        except InputError as error:
+            faults += [f"{name} {fault}" for fault in error.faults]
             continue
         if width * height > image_pixels:
             faults.append(f"{name} is {width} x {height} pixels; at most {image_pixels:,} pixels are accepted")

@@ -8,13 +8,15 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from rig.errors import InputError
+from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
 from server.http.rig_schemas import CaptureChecks, HoldingsOut
-from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures
-from server.services.captures import About
+from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
+from server.services.captures import TEXT_MOST, About
 from server.services.jobs import Work
 from server.services.keys import Caller
 from server.storage.records import CaptureRecord
+from server.wire.fetch import fetch_archive
 from server.wire.multipart import ARCHIVE, described_form, receive_capture
 from server.wire.problems import Responses, documented
 from server.wire.send_file import send_file
@@ -44,6 +46,20 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
     """Takes a capture folder as an archive; 422 names every fault in it, and then nothing of it is kept."""
     record, _ = await receive_capture(service, request)
+    return _created(record, response)
+
+
+@router.post("/captures/imports", status_code=201, responses=documented(400, 404, 413, 415, 507))
+async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, response: Response) -> CaptureOut:
+    """Takes a capture folder as an archive that lies elsewhere, at a server that the operator allowed
+    (``EIGENHEAD_IMPORT_ORIGINS``; 403 where there is none); 422 names every fault in it."""
+    if not service.settings.import_origins:
+        detail = "This service imports from nowhere: its operator names servers in EIGENHEAD_IMPORT_ORIGINS. Upload it."
+        raise Forbidden("imports-off", detail)
+    about = About(wanted.session, wanted.label, wanted.expression)
+    with service.store.incoming() as folder:
+        archive = await fetch_archive(service, wanted.url, folder)
+        record = await service.threads.check(service.captures.accept, archive, folder, about)
     return _created(record, response)
 
 
@@ -142,7 +158,7 @@ def delete_capture(
     status_code=202,
     tags=["jobs"],
     responses=documented(400, 404, 409, 413, 415, 507),
-    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model"), settings="JSON object"),
+    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), settings="JSON object"),
 )
 async def reconstruct_upload(
     service: ServiceOf,
@@ -153,7 +169,8 @@ async def reconstruct_upload(
     """Upload and job in one call."""
     record, fields = await receive_capture(service, request)
     try:
-        wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")))
+        name = (fields.get("name") or "")[:TEXT_MOST]
+        wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")), name)
         key = request.headers.get("idempotency-key")
         submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=key)
         job = await service.threads.disk(submit)

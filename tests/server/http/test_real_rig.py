@@ -103,6 +103,33 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         assert len(client.get("/v1/captures").json()["captures"]) == 4
 
 
+def test_lamps_settings_and_a_moving_preview_over_http(studio: StudioDevices, tmp_path: Path) -> None:
+    with (
+        running_service(tmp_path / "data", worker=False, rig=str(studio.folder / "rig.toml")) as service,
+        httpx.Client(base_url=service.url, timeout=60) as client,
+    ):
+        studio.seat(False)  # five takes in turn, each with noise of its own
+        assert client.get("/v1/rig/lights").json() == {"outputs": [0, 1]}
+        with client.stream("GET", "/v1/rig/cameras/cam03/preview.mjpg", params={"seconds": 1.6}) as stream:
+            assert stream.headers["content-type"] == "multipart/x-mixed-replace; boundary=frame"
+            data = stream.read()
+        parts = [part for part in data.split(b"--frame\r\nContent-Type: image/jpeg\r\n") if part]
+        pictures = [part.partition(b"\r\n\r\n")[2][: int(part.split()[1])] for part in parts]
+        assert len(pictures) >= 3
+        assert {_decoded(picture).shape for picture in pictures} == {(240, 320, 3)}
+        assert len(set(pictures)) >= 2, "the sensor's noise makes each another picture"
+        assert client.get("/v1/rig/cameras/cam99/preview.mjpg").status_code == 404
+        assert client.put("/v1/rig/lights", json={"outputs": []}).json() == {"outputs": []}
+        dark = _decoded(client.get("/v1/rig/cameras/cam03/preview.jpg").content)
+        assert dark.mean() < 0.5 * _decoded(pictures[0]).mean()
+        assert client.put("/v1/rig/lights", json={"outputs": [4]}).status_code == 422
+        changed = client.patch("/v1/rig/cameras/cam03/settings", json={"exposure_ms": 8})
+        assert changed.json()["exposure_ms"] == 8.0
+        assert "exposure_ms" in changed.json()["unmet"][0]
+        assert client.get("/v1/rig/cameras/cam03/settings").json() == changed.json()
+        assert client.patch("/v1/rig/cameras/cam03/settings", json={"exposure_ms": -1}).status_code == 422
+
+
 @pytest.mark.timeout(600)
 def test_a_rig_without_a_calibration_is_calibrated_over_http(tmp_path: Path) -> None:
     """Four cameras that show the recorded board, shot by shot; the first shots lack a camera."""
