@@ -10,7 +10,8 @@ from pathlib import Path
 
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
-from rig.formats.capture_folder import IMAGE_SUFFIXES, capture_root
+from rig.formats.capture_folder import capture_root
+from rig.formats.images import IMAGE_SUFFIXES
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
 

@@ -87,6 +87,7 @@ class ShotConfig:
     open_timeout_s: float = 10.0
     warm_up_frames: int = 3
     plates: int = 5
+    plates_over_s: float = 3.0  # from the first clean plate to the last: in that time a person who sits still moves
     skew_most_ms: float = 40.0  # in which a head that drifts at 25 mm/s moves 1 mm
     clipped_most: float = 0.05  # share of pixels at 255 in every channel
     dark_below: float = 0.25  # brightness relative to the clean plates
@@ -147,6 +148,22 @@ def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject:
     if faults or config is None:
         raise InputError(subject, faults)
     return dataclasses.replace(config, folder=folder)
+
+
+def adjusted(
+    config: RigConfig, cameras: Mapping[str, Mapping[str, float | None]], outputs: tuple[int, ...] | None
+) -> RigConfig:
+    """The rig with other ``exposure_ms``, ``gain_db`` and ``white_balance_k`` of cameras, and other lamps (None: those
+    of rig.toml). Raises InputError that names every fault."""
+    changed = dataclasses.replace(
+        config,
+        cameras=tuple(dataclasses.replace(camera, **cameras.get(camera.name, {})) for camera in config.cameras),
+        lights=config.lights if outputs is None else dataclasses.replace(config.lights, outputs=outputs),
+    )
+    faults = _rig_faults(changed)
+    if faults:
+        raise InputError("rig", faults)
+    return changed
 
 
 def _rig_faults(config: RigConfig) -> list[str]:
@@ -219,11 +236,12 @@ def _trigger_faults(trigger: TriggerConfig) -> list[str]:
 
 
 def _shot_faults(shot: ShotConfig) -> list[str]:
-    least = {"warm_up_frames": 1, "plates": 1}
+    least = {"warm_up_frames": 1, "plates": 1, "plates_over_s": 0}
+    values = {field.name: getattr(shot, field.name) for field in dataclasses.fields(shot)}
     return [
-        f"{field.name}: {getattr(shot, field.name)} is too small; at least {least.get(field.name, 0)}"
-        for field in dataclasses.fields(shot)
-        if getattr(shot, field.name) < least.get(field.name, 1e-9)
+        f"{name}: {value} is too small; {f'at least {least[name]}' if name in least else 'more than 0'}"
+        for name, value in values.items()
+        if (value < least[name] if name in least else value <= 0)
     ]
 
 

@@ -124,7 +124,7 @@ def _cameras(document: dict[str, Any], cameras: Collection[str], faults: list[st
 
 
 def _length(document: dict[str, Any], key: str, faults: list[str], where: str = "") -> float:
-    value = document.get(key)
+    value: Any = document.get(key)
     if not _is_number(value) or not 0.1 <= value <= 1e5:
         faults.append(f"{where}{key} is {value!r:.80}, wanted a length in millimetres, 0.1 to 100000")
         return 1.0

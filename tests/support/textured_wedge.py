@@ -63,8 +63,11 @@ def photograph(camera: Camera, seed: int = 0) -> UInt8[np.ndarray, "h w"]:
     points = on_wedge(camera, np.column_stack([u.ravel(), v.ravel()]))
     along = points[:, 0] * np.sqrt(1 + SLOPE**2)  # mm along the side, from the ridge
     # Rows of the texture go down: a tag that is printed upside down in a mirror is none.
-    at = [(TEXELS_MM * (c + SIDE_MM / 2)).reshape(k.height, k.width).astype(np.float32) for c in (along, -points[:, 1])]
-    return cv2.remap(texture(seed), *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=128.0)
+    across, down = (
+        (TEXELS_MM * (c + SIDE_MM / 2)).reshape(k.height, k.width).astype(np.float32) for c in (along, -points[:, 1])
+    )
+    grey = (128.0,)
+    return cv2.remap(texture(seed), across, down, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, grey)
 
 
 @cache
