@@ -47,7 +47,6 @@ def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool
     ``scratch`` is a folder of the caller's that may be deleted once the structure is solved; ``one_lens``: all
     photographs are of one camera at one setting; None: they are where each camera has one picture and all are of one
     size. Raises InputError naming every picture that cannot be used."""
-
     sizes = _write_grey(photographs, scratch / "pictures")
     if one_lens is None:
         one_lens = len(set(sizes.values())) == 1 and photographs.shots == (ONE_SHOT,)
