@@ -44,13 +44,13 @@ def directions_deg(views: int) -> list[tuple[float, float]]:
 
 def buddha(every: int, size: float) -> tuple[SceneCalibration, Agreement]:
     """The Buddha's photographs, one of ``every``, scaled by ``size``."""
-    files = sorted((shared("buddha") / "images").iterdir())[::every]
+    files = sorted((shared("data/buddha") / "images").iterdir())[::every]
     with tempfile.TemporaryDirectory() as folder:
         for file in files:
             picture = cv2.resize(read_image(file), None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
             write_image(Path(folder) / f"{file.stem}.png", picture)
         found = calibrate_scene(Path(folder), one_lens=True)
-    return found, agreement(found.structure, read_projections(shared("buddha") / "projections.json", size))
+    return found, agreement(found.structure, read_projections(shared("data/buddha") / "projections.json", size))
 
 
 def studio(seed: int, views: int) -> tuple[SceneCalibration, Rig]:
