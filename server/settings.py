@@ -81,6 +81,7 @@ class ServiceSettings(BaseSettings):
     cache_bytes: int = Field(default=4 << 30, ge=0, description="the most that silhouettes and thumbnails take up")
     sweep_s: float = Field(default=60.0, gt=0)
 
+    ask_consent: bool = Field(default=False, description="captures need a session with a note of the subject's consent")
     console: bool = Field(default=True, description="serve the operator's pages; they add 1.5 s to the start")
     log_json: bool = Field(default=False, description="log lines as JSON")
 

@@ -87,6 +87,7 @@ class ShotConfig:
     open_timeout_s: float = 10.0
     warm_up_frames: int = 3
     plates: int = 5
+    plates_over_s: float = 3.0  # from the first clean plate to the last: in that time a person who sits still moves
     skew_most_ms: float = 40.0  # in which a head that drifts at 25 mm/s moves 1 mm
     clipped_most: float = 0.05  # share of pixels at 255 in every channel
     dark_below: float = 0.25  # brightness relative to the clean plates

@@ -157,6 +157,15 @@ class Size(Answer):
     height: int
 
 
+class FaultOut(Answer):
+    """What is wrong with a capture that was accepted."""
+
+    code: str = Field(description="as in docs/rig.md, among them moved, overexposed, blurred, setting, plates, cut-off")
+    camera: str | None = Field(description="null: the rig as a whole")
+    detail: str
+    remedy: str
+
+
 class CaptureOut(Answer):
     id: str
     created: Moment
@@ -171,6 +180,10 @@ class CaptureOut(Answer):
     bytes: int
     inputs: dict[str, str] = Field(description="sha256 of every file, by name")
     shot: JsonObject | None = Field(None, description="the rig's sync certificate")
+    verdict: Literal["good", "usable", "poor"] | None = Field(
+        None, description="good: no fault; poor: shoot again; null: not judged (of the board, or of an earlier version)"
+    )
+    faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
 
 
 class CaptureList(Answer):

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.acquisition.commands import board_shot
-from rig.acquisition.plates import link_plates
+from rig.acquisition.plate_checks import PlatesRefused
+from rig.acquisition.plates import PlatesVersion, link_plates, plates_versions
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import ShotDocument, ShotFailed
 from rig.atomic_write import write_atomically
@@ -78,7 +79,15 @@ class RigBackend(Protocol):
         ...
 
     def take_background(self) -> CleanPlates:
-        """New clean plates of the empty studio. Raises Unavailable."""
+        """New clean plates of the empty studio. Raises Unavailable, and Conflict where they show somebody."""
+        ...
+
+    def plates(self) -> list[PlatesVersion]:
+        """The clean plates that are kept, newest first."""
+        ...
+
+    def use_plates(self, version: str) -> None:
+        """Puts clean plates that are kept to use. Raises NotFound."""
         ...
 
     def use(self, calibration: Path) -> None:
@@ -141,6 +150,12 @@ class SimulatedRig:
     def take_background(self) -> CleanPlates:
         """The studio takes clean plates with every shot; there is nothing to keep."""
         return CleanPlates(self._rig().names, 2, "the simulated studio takes them with each shot")
+
+    def plates(self) -> list[PlatesVersion]:
+        return []
+
+    def use_plates(self, version: str) -> None:
+        raise NotFound("version of the clean plates", version, "the simulated studio takes them with each shot")
 
     def use(self, calibration: Path) -> None:
         _check_names(read_rig(calibration), self._rig().names)
@@ -274,10 +289,26 @@ class RealRig:
         with self._lock:
             try:
                 plates = self._opened().take_plates()
+            except PlatesRefused as error:
+                faults = [f"{fault.camera}: {fault.detail}" for fault in error.faults]
+                detail = (
+                    "The new clean plates show somebody, or a changed studio; the old ones stay in use. Take them "
+                    f"again with nobody there, or put them to use all the same: version {error.version}."
+                )
+                raise Conflict("plates-occupied", detail, faults) from error
             except ShotFailed as error:
                 faults = [str(fault) for fault in error.faults]
                 raise Unavailable("plates-failed", str(error), faults) from error
         return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, "")
+
+    def plates(self) -> list[PlatesVersion]:
+        return plates_versions(self._config.plates_folder)
+
+    def use_plates(self, version: str) -> None:
+        with self._lock:
+            if all(kept.id != version for kept in self.plates()):
+                raise NotFound("version of the clean plates", version, "GET /v1/rig/background lists them")
+            self._opened().use_plates(version)
 
     def use(self, calibration: Path) -> None:
         rig = read_rig(calibration)

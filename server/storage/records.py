@@ -5,10 +5,13 @@ job engine keeps the requests and results of jobs as they are, across upgrades o
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Generic, NotRequired, TypedDict, TypeVar
 
 from pydantic import TypeAdapter
+
+from rig.acquisition.shot import Fault
+from rig.acquisition.verdict import ViewDocument
 
 JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
 T = TypeVar("T")
@@ -26,18 +29,21 @@ class CameraSize:
 @dataclass(frozen=True, slots=True)
 class CaptureContent:
     """What is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the calibration
-    board, which show no head."""
+    board, which show no head. ``checks``: what was measured of each camera's picture."""
 
     cameras: tuple[CameraSize, ...]
     front: str
     inputs: dict[str, str]
     bytes: int
     board: bool = False
+    faults: tuple[Fault, ...] = ()
+    checks: Mapping[str, ViewDocument] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
-    """A capture: where it came from, what people say of it, what is in it, and the certificate of the rig's shot."""
+    """A capture: where it came from, what people say of it, what is in it, the certificate of the rig's shot, and the
+    verdict on it with its faults (None of what was not judged: the board, captures of earlier versions)."""
 
     id: str
     created: str
@@ -52,6 +58,8 @@ class CaptureRecord:
     features: bool
     shot: Mapping[str, object] | None = None
     board: bool = False
+    verdict: str | None = None
+    faults: tuple[Fault, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

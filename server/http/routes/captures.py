@@ -10,6 +10,7 @@ from fastapi.responses import FileResponse
 from rig.errors import InputError
 from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
+from server.http.rig_schemas import CaptureChecks, HoldingsOut
 from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
 from server.services.captures import TEXT_MOST, About
 from server.services.jobs import Work
@@ -81,6 +82,12 @@ def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureO
     return CaptureOut.model_validate(service.store.capture(capture_id))
 
 
+@router.get("/captures/{capture_id}/checks", responses=documented(404))
+def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureChecks:
+    """What the verdict follows from: exposure, sharpness, the camera's place and the subject's outline by camera."""
+    return CaptureChecks.model_validate({"cameras": service.store.checks(capture_id)})
+
+
 @router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: CaptureEdit) -> CaptureOut:
     """Another label, expression or session."""
@@ -125,10 +132,25 @@ def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeat
     return NewFeatures(points=service.captures.features(capture_id))
 
 
+@router.get("/captures/{capture_id}/holdings", responses=documented(404))
+def get_holdings(service: ServiceOf, caller: Reader, capture_id: str) -> HoldingsOut:
+    """What a removal of the capture takes, and what stays."""
+    return HoldingsOut.model_validate(service.captures.holdings(capture_id))
+
+
 @router.delete("/captures/{capture_id}", status_code=204, responses=documented(404, 409))
-def delete_capture(service: ServiceOf, caller: Taker, capture_id: str) -> None:
-    """Removes a capture with its images; its jobs and their results stay. 409 while a job needs it."""
-    service.captures.remove(capture_id)
+def delete_capture(
+    service: ServiceOf,
+    caller: Taker,
+    capture_id: str,
+    erase: Annotated[bool, Query(description="its jobs and heads, too, for good")] = False,
+) -> None:
+    """Removes a capture with its images; its jobs and their results, which show the face, stay. 409 while a job needs
+    it. With ``erase`` nothing stays: jobs are cancelled and go with their results."""
+    if erase:
+        service.captures.erase(capture_id)
+    else:
+        service.captures.remove(capture_id)
 
 
 @router.post(

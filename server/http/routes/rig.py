@@ -10,6 +10,7 @@ from fastapi.responses import StreamingResponse
 
 from server.errors import Unavailable
 from server.http.auth import ServiceOf, require
+from server.http.rig_schemas import PlatesList, PlatesOut, UsePlates
 from server.http.schemas import (
     BackgroundOut,
     CameraSettingsEdit,
@@ -99,11 +100,26 @@ def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
     return Lights(outputs=list(service.rig.set_lights(tuple(sorted(set(wanted.outputs))))))
 
 
-@router.post("/background", responses=documented(507))
+@router.post("/background", responses=documented(409, 507))
 def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
-    """Takes new clean plates of the empty studio; the old ones stay if that fails (503)."""
+    """Takes new clean plates of the empty studio. The old ones stay if that fails (503), or if the new ones show
+    somebody whom the old ones do not (409): those are kept, and PUT puts them to use all the same."""
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())
+
+
+@router.get("/background", responses=documented())
+def list_plates(service: ServiceOf, caller: Reader) -> PlatesList:
+    """The clean plates that are kept, newest first: those in use, earlier ones, and those that were refused."""
+    return PlatesList(versions=[PlatesOut.model_validate(kept) for kept in service.rig.plates()])
+
+
+@router.put("/background", responses=documented(400, 404, 413, 415, 507))
+def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesList:
+    """Puts clean plates that are kept to use: earlier ones, which takes the newest back, or refused ones all the
+    same."""
+    service.rig.use_plates(wanted.version)
+    return list_plates(service, caller)
 
 
 @router.put("/calibration", responses=documented(400, 404, 409, 413, 415, 507))
