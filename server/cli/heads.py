@@ -1,4 +1,4 @@
-"""Commands that make and judge heads: reconstruct, verify, simulate, demo, experiments."""
+"""Commands that make and judge heads: check, reconstruct, verify, simulate, demo, experiments."""
 
 import shutil
 import sys
@@ -77,6 +77,25 @@ def reconstruct(
         warn(f"{warning['code']}: {warning['message']}")
     made = [out / name for name in ("head.ply", "bust.ply") if (out / name).is_file()]
     answer(written, json_out, [str(path) for path in made])
+
+
+@app.command(epilog="Example: eigenhead check shots/anna.tar.gz --json")
+def check(
+    capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
+    settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
+    json_out: Json = False,
+) -> None:
+    """Say what is wrong with a capture, without a fit.
+
+    Status 2 where it cannot be reconstructed; with warnings it can, and the status is 0."""
+    from server.cli.check import checked, lines
+    from server.cli.reconstruct_local import settings_document
+
+    with progress_bar() as report:
+        found = checked(capture, settings_document(settings), report=report)
+    answer(found, json_out, lines(found))
+    if found["faults"]:
+        raise typer.Exit(2)
 
 
 @app.command(epilog="Example: eigenhead verify shots/m1 shots/m2 shots/m3 --reference mannequin.ply --out acceptance")
@@ -247,7 +266,7 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden or visible."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible or surfaces."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
@@ -256,6 +275,7 @@ def experiments(
         int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
     ] = None,
     captures: Annotated[bool, typer.Option(help="hidden, visible: the captures of --shared, too.")] = False,
+    openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
     shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
     out: Annotated[
         Path | None, typer.Option(help="Keeps rows there, so that a stopped run goes on; and the table and pictures.")
@@ -272,6 +292,7 @@ def experiments(
             subjects=subjects,
             simplex=simplex,
             captures=captures,
+            openmvs=openmvs,
             shared=shared,
             folder=out,
             report=report,
