@@ -59,7 +59,7 @@ def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray
         for n, size in zip(solid.shape, (height, width), strict=True)
     )
     farthest = ndimage.maximum(np.where(solid, outline_px[np.ix_(rows, columns)], 0.0), labels, np.arange(count))
-    wrong = np.asarray(farthest)[labels] > WIDENED_PX
+    wrong = np.asarray(farthest)[np.asarray(labels, np.int32)] > WIDENED_PX
     return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]
 
 
