@@ -18,6 +18,7 @@ WARNING_CODES = (
     "plates-exchanged",
     "scale-implausible",
     "shape-implausible",
+    "unknown-key",
     "view",
     "view-left-out",
 )

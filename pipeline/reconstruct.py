@@ -28,21 +28,20 @@ from pipeline.fitting.fine.refine import Displaced, refine_to_surface
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.refine import refine_with_photographs
-from pipeline.fitting.posterior import vertex_deviation_mm, with_estimated_prior
+from pipeline.fitting.posterior import RELIEF_OF_OUTLINES, vertex_deviation_mm, with_estimated_prior
 from pipeline.fitting.simplex.hierarchy import fit_simplex
 from pipeline.fitting.span_misfit import with_span_misfit
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.kept_arrays import kept_arrays
-from pipeline.multiview.camera_drift import find_drift
 from pipeline.results.bust import Bust, make_bust
 from pipeline.results.camera_metrics import camera_figures, start_masks
 from pipeline.results.measurements import landmarks, measurements
 from pipeline.results.plausibility import plausibility_warnings, refuse
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
-from pipeline.silhouettes.own_pictures import own_pictures
 from pipeline.silhouettes.segment import segment
+from pipeline.silhouettes.usable_views import usable_views
 from pipeline.texture.atlas import paint_atlas
 from pipeline.texture.uv_unwrap import unwrap
 from pipeline.texture.vertex_colours import texture
@@ -53,21 +52,8 @@ from rig.mesh import Mesh, vertex_normals
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
-VIEWS_LEAST = 3
 Report = Callable[[str, float], None]
 Segment = Callable[..., dict[str, Silhouette]]
-
-
-class TooFewViews(EigenheadError):
-    """Not enough usable silhouettes."""
-
-    def __init__(self, silhouettes: Mapping[str, Silhouette]) -> None:
-        poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
-        told = "; ".join(f"{name}: {', '.join(reasons) or 'unusable'}" for name, reasons in poor.items())
-        super().__init__(
-            f"only {len(silhouettes) - len(poor)} of {len(silhouettes)} views have a usable silhouette, "
-            f"{VIEWS_LEAST} are needed ({told}). Take new clean plates with the same light, or supply masks/"
-        )
 
 
 @dataclass
@@ -111,11 +97,8 @@ def reconstruct(
     def segmented(shot: Capture) -> dict[str, Silhouette]:
         return segment(shot, rig, settings.segmentation, report=report)
 
-    own = own_pictures(capture, rig, segmented, exchanged=settings.exchanged_pictures)
-    digests, capture, silhouettes = capture.digests, own.capture, own.silhouettes
-    if sum(silhouette.quality.usable for silhouette in silhouettes.values()) < VIEWS_LEAST:
-        raise TooFewViews(silhouettes)
-    silhouettes, moved = without_moved_cameras(silhouettes, rig)
+    found = usable_views(capture, rig, segmented, exchanged=settings.exchanged_pictures)
+    digests, capture, silhouettes = capture.digests, found.capture, found.silhouettes
     clock("alignment")
     model = basis(model, settings)
     front = front_camera(rig, settings)
@@ -162,10 +145,8 @@ def reconstruct(
     widths = {camera.name: camera.intrinsics.width for camera in rig}
     implausible = plausibility_warnings(fit, figures, widths)
     told = (
-        *own.warnings,
+        *found.warnings,
         *implausible,
-        *view_warnings(silhouettes),
-        *moved,
         *warnings,
         *eye_warnings(finer),
         *coloured.warnings,
@@ -192,7 +173,7 @@ def reconstruct(
         front=front,
         settings=settings,
         digests=digests,
-        pictures=own.pictures,
+        pictures=found.pictures,
         seconds=clock.seconds | {"total": time.perf_counter() - started},
         warnings=told,
         gains=coloured.gains,
@@ -227,20 +208,6 @@ def find_bust(
 
 def _of_stage(report: Report, stage: str, _: str, fraction: float) -> None:
     report(stage, fraction)
-
-
-def without_moved_cameras(
-    silhouettes: Mapping[str, Silhouette], rig: Rig
-) -> tuple[dict[str, Silhouette], list[ReportWarning]]:
-    """Views of cameras that no longer stand where they were calibrated take no part; each is named, and so are those
-    whose mask may be loose instead."""
-    kept, warnings = dict(silhouettes), []
-    for drift in find_drift(silhouettes, rig):
-        if drift.moved:
-            quality = replace(silhouettes[drift.camera].quality, usable=False)
-            kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
-        warnings.append(ReportWarning(drift.code, str(drift)))
-    return kept, warnings
 
 
 def basis(model: HeadModel, settings: Settings) -> HeadModel:
@@ -321,6 +288,8 @@ def fit_head(
     if detail.level == "span":
         wider = _basis(model, eigenheads, kernel=True)
         return with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, parts
+    if detail.level == "kernel":
+        relief_mm *= RELIEF_OF_OUTLINES
     return with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm), model, detail, parts
 
 
@@ -389,11 +358,3 @@ def eye_warnings(head: Displaced | None) -> list[ReportWarning]:
         return []
     which = "both eyes are" if len(head.closed_eyes) == 2 else f"the {min(head.closed_eyes)} eye is"
     return [ReportWarning("eyes-closed", f"{which} closed: no white and no iris in the photographs; lids were closed")]
-
-
-def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    found = []
-    for name, silhouette in silhouettes.items():
-        code = "view" if silhouette.quality.usable else "view-left-out"
-        found += [ReportWarning(code, f"{name}: {text}") for text in silhouette.quality.warnings]
-    return found

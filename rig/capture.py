@@ -19,13 +19,14 @@ Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
     """Images by camera name (RGB), clean plates, ready masks (True = subject), feature points (pixels) by landmark
-    and camera, and the sha256 of every file that it was read from."""
+    and camera, the sha256 of every file that it was read from, and what its reader noticed and did not mind."""
 
     images: Mapping[str, ImageRgb]
     backgrounds: Mapping[str, tuple[ImageRgb, ...]] = field(default_factory=dict)
     masks: Mapping[str, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
     features: Features = field(default_factory=dict)
     digests: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
 
 def refiled(
@@ -53,6 +54,7 @@ def refiled(
         given(capture.masks, pictures),
         {landmark: given(views, points) for landmark, views in capture.features.items()},
         _renamed(capture.digests, {"images": pictures, "masks": pictures, "background": plates}),
+        capture.remarks,
     )
 
 

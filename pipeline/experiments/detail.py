@@ -37,9 +37,10 @@ from pipeline.fitting.rim import find_rim, make_topology, pack_views
 from pipeline.imaging.cpu_raster import camera_depths, depth_maps
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.multiview.visual_hull import visual_hull
-from pipeline.reconstruct import Clock, align, basis, fit_head, front_camera, without_moved_cameras
+from pipeline.reconstruct import Clock, align, basis, fit_head, front_camera
 from pipeline.settings import Settings, document_from_settings
 from pipeline.silhouettes.segment import segment
+from pipeline.silhouettes.usable_views import without_moved_cameras
 from pipeline.texture.vertex_colours import texture
 from rig.camera import Camera
 from rig.capture import Capture

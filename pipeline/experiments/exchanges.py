@@ -4,7 +4,8 @@
 by what a calibration leaves. In each, the files of two cameras are exchanged, those of three moved round in a ring,
 and one camera's files copied over another's. They go through ``own_pictures`` as a job's do, with ready masks. An
 exchange is repaired where the fit ends within ``WORST_RATIO`` of the error of the same capture unexchanged; where every
-silhouette is the same again, so is the fit.
+silhouette is the same again, so is the fit. What was copied over is lost, and nothing can bring it back: beside the
+ratio stands whether the capture ended as the unexchanged one without that view (``lost_view_only``).
 
 ``false_alarms``: captures of the same kinds with nothing wrong, silhouettes alone; every code that is told is counted.
 """
@@ -62,6 +63,7 @@ def exchanges(
         for quantity in ("named", "repaired"):
             found[f"{kind}_{quantity}_share"] = float(np.mean([row[kind][quantity] for row in rows]))
         found[f"{kind}_worst_ratio"] = max(row[kind]["ratio"] for row in rows)
+    found["duplicate_lost_view_only_share"] = float(np.mean([row["duplicate"]["lost_view_only"] for row in rows]))
     found["good_called_exchanged"] = sum(bool(row["good_codes"]) for row in rows)
     return {"figures": found, "rows": rows}
 
@@ -108,12 +110,14 @@ def _exchanged_row(
         except ExchangedPictures as refusal:
             named = all(name in str(refusal) for name in filed)
             row[kind] = {"filed": filed, "named": named, "repaired": False, "ratio": 0.0, "told": [str(refusal)]}
+            row[kind]["lost_view_only"] = False
             continue
         same = all(_same(good.silhouettes[name], found.silhouettes[name]) for name in rig.names)
         ratio = 1.0 if same else _error_mm(model, subject, found.silhouettes, rig) / base_mm
         told = [warning.message for warning in found.warnings]
         named = _is_named(kind, filed, found)
         row[kind] = {"filed": filed, "named": named, "repaired": ratio <= WORST_RATIO, "ratio": ratio, "told": told}
+        row[kind]["lost_view_only"] = _only_lost(good.silhouettes, found.silhouettes, filed)
     return row
 
 
@@ -157,6 +161,11 @@ def _is_named(kind: str, filed: Mapping[str, str], found: OwnPictures) -> bool:
         texts = [warning.message for warning in found.warnings if warning.code == "picture-duplicated"]
         return len(texts) == 1 and texts[0].startswith(f"{lost} ")
     return dict(found.pictures) == {picture: holder for holder, picture in filed.items()}
+
+
+def _only_lost(good: Mapping[str, Silhouette], found: Mapping[str, Silhouette], filed: Mapping[str, str]) -> bool:
+    """Whether the camera whose picture is gone takes no part, and all others have their own silhouettes."""
+    return all(not found[name].quality.usable if name in filed else _same(good[name], found[name]) for name in good)
 
 
 def _same(one: Silhouette, two: Silhouette) -> bool:

@@ -5,7 +5,8 @@ Subjects are heads of the model's span in the studio, under hair that covers ear
 population there under any hair, and, where asked for, captures with a truth beside them. Each is reconstructed whole at
 every level, from the same silhouettes. Distances are from the true surface to the head as delivered, weighted by area;
 regions are the model's, carried to the truth by the nearest vertex. A place lies within its interval where that
-distance is below 1.96 times the deviation (``quality``) stated there; a landmark counts by its coordinates, a
+distance is below 1.96 times the deviation (``quality``) stated there. What hardly a direction from outside reaches,
+nostrils and the inside of the mouth, is nobody's skin and does not count. A landmark counts by its coordinates, a
 measurement by its length. Another population has its landmarks where its makers put them, millimetres along the surface
 from ours: that counts as error, as it does for whoever compares two programs.
 """
@@ -30,13 +31,17 @@ from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.records import Records, key_of
 from pipeline.experiments.span import weighted_quantile
 from pipeline.fitting import posterior, span_misfit
+from pipeline.fitting.photo import refine as photo_refine
+from pipeline.imaging.cpu_raster import camera_depths, depth_map
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.reconstruct import reconstruct
 from pipeline.results import measurements
 from pipeline.results.measurements import DISTANCES, Landmark, Measurement
 from pipeline.settings import OutputSettings, Settings
 from pipeline.silhouettes.segment import segment
+from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
+from rig.geometry import look_at
 from rig.mesh import Mesh, boundary_edges
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS
@@ -48,6 +53,13 @@ HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm d
 SEEN_MM, HIDDEN_MM = 2.0, 4.0  # from the visible points, 1.5 mm apart; what lies between is neither
 INTERVAL = 1.96  # standard deviations that hold 95 %
 FIRST_SEED = 4  # on the heads before it what intervals assume of unseen skin was measured
+OUTSIDE_MM, OUTSIDE_DIRECTIONS, OUTSIDE_PX = (
+    3000.0,
+    64,
+    320,
+)  # from how far, how many and how finely a head is looked at
+REACHED_MM = 1.5  # a surface in front of a place by less is its own
+DIRECTIONS_LEAST = 8  # skin under hair is seen from 16 and more, a nostril and the inside of a mouth from 6 at most
 LEAST_PLACES = 50  # of a region, for figures of its own
 LEVELS: tuple[Level, ...] = ("span", "kernel", "photo", "fine")
 POOLED = ("studio", "draws")  # every subject of which counts alike in the figures of ``all``
@@ -76,7 +88,9 @@ def hidden(
         subjects: heads of each population.
         folder: keeps rows, so that a stopped run goes on.
     """
-    key = key_of(model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, measurements)
+    key = key_of(
+        model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, photo_refine, measurements
+    )
     records = Records(folder, "hidden", key)
     seeds = range(FIRST_SEED, FIRST_SEED + subjects)
     drawn = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer, preset=HEAVY_HAIR)
@@ -182,8 +196,9 @@ def skin_figures(
     open_end = np.isin(corner, np.unique(boundary_edges(head_world.faces))).any(axis=1)
     points = known.visible.points[known.visible.part == PARTS.index("head")].astype(float)
     far, _ = KDTree(points).query(known.mesh.vertices)
+    hidden_skin = (far > HIDDEN_MM) & reached_from_outside(known.mesh)
     found: dict[str, float] = {}
-    for kind, shown in {"seen": far < SEEN_MM, "hidden": far > HIDDEN_MM}.items():
+    for kind, shown in {"seen": far < SEEN_MM, "hidden": hidden_skin}.items():
         for name, region in {"all": np.ones(len(deviation_mm), bool), **regions}.items():
             rows = np.flatnonzero(shown & region[nearest] & ~open_end)
             if len(rows) < LEAST_PLACES:
@@ -195,6 +210,26 @@ def skin_figures(
                 f"{kind}_{name}_stated_mm": weighted_quantile(stated[rows], area[rows], 0.5),
             }
     return found
+
+
+def reached_from_outside(mesh: Mesh) -> Bool[np.ndarray, " v"]:
+    """Which vertices are seen from several directions far away: nostrils and the inside of a mouth are none of them."""
+    centre = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+    radius = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    focal, middle = 0.5 * OUTSIDE_PX * OUTSIDE_MM / (1.05 * radius), 0.5 * (OUTSIDE_PX - 1)
+    lens = Intrinsics(OUTSIDE_PX, OUTSIDE_PX, focal, focal, middle, middle)
+    step = np.arange(OUTSIDE_DIRECTIONS) + 0.5  # a Fibonacci lattice
+    height, turn = 1.0 - 2.0 * step / OUTSIDE_DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * step
+    flat = np.sqrt(1.0 - height**2)
+    directions = np.zeros(len(mesh.vertices), int)
+    for direction in np.stack([flat * np.cos(turn), height, flat * np.sin(turn)], axis=1):
+        camera = Camera(
+            "outside", lens, look_at(centre + OUTSIDE_MM * direction, centre, np.eye(3)[np.abs(direction).argmin()])
+        )
+        depth, _ = depth_map(camera, mesh.vertices, mesh.faces)
+        column, row = np.rint(camera.project(mesh.vertices)).astype(int).T
+        directions += camera_depths(camera, mesh.vertices) < depth[row, column] + REACHED_MM
+    return directions >= DIRECTIONS_LEAST
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:

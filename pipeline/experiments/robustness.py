@@ -44,10 +44,10 @@ from pipeline.experiments.subjects import (
 from pipeline.fitting.contour import fit_contour
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.multiview import camera_drift as drift
-from pipeline.reconstruct import without_moved_cameras
 from pipeline.settings import FittingSettings, Settings
 from pipeline.silhouettes import view_consistency as agreement
 from pipeline.silhouettes.segment import segment
+from pipeline.silhouettes.usable_views import without_moved_cameras
 from rig.capture import Capture
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.render.renderer import Renderer

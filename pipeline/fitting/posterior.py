@@ -29,6 +29,7 @@ LEAST_DETERMINED = 5.0  # coefficients; of fewer the prior's scale is not estima
 VARIANCE_RANGE = (0.1, 4.0)
 KERNEL_VARIANCE_UNSEEN = 4.0  # hidden skin strays more than seen skin: no landmark holds it in its place
 KERNEL_MM = math.hypot(*(scale.amplitude_mm for scale in SCALES))
+RELIEF_OF_OUTLINES = 2.0  # times what photographs add to a head: outlines show no hollow, beside the nose or of an eye
 EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance ratio
 
 

@@ -1,4 +1,4 @@
-"""Commands that make and judge heads: reconstruct, verify, simulate, demo, experiments."""
+"""Commands that make and judge heads: check, reconstruct, verify, simulate, demo, experiments."""
 
 import shutil
 import sys
@@ -77,6 +77,25 @@ def reconstruct(
         warn(f"{warning['code']}: {warning['message']}")
     made = [out / name for name in ("head.ply", "bust.ply") if (out / name).is_file()]
     answer(written, json_out, [str(path) for path in made])
+
+
+@app.command(epilog="Example: eigenhead check shots/anna.tar.gz --json")
+def check(
+    capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
+    settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
+    json_out: Json = False,
+) -> None:
+    """Say what is wrong with a capture, without a fit.
+
+    Status 2 where it cannot be reconstructed; with warnings it can, and the status is 0."""
+    from server.cli.check import checked, lines
+    from server.cli.reconstruct_local import settings_document
+
+    with progress_bar() as report:
+        found = checked(capture, settings_document(settings), report=report)
+    answer(found, json_out, lines(found))
+    if found["faults"]:
+        raise typer.Exit(2)
 
 
 @app.command(epilog="Example: eigenhead verify shots/m1 shots/m2 shots/m3 --reference mannequin.ply --out acceptance")

@@ -10,9 +10,10 @@ from calibration.silhouette_refinement.report import RefinementRun
 from calibration.silhouette_refinement.rims import Heads
 from pipeline.eigenheads.model import load_model, with_modes
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.reconstruct import align, without_moved_cameras
+from pipeline.reconstruct import align
 from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
+from pipeline.silhouettes.usable_views import without_moved_cameras
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture

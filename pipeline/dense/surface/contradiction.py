@@ -15,7 +15,7 @@ from pipeline.compiled import njit
 from pipeline.dense.surface.view_stack import ViewStack
 from pipeline.dense.surface.vote_kernels import CENTRE, DEPTH, FRAME, OUTLINE, SIGMA, nearest_pixel, seen_at
 from pipeline.imaging.projection_kernels import LENS, NEAREST_MM
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import map_in_threads
 
 BLOCK = 4  # pixels along the side of what is decided at once
 STRIDE = 3  # every third pixel of every third row stands for the others
@@ -28,22 +28,23 @@ SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
 def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
     """The views without the outlines that others contradict, and by view the share of its crop that was."""
-    shares = np.zeros(len(views.cameras))
+
+    def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
+        height, width = views.sizes[v]
+        blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
+        _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
+        solid = np.bitwise_count(blocks) >= VIEWS_LEAST
+        own = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
+        return _beyond_windows(solid, own.reshape(height, width)) if solid.any() else None
+
+    wrong = map_in_threads(wrong_pixels, len(views.cameras))
+    shares = np.array([0.0 if mask is None else mask.mean() for mask in wrong])
+    if not shares.any():  # as usual: a hundred megabytes need no copy
+        return views, shares
     pixels = views.pixels.copy()
-
-    def one(first: int, last: int) -> None:
-        for v in range(first, last):
-            height, width = views.sizes[v]
-            blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
-            _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
-            solid = np.bitwise_count(blocks) >= VIEWS_LEAST
-            if solid.any():
-                own = pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
-                wrong = _beyond_windows(solid, own.reshape(height, width))
-                own[wrong.ravel()] = SILENT_PX
-                shares[v] = wrong.mean()
-
-    in_threads(len(views.cameras), one)
+    for start, mask in zip(views.starts, wrong, strict=True):
+        if mask is not None:
+            pixels[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX
     return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
 
 

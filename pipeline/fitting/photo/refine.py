@@ -136,12 +136,13 @@ def unfollowed(
     """How far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).
 
     Where several cameras see a place (vertex ``lost``) and find no match within reach, it is off by more than they can
-    tell: eyes that the model has open and the subject closed. Nothing is said beyond the patches.
+    tell: eyes that the model has open and the subject closed. That counts where it is, and not for the whole head.
+    Nothing is said beyond the patches.
     """
     off, _ = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)
     full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)
     square = np.concatenate([np.minimum(np.abs(off), LOST_MM), np.full(len(lost), LOST_MM)]) ** 2
-    square = MISFIT_LOCAL * square + (1.0 - MISFIT_LOCAL) * square.mean()
+    square = MISFIT_LOCAL * square + (1.0 - MISFIT_LOCAL) * square[: len(off)].mean()
     distance, near = KDTree(full[np.concatenate([seen.vertex, lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
     weight = np.exp(-0.5 * (distance / NEAR_MM) ** 2)
     return MISFIT_FACTOR * np.sqrt((weight * square[near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 0.1))

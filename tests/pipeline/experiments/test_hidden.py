@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.detail import Known
-from pipeline.experiments.hidden import as_markdown, figures, landmark_figures, skin_figures
+from pipeline.experiments.hidden import as_markdown, figures, landmark_figures, reached_from_outside, skin_figures
 from pipeline.results.measurements import Landmark, Measurement
 from rig.capture import Capture
 from rig.mesh import Mesh
@@ -40,6 +40,19 @@ def test_seen_and_hidden_skin_are_told_apart_by_region() -> None:
     assert said["seen_left_within_95"] > 0.95
     assert said["hidden_left_within_95"] < 0.05
     assert not any("none" in key for key in said)
+
+
+def test_a_cavity_is_nobodys_skin() -> None:
+    """A sphere within a sphere: nothing from outside reaches the inner one; alone it is seen all over."""
+    inner, outer = ellipsoid(3), ellipsoid(3)
+    both = Mesh(
+        np.concatenate([0.5 * inner.vertices, outer.vertices]),
+        np.concatenate([inner.faces, outer.faces + len(inner.vertices)]),
+    )
+    reached = reached_from_outside(both)
+    assert not reached[: len(inner.vertices)].any()
+    assert reached[len(inner.vertices) :].all()
+    assert reached_from_outside(inner).all()
 
 
 def test_landmarks_count_by_coordinate_and_measurements_by_length() -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 from rig.acquisition.commands import COLUMNS, NoCalibration, board_shots, capture, check, preview, take_plates
-from rig.acquisition.plates import read_plates, write_plates
+from rig.acquisition.plate_checks import PlatesRefused
+from rig.acquisition.plates import plates_versions, read_plates, write_plates
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import FAULTS, WARNINGS, ShotFailed, Timing, certify
 from rig.camera import Camera, Intrinsics
@@ -187,6 +189,22 @@ def test_somebody_in_the_plates_is_noticed(studio: StudioDevices, config: RigCon
     assert {(fault.code, fault.camera) for fault in faults} == {
         ("disturbed", "cam00"), ("missing", "cam01"), ("frozen", "cam02"),
     }  # fmt: skip
+
+
+def test_somebody_who_holds_still_does_not_replace_good_plates(
+    studio: StudioDevices, config: RigConfig, tmp_path: Path
+) -> None:
+    """They are kept as a version, for whoever knows that the studio itself changed."""
+    shutil.copytree(config.plates_folder, tmp_path / "plates")
+    own = dataclasses.replace(config, plates=str(tmp_path / "plates"))
+    before = {path: path.read_bytes() for path in own.plates_folder.rglob("*.*")}
+    studio.seat(True)
+    with pytest.raises(PlatesRefused, match="occupied") as refused:
+        take_plates(own)
+    assert {path: path.read_bytes() for path in own.plates_folder.rglob("*.*")} == before
+    newest = plates_versions(own.plates_folder)[0]
+    assert (newest.id, newest.in_use) == (refused.value.version, False)
+    assert newest.refused
 
 
 def test_plates_folder_of_a_capture_is_read(tmp_path: Path) -> None:

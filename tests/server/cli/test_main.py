@@ -13,7 +13,19 @@ import pytest
 from tests.support.services import ROOT, small_capture
 
 COMMANDS = [
-    *("serve", "worker", "reconstruct", "verify", "simulate", "demo", "prepare", "doctor", "board", "calibrate"),
+    *(
+        "serve",
+        "worker",
+        "check",
+        "reconstruct",
+        "verify",
+        "simulate",
+        "demo",
+        "prepare",
+        "doctor",
+        "board",
+        "calibrate",
+    ),
     *("keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
     *("model list", "model info", "model import", "model remove"),
 ]

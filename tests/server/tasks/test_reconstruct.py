@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from pipeline.eigenheads.model import load_model
-from pipeline.reconstruct import TooFewViews
+from pipeline.silhouettes.usable_views import TooFewViews
 from rig.formats.capture_folder import write_capture
 from rig.formats.mesh_file import read_mesh
 from rig.render.renderer import Renderer

@@ -1,0 +1,93 @@
+"""Which views of a capture take part, and what is said of the others: all that can be known before a fit.
+
+Enters: a capture, its rig, and a way to segment it. Leaves: every picture under its own camera, silhouettes of which
+those that may not be believed are marked, and the warnings that say why. ``reconstruct`` begins with it; ``eigenhead
+check`` asks nothing else.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.camera_drift import find_drift
+from pipeline.silhouettes.own_pictures import own_pictures
+from rig.capture import Capture
+from rig.errors import EigenheadError
+from rig.rig import Rig
+
+VIEWS_LEAST = 3
+
+
+class TooFewViews(EigenheadError):
+    """Not enough usable silhouettes."""
+
+    def __init__(self, silhouettes: Mapping[str, Silhouette]) -> None:
+        poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
+        told = "; ".join(f"{name}: {', '.join(reasons) or 'unusable'}" for name, reasons in poor.items())
+        super().__init__(
+            f"only {len(silhouettes) - len(poor)} of {len(silhouettes)} views have a usable silhouette, "
+            f"{VIEWS_LEAST} are needed ({told}). Take new clean plates with the same light, or supply masks/"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UsableViews:
+    """A capture with every picture under its own camera and its silhouettes; those that take no part are not usable.
+    ``pictures``: for each camera that was given another's picture, the name under which its own is filed."""
+
+    capture: Capture
+    silhouettes: Mapping[str, Silhouette]
+    pictures: Mapping[str, str]
+    warnings: tuple[ReportWarning, ...]
+
+
+def usable_views(
+    capture: Capture,
+    rig: Rig,
+    segmented: Callable[[Capture], dict[str, Silhouette]],
+    *,
+    exchanged: Literal["repair", "refuse"],
+) -> UsableViews:
+    """Segments a capture, files exchanged pictures back, and leaves out what contradicts the other views.
+
+    Args:
+        capture: as it was read.
+        rig: the cameras as calibrated.
+        segmented: the silhouettes of a capture.
+        exchanged: what to do about an exchange of pictures that is beyond doubt.
+
+    Raises:
+        ExchangedPictures, WrongRig: of ``own_pictures``.
+        TooFewViews: fewer than ``VIEWS_LEAST`` silhouettes are of use.
+    """
+    own = own_pictures(capture, rig, segmented, exchanged=exchanged)
+    if sum(silhouette.quality.usable for silhouette in own.silhouettes.values()) < VIEWS_LEAST:
+        raise TooFewViews(own.silhouettes)
+    silhouettes, moved = without_moved_cameras(own.silhouettes, rig)
+    remarks = [ReportWarning("unknown-key", remark) for remark in capture.remarks]
+    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *remarks)
+    return UsableViews(own.capture, silhouettes, own.pictures, warnings)
+
+
+def without_moved_cameras(
+    silhouettes: Mapping[str, Silhouette], rig: Rig
+) -> tuple[dict[str, Silhouette], list[ReportWarning]]:
+    """Views of cameras that no longer stand where they were calibrated take no part; each is named, and so are those
+    whose mask may be loose instead."""
+    kept, warnings = dict(silhouettes), []
+    for drift in find_drift(silhouettes, rig):
+        if drift.moved:
+            quality = replace(silhouettes[drift.camera].quality, usable=False)
+            kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
+        warnings.append(ReportWarning(drift.code, str(drift)))
+    return kept, warnings
+
+
+def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
+    found = []
+    for name, silhouette in silhouettes.items():
+        code = "view" if silhouette.quality.usable else "view-left-out"
+        found += [ReportWarning(code, f"{name}: {text}") for text in silhouette.quality.warnings]
+    return found

@@ -1,0 +1,69 @@
+"""Keys of ``cameras.json`` that nobody reads: a misspelt ``covarianse`` or a ``k4`` that the lens model has not is no
+fault, since files may carry what other programs put there, but who wrote it should know that it does nothing."""
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rig.recorded_lens import COEFFICIENTS
+
+READ = {
+    "": {"format", "unit", "cameras"},
+    "cameras": {"name", "width", "height", "intrinsics", "distortion", "camera_from_world", "covariance"},
+    "cameras.intrinsics": {"fx", "fy", "cx", "cy"},
+    "cameras.camera_from_world": {"rotation", "translation"},
+}
+LENS_MODELS: dict[str, set[str]] = {
+    "brown-conrady": {"model", "k1", "k2", "p1", "p2", "k3"},
+    **{model: {"model", *keys} for model, keys in COEFFICIENTS.items()},
+}
+TOLD_MOST = 8
+
+
+def unread_keys(path: Path) -> tuple[str, ...]:
+    """A sentence for every key of a rig file that is not read; nothing for the files of other programs, which have keys
+    of their own, and for a file that cannot be read at all, which its reader refuses."""
+    if path.suffix != ".json" or path.name == "transforms.json":
+        return ()
+    try:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
+        return ()
+    return unread_keys_of(document, path.name)
+
+
+def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[str, ...]:
+    """The same of a decoded file. What many cameras have alike is said once, with their number."""
+    counts = Counter(_unread(document))
+    told = []
+    for (place, key), times in list(counts.items())[:TOLD_MOST]:
+        where = f"{place}.{key!s:.40}" if place else f"{key!s:.40}"
+        whose = f" of {times} cameras" if times > 1 else ""
+        told.append(f"{subject}: the key {where}{whose} is not read: it is misspelt, or no key of this format")
+    if len(counts) > TOLD_MOST:
+        told.append(f"{subject}: {len(counts) - TOLD_MOST} more keys are not read")
+    return tuple(told)
+
+
+def _unread(document: Any) -> Iterator[tuple[str, str]]:
+    """Place and name of each key."""
+    if not isinstance(document, Mapping):
+        return
+    yield from _beside(document, "")
+    cameras = document.get("cameras")
+    for camera in cameras if isinstance(cameras, list) else []:
+        if isinstance(camera, Mapping):
+            yield from _beside(camera, "cameras")
+            yield from _beside(camera.get("intrinsics"), "cameras.intrinsics")
+            yield from _beside(camera.get("camera_from_world"), "cameras.camera_from_world")
+            lens = camera.get("distortion")
+            if isinstance(lens, Mapping):
+                known = LENS_MODELS.get(str(lens.get("model", "brown-conrady")), set(lens))  # others are refused
+                yield from (("cameras.distortion", key) for key in lens if key not in known)
+
+
+def _beside(entry: Any, place: str) -> Iterator[tuple[str, str]]:
+    if isinstance(entry, Mapping):
+        yield from ((place, key) for key in entry if key not in READ[place])

@@ -1,0 +1,60 @@
+"""Keys of cameras.json that nobody reads are named, once, and stop nothing."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rig.formats.cameras_json import document_from_rig, read_rig
+from rig.formats.capture_folder import read_capture
+from rig.formats.unread_keys import unread_keys, unread_keys_of
+from rig.studio.scene.layout import default_layout
+from tests.support.services import small_capture
+
+
+def test_what_this_program_writes_is_read_whole() -> None:
+    assert unread_keys_of(document_from_rig(default_layout())) == ()
+
+
+@pytest.mark.parametrize(
+    ("place", "key"),
+    [((), "units"), (("cameras",), "covarianse"), (("cameras", "intrinsics"), "skew"),
+     (("cameras", "distortion"), "k4"), (("cameras", "camera_from_world"), "scale")],
+)  # fmt: skip
+def test_a_key_that_is_not_read_is_named_with_its_place(place: tuple[str, ...], key: str) -> None:
+    document = json.loads(json.dumps(document_from_rig(default_layout())))
+    entry = document
+    for part in place:
+        entry = entry[part][3] if part == "cameras" else entry[part]
+    entry[key] = 1.0
+    (told,) = unread_keys_of(document)
+    assert f"the key {'.'.join((*place, key))} is not read" in told
+
+
+def test_what_all_cameras_have_alike_is_said_once() -> None:
+    document = json.loads(json.dumps(document_from_rig(default_layout())))
+    for camera in document["cameras"]:
+        camera["serial"] = "x"
+    (told,) = unread_keys_of(document)
+    assert f"cameras.serial of {len(document['cameras'])} cameras" in told
+
+
+def test_a_thousand_keys_are_a_few_lines() -> None:
+    assert len(unread_keys_of({f"key{i}": 0 for i in range(1000)})) == 9
+
+
+def test_a_capture_with_such_a_key_is_read_and_says_so(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    path = folder / "cameras.json"
+    document = json.loads(path.read_text())
+    document["cameras"][0]["covarianse"] = [[0.0]]
+    path.write_text(json.dumps(document))
+    assert len(read_rig(path)) == 3
+    capture, _ = read_capture(folder)
+    assert [remark for remark in capture.remarks if "cameras.covarianse is not read" in remark]
+
+
+def test_files_of_other_programs_and_damaged_ones_are_not_judged(tmp_path: Path) -> None:
+    (tmp_path / "camera_array.toml").write_text("[cam]\nport = 1\n")
+    (tmp_path / "cameras.json").write_text("{")
+    assert unread_keys(tmp_path / "camera_array.toml") == unread_keys(tmp_path / "cameras.json") == ()

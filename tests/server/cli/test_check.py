@@ -1,0 +1,87 @@
+"""`eigenhead check`: every fault of a capture at once, and what outlines say, without a fit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.eigenheads.model import load_model
+from rig.capture import Capture, refiled
+from rig.formats.archive import pack_folder
+from rig.formats.capture_folder import write_capture
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from server.cli.check import Checked, checked, lines
+from tests.server.cli.test_main import run
+from tests.server.http.test_hostile import SPOILT
+from tests.support.services import small_capture
+from tests.support.silhouette_subjects import dressed_head
+
+
+def found_in(capture: Path, **settings: object) -> Checked:
+    return checked(capture, settings, report=lambda stage, share: None)
+
+
+@pytest.fixture(scope="module")
+def masked(renderer: Renderer) -> tuple[Capture, Rig]:
+    """A bare head's masks at half size, and pictures that differ: noise."""
+    rig, rng = default_layout().scaled(0.5), np.random.default_rng(2)
+    vertices, faces, pose = dressed_head(load_model(), rig, rng, 60, bare=True)
+    with renderer.silhouette_set(rig, faces) as drawn:
+        masks = {name: mask > 0 for name, mask in drawn.masks(pose.apply(vertices)).items()}
+    pictures = {name: rng.integers(0, 256, (*mask.shape, 3), dtype=np.uint8) for name, mask in masks.items()}
+    return Capture(pictures, {}, masks), rig
+
+
+def test_every_fault_is_told_at_once_and_is_status_2(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    for case in ("every camera at one place", "an image without a camera", "features of a third eye"):
+        SPOILT[case][0](folder)
+    (folder / "images" / "cam01.png").unlink()
+    pack_folder(folder, tmp_path / "capture.tar")
+    for capture in (folder, tmp_path / "capture.tar"):
+        done = run("check", str(capture), "--json")
+        assert (done.returncode, done.stderr) == (2, "")
+        told = json.loads(done.stdout)
+        for word in ("at one place", "images/foo.png has no camera", "'third_eye'", "images/cam01.png is missing"):
+            assert [fault for fault in told["faults"] if word in fault]
+    done = run("check", str(folder))
+    assert done.returncode == 2
+    assert "cannot be reconstructed" in done.stdout.splitlines()[0]
+
+
+@pytest.mark.gl
+def test_a_good_capture_is_nothing_to_speak_of(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
+    write_capture(tmp_path / "good", *masked)
+    done = run("check", str(tmp_path / "good"), "--json")
+    assert done.returncode == 0
+    told = json.loads(done.stdout)
+    assert (told["faults"], told["warnings"]) == ([], [])
+    assert told["cameras"] == list(masked[1].names)
+
+
+@pytest.mark.gl
+def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(
+    masked: tuple[Capture, Rig], tmp_path: Path
+) -> None:
+    capture, rig = masked
+    write_capture(tmp_path / "shot", refiled(capture, pictures={"cam02": "cam07", "cam07": "cam02"}), rig)
+    found = found_in(tmp_path / "shot")
+    assert not found["faults"]
+    assert [w for w in found["warnings"] if w["code"] == "cameras-exchanged" and "cam02 and cam07" in w["message"]]
+    refused = found_in(tmp_path / "shot", exchanged_pictures="refuse")
+    assert [fault for fault in refused["faults"] if "cam02 and cam07" in fault]
+
+
+@pytest.mark.gl
+def test_a_key_that_nobody_reads_is_a_warning(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
+    write_capture(tmp_path / "shot", *masked)
+    path = tmp_path / "shot" / "cameras.json"
+    document = json.loads(path.read_text())
+    document["units"] = "m"
+    path.write_text(json.dumps(document))
+    found = found_in(tmp_path / "shot")
+    assert [warning["code"] for warning in found["warnings"]] == ["unknown-key"]
+    assert "warning  unknown-key: cameras.json: the key units is not read" in "\n".join(lines(found))
