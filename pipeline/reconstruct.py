@@ -14,6 +14,7 @@ from pipeline.dense.estimate import estimate_depth
 from pipeline.dense.part_votes import PartVotes, vote_parts
 from pipeline.dense.parts import HAIR, PartMap, classify_parts
 from pipeline.dense.surface.signed_distance import NoSurface
+from pipeline.dense.surface.skin import part_of
 from pipeline.dense.window_bias import WindowBias
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.gaussian_process import with_kernel
@@ -130,7 +131,8 @@ def reconstruct(
     coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture)
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
-        bust, bust_warnings = find_bust(maps, votes, bias, capture, silhouettes, rig, mesh, settings, clock)
+        skin = None if finer is None else part_of(mesh, finer.observed)
+        bust, bust_warnings = find_bust(maps, votes, bias, capture, silhouettes, rig, mesh, skin, settings, clock)
     atlas = None
     if settings.outputs.atlas:
         clock("atlas")
@@ -178,6 +180,7 @@ def reconstruct(
         detail=detail,
         atlas=atlas,
         bust=bust,
+        parts=parts,
     )
 
 
@@ -189,13 +192,15 @@ def find_bust(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     head_world: Mesh,
+    head_skin_world: Mesh | None,
     settings: Settings,
     clock: Clock,
 ) -> tuple[Bust | None, list[ReportWarning]]:
     """All that the cameras see, as one closed surface; a warning where the photographs do not tell it."""
     clock("bust")
     try:
-        bust = make_bust(maps, capture, silhouettes, rig, head_world, votes, bias, settings, report=clock.report)
+        given = (maps, capture, silhouettes, rig, head_world, votes, bias, settings)
+        bust = make_bust(*given, head_skin_world=head_skin_world, report=clock.report)
     except NoSurface as reason:
         return None, [ReportWarning("no-bust", str(reason))]
     return bust, list(bust.surface.warnings)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.geometry import RigidTransform
+from rig.recorded_lens import RecordedLens
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +93,16 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A calibrated camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm), of a left perturbation."""
+    """A calibrated camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm), of a left perturbation.
+
+    ``recorded``: the lens of its picture files where ``intrinsics`` is the pinhole that they are undistorted to.
+    """
 
     name: str
     intrinsics: Intrinsics
     camera_from_world: RigidTransform
     covariance: Float[np.ndarray, "6 6"] | None = None
+    recorded: RecordedLens | None = None
 
     @property
     def centre_world(self) -> Float[np.ndarray, " 3"]:

@@ -41,6 +41,7 @@ def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """Directed edges that only one face has: the open rim of the mesh."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    keys = np.sort(edges, axis=1)
-    _, first, count = np.unique(keys, axis=0, return_index=True, return_counts=True)
+    low, high = edges.min(axis=1).astype(np.int64), edges.max(axis=1)
+    # One number for both ends: whole rows sort thirty times as long.
+    _, first, count = np.unique((low << 32) | high, return_index=True, return_counts=True)
     return edges[first[count == 1]]

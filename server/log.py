@@ -6,14 +6,40 @@ traceback of it is left out.
 
 import logging
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 import structlog
+from structlog.typing import EventDict
 
 from rig.errors import EigenheadError
 
+NOT_FOR_CALLERS = ("timestamp", "level", "event", "job", "trace", "exc_info")
 
-def set_up(as_json: bool, level: str = "info") -> None:
-    """Configures this process's logging."""
+
+def log_file(jobs: Path, job_id: str) -> Path:
+    """Where the lines of a job are kept, beside its result."""
+    return jobs / job_id / "log.txt"
+
+
+class JobLog:
+    """A processor that also writes the lines of a job to its own file, for whoever may read the job. Without traces,
+    which tell of the service's inside; a job whose folder is gone has no log."""
+
+    def __init__(self, jobs: Path) -> None:
+        self._jobs = jobs
+
+    def __call__(self, logger: object, method: str, event: EventDict) -> EventDict:
+        if "job" in event and log_file(self._jobs, str(event["job"])).parent.is_dir():
+            told = {key: value for key, value in event.items() if key not in NOT_FOR_CALLERS}
+            words = " ".join(f"{key}={value}" for key, value in told.items())
+            with suppress(OSError), log_file(self._jobs, str(event["job"])).open("a", encoding="utf-8") as stream:
+                stream.write(" ".join(filter(None, [event["timestamp"], event["level"], event["event"], words])) + "\n")
+        return event
+
+
+def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None:
+    """Configures this process's logging. ``jobs``: the folder of jobs, of which each gets its lines in a file too."""
     shared = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
@@ -23,7 +49,7 @@ def set_up(as_json: bool, level: str = "info") -> None:
         structlog.processors.JSONRenderer() if as_json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())
     )
     structlog.configure(
-        processors=[*shared, structlog.processors.format_exc_info, renderer],
+        processors=[*shared, *([] if jobs is None else [JobLog(jobs)]), structlog.processors.format_exc_info, renderer],
         wrapper_class=structlog.make_filtering_bound_logger(level),
         logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),  # the one of this moment: it may be replaced
         cache_logger_on_first_use=False,

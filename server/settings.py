@@ -1,6 +1,7 @@
 """Settings of the service: from the command line, from EIGENHEAD_* variables, or these defaults."""
 
 import json
+import re
 from pathlib import Path
 
 from pydantic import Field, field_validator
@@ -10,6 +11,7 @@ from pipeline.eigenheads.data_folder import data_folder
 from server.address import is_loopback
 
 PREFIX = "EIGENHEAD_"
+ORIGIN = re.compile(r"^https?://[^/?#\s@]+$")
 RECONSTRUCT = ".tasks.reconstruct:reconstruct_capture"
 MOVED: dict[str, str] = {"server.work:reconstruct_capture": RECONSTRUCT}
 
@@ -30,6 +32,13 @@ class ServiceSettings(BaseSettings):
     )
     cors_origins: tuple[str, ...] = Field(
         default=(), description="other web pages that may call the API with a key, such as https://lab.example"
+    )
+    import_origins: tuple[str, ...] = Field(
+        default=(), description="where callers may import captures from, such as https://store.example; https://*: any"
+    )
+    import_s: float = Field(default=600.0, gt=0, description="the longest that fetching an archive may take")
+    webhook_origins: tuple[str, ...] = Field(
+        default=(), description="where a job may name a webhook of its own; https://*: any public one"
     )
     rig: Path | None = Field(default=None, description="rig.toml; without it the simulated studio")
 
@@ -72,6 +81,7 @@ class ServiceSettings(BaseSettings):
     cache_bytes: int = Field(default=4 << 30, ge=0, description="the most that silhouettes and thumbnails take up")
     sweep_s: float = Field(default=60.0, gt=0)
 
+    ask_consent: bool = Field(default=False, description="captures need a session with a note of the subject's consent")
     console: bool = Field(default=True, description="serve the operator's pages; they add 1.5 s to the start")
     log_json: bool = Field(default=False, description="log lines as JSON")
 
@@ -80,6 +90,14 @@ class ServiceSettings(BaseSettings):
     def _present_place(cls, address: str) -> str:
         """Where what a variable of an older version names lies now."""
         return MOVED.get(address, address)
+
+    @field_validator("import_origins", "webhook_origins")
+    @classmethod
+    def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        for origin in origins:
+            if not ORIGIN.match(origin):
+                raise ValueError(f"{origin!r} is no origin; give scheme://host or scheme://host:port, no path")
+        return origins
 
     @property
     def public_host(self) -> str | None:

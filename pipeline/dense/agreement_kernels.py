@@ -6,6 +6,8 @@ from pipeline.compiled import njit
 from pipeline.dense.matching_kernels import HEIGHT, START, WIDTH
 from pipeline.imaging.projection_kernels import NEAREST_MM, placed
 
+FAR_TOLERANCES = 20.0  # along a ray: at the steepest slope the planes are then six tolerances apart
+
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreeing, before, apart):
@@ -19,6 +21,7 @@ def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreei
     ``Stack.ways`` has them, ``lenses`` fx and fy of the others, ``limits`` ``tolerance_mm`` and ``deviations``.
     """
     tolerance_mm, deviations = limits
+    far_mm = FAR_TOLERANCES * tolerance_mm
     height, width = agreeing.shape
     for row in range(height):
         for column in range(width):
@@ -41,6 +44,11 @@ def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreei
                 i, j = int(x + 0.5), int(y + 0.5)
                 q = int(way[START]) + j * int(way[WIDTH]) + i
                 if depth[q] <= 0.0:
+                    continue
+                if there > depth[q] + far_mm:
+                    continue
+                if there < depth[q] - far_mm:
+                    before[row, column] += 1
                     continue
                 z_x, z_y = slopes[q, 0], slopes[q, 1]
                 off = there - (depth[q] + (x - i) * z_x + (y - j) * z_y)

@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
+from pipeline.dense.crop_kernels import fill_lens_map
 from pipeline.imaging.grey import LUMINANCE, noise_level
+from pipeline.imaging.projection import packed_lens
 from pipeline.imaging.silhouette import Silhouette
-from rig.camera import Camera, Intrinsics, lens_image
+from rig.camera import Camera, Intrinsics
 from rig.rig import Rig
 
 LEVELS = 4  # full, half, quarter, eighth
@@ -125,12 +127,9 @@ def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
 
 def lens_map(camera: Camera, pinhole: Camera) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Column and row at which the camera's photograph shows each pixel of a pinhole at the same pose."""
-    k, lens = pinhole.intrinsics, camera.intrinsics
-    column, row = np.meshgrid(np.arange(float(k.width)), np.arange(float(k.height)))
-    normalised = pinhole.undistort(np.stack([column.ravel(), row.ravel()], axis=1))
-    pixel = lens_image(np.pad(normalised, ((0, 0), (0, 1)), constant_values=1.0), lens.values())
-    pixel[np.linalg.norm(normalised, axis=1) > lens.distortion.turning_radius()] = -1e4
-    x, y = pixel.T.astype(np.float32).reshape(2, k.height, k.width)
+    k = pinhole.intrinsics
+    x, y = np.empty((k.height, k.width), np.float32), np.empty((k.height, k.width), np.float32)
+    fill_lens_map(k.values()[:4], packed_lens(camera), x, y)
     return x, y
 
 

@@ -34,8 +34,6 @@ def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
     """The known pixels as points of the world frame, mm, row by row."""
     camera = depth_map.camera
     row, column = np.nonzero(depth_map.known)
-    z = depth_map.depth_mm[row, column].astype(float)
-    rays = np.pad(
-        camera.undistort(np.stack([column, row], axis=1).astype(float)), ((0, 0), (0, 1)), constant_values=1.0
-    )
-    return camera.camera_from_world.inverse().apply(rays * z[:, None])
+    z, k = depth_map.depth_mm[row, column].astype(float), camera.intrinsics
+    points = np.stack([(column - k.cx) / k.fx * z, (row - k.cy) / k.fy * z, z], axis=1)
+    return camera.camera_from_world.inverse().apply(points)

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap, points_world
 from pipeline.dense.parts import PartMap
+from pipeline.imaging.projection import project_points
 from rig.rig import Rig
 
 UNSEEN, SKIN, HAIR, CLOTHES = 0, 1, 2, 3
@@ -51,18 +52,20 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
     corner = points.min(axis=0)
     cell = np.floor((points - corner) / CELL_MM).astype(np.int64)
     size = cell.max(axis=0) + 1
-    keys, group = np.unique(_keys(cell, size), return_inverse=True)
-    count = np.bincount(group)[:, None]
+    group = _keys(cell, size)
+    count = np.bincount(group)  # a body has a few million such cells: counted sooner than sorted
+    keys = np.flatnonzero(count)
+    count = count[keys, None]
 
     def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
-        return np.stack([np.bincount(group, values[:, k]) for k in range(3)], axis=1) / count
+        return np.stack([np.bincount(group, values[:, k])[keys] for k in range(3)], axis=1) / count
 
     return PartVotes(corner, size, keys, mean(points), mean(shown))
 
 
 def _shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
     height, width = part.probability.shape[:2]
-    column, row = np.rint(np.nan_to_num(rig[part.camera].project(points), nan=-1.0)).astype(int).T
+    column, row = np.rint(np.nan_to_num(project_points(rig[part.camera], points), nan=-1.0)).astype(int).T
     framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return part.probability[np.where(framed, row, 0), np.where(framed, column, 0)] * framed[:, None]
 

@@ -18,9 +18,10 @@ BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken f
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def propagate(sight, parity, steps, depth, slopes, cost):
+def propagate(sight, parity, steps, same_mm, depth, slopes, cost):
     """Every pixel of one colour of the chequerboard tries the planes of its neighbours of the other colour, ``steps``
-    pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known."""
+    pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known. Planes that differ by
+    less than ``same_mm``, in depth and a pixel beside it, are the same."""
     height, width = depth.shape
     ways, window = sight.ways, np.empty((2, sight.pattern.shape[1]), np.float32)
     scores, place = np.empty(len(ways)), np.empty(8)
@@ -46,7 +47,7 @@ def propagate(sight, parity, steps, depth, slopes, cost):
                         continue
                     z_x, z_y = slopes[row + j, column + i, 0], slopes[row + j, column + i, 1]
                     z = there - i * z_x - j * z_y
-                    if abs(z - best_z) < 1e-4 * best_z and abs(z_x - best_x) + abs(z_y - best_y) < 0.1:
+                    if abs(z - best_z) < same_mm and abs(z_x - best_x) + abs(z_y - best_y) < same_mm:
                         continue
                     value = cost_of(sight, loaded, z, z_x, z_y, reach, place, scores)
                     if value < best:

@@ -21,6 +21,7 @@ from pipeline.settings import DenseSettings
 STEEPEST = 3.0  # slope against the image plane: 72 degrees
 RADIUS_PX = 2  # of the neighbourhood that a plane is laid through
 LEAST_INFORMATION = 1e-4  # 1 / mm^2: a standard deviation of 100 mm
+SAME_PX = 0.1  # planes that differ by less are one: a slide takes either to its place
 MOST_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
@@ -70,13 +71,12 @@ def _refined(
     rounds: int,
 ) -> Field:
     sight = stack.sight(view, neighbours, pattern, settings.contrast_levels)
-    depth, slopes = field.depth.copy(), field.slopes.copy()
+    depth, slopes, live = field.depth.copy(), field.slopes.copy(), field.depth > 0.0
+    pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
     if steps_px:
         cost = np.full(depth.shape, -1.0, np.float32)
         for parity in (0, 1):
-            propagate(sight, parity, np.array(steps_px), depth, slopes, cost)
-    live = depth > 0.0
-    pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
+            propagate(sight, parity, np.array(steps_px), SAME_PX * pixel_mm, depth, slopes, cost)
     before, known = depth, field.information + LEAST_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
     for _ in range(rounds):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Int, Int32
 
 from pipeline.dense.field import Field
 from pipeline.dense.room import Room
@@ -32,23 +32,33 @@ def first_fields(
     """
 
     def work(view: int) -> Field:
-        cost = np.empty((*rooms[view].near.shape, settings.labels), np.float32)
+        room = rooms[view]
+        cost, strides = np.empty((*room.near.shape, settings.labels), np.float32), label_strides(room, settings)
         sight = stack.sight(view, neighbours[view], pattern, settings.contrast_levels)
-        sweep_view(sight, rooms[view].near, rooms[view].far, rooms[view].slopes, cost)
-        return _cheapest(cost, rooms[view])
+        sweep_view(sight, room.near, room.far, room.slopes, strides, cost)
+        return _cheapest(cost, room, strides)
 
     return map_in_threads(work, len(stack))
 
 
-def _cheapest(cost: Float32[np.ndarray, "h w d"], room: Room) -> Field:
-    """The label of the cheapest paths, and within it the least of the pixel's own costs: paths are no likeness."""
+def label_strides(room: Room, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
+    """One in how many labels is matched: 1, 2, 4 ..., so that places lie no farther apart than in the deepest room."""
+    depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
+    return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
+
+
+def _cheapest(cost: Float32[np.ndarray, "h w d"], room: Room, strides: Int32[np.ndarray, "h w"]) -> Field:
+    """The label of the cheapest paths, and within a stride the least of its own costs: paths are no likeness."""
     paths = np.empty_like(cost)
     aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)
     labels = cost.shape[2]
-    best = np.clip(paths.argmin(axis=2), 1, labels - 2)
-    before, at, after = (np.take_along_axis(cost, best[:, :, None] + j, axis=2)[:, :, 0] for j in (-1, 0, 1))
+    best = (paths.argmin(axis=2) + strides // 2) // strides * strides  # a label that was matched
+    best = np.clip(best, strides, labels - 1 - strides)
+    before, at, after = (
+        np.take_along_axis(cost, (best + j * strides)[:, :, None], axis=2)[:, :, 0] for j in (-1, 0, 1)
+    )
     within = np.clip(0.5 * (before - after) / np.maximum(before + after - 2.0 * at, 1e-6), -0.5, 0.5)
-    share = (best + within) / (labels - 1)
+    share = (best + strides * within) / (labels - 1)
     depth = np.where(room.far > 0.0, room.near + share * (room.far - room.near), 0.0).astype(np.float32)
     slopes = room.slopes[:, :, :2] + share[:, :, None] * (room.slopes[:, :, 2:] - room.slopes[:, :, :2])
     zero = np.zeros_like(depth)

@@ -43,10 +43,11 @@ def cost_of(sight, loaded, z, z_x, z_y, reach, place, scores):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def sweep_view(sight, near, far, slopes, cost):
+def sweep_view(sight, near, far, slopes, strides, cost):
     """Fills ``cost`` (h, w, labels): 1 minus the likeness at ``near + share (far - near)``, mm.
 
-    ``slopes`` (h, w, 4): of near by x and y, of far by x and y, mm a pixel.
+    ``slopes`` (h, w, 4): of near by x and y, of far by x and y, mm a pixel. ``strides`` (h, w): one in so many labels
+    is matched, and the last; costs run linearly between.
     """
     height, width, labels = cost.shape
     window = np.empty((2, sight.pattern.shape[1]), np.float32)
@@ -59,12 +60,20 @@ def sweep_view(sight, near, far, slopes, cost):
                 continue
             total, energy = load_window(sight, width, height, column, row, window)
             loaded = Loaded(column, row, window, total, energy)
-            for d in range(labels):
+            d, before = 0, 0
+            while True:
                 share = d / (labels - 1.0)
                 z = near[row, column] + share * (far[row, column] - near[row, column])
                 z_x = slopes[row, column, 0] + share * (slopes[row, column, 2] - slopes[row, column, 0])
                 z_y = slopes[row, column, 1] + share * (slopes[row, column, 3] - slopes[row, column, 1])
-                cost[row, column, d] = cost_of(sight, loaded, z, z_x, z_y, reach, place, scores)
+                value = cost_of(sight, loaded, z, z_x, z_y, reach, place, scores)
+                for between in range(before + 1, d):
+                    there = (between - before) / (d - before)
+                    cost[row, column, between] = (1.0 - there) * cost[row, column, before] + there * value
+                cost[row, column, d] = value
+                if d == labels - 1:
+                    break
+                d, before = min(d + strides[row, column], labels - 1), d
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)

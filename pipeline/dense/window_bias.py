@@ -27,11 +27,17 @@ class WindowBias:
     share: float = 0.0
 
 
-def windowed_height(vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
+def windowed_height(
+    vertices: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    wanted: Bool[np.ndarray, " v"] | None = None,
+) -> Float[np.ndarray, " v"]:
     """How far (mm, along the normal) the mean of the surface over a window lies above each vertex; sheets that face
-    another way do not count."""
+    another way do not count. 0 where nobody asks: only the ``wanted`` ones are found (all of them, if None)."""
     height_mm, cells = np.zeros(len(vertices)), sorted_into_cells(vertices, REACH_MM)
-    given = (np.ascontiguousarray(vertices), np.ascontiguousarray(normals), *cells, WINDOW_MM, REACH_MM, height_mm)
+    chosen = np.ones(len(vertices), bool) if wanted is None else wanted
+    surface = (np.ascontiguousarray(vertices), np.ascontiguousarray(normals), chosen)
+    given = (*surface, *cells, WINDOW_MM, REACH_MM, height_mm)
     in_threads(len(vertices), lambda first, last: windowed_heights(*given, first, last))
     return height_mm
 
@@ -41,5 +47,5 @@ def without_bias(mesh_world: Mesh, measured: Bool[np.ndarray, " v"], bias: Windo
     if bias == WindowBias():
         return mesh_world
     vertices, normals = mesh_world.vertices, mesh_world.normals()
-    off_mm = bias.common_mm + bias.share * windowed_height(vertices, normals)
+    off_mm = bias.common_mm + bias.share * windowed_height(vertices, normals, measured)
     return Mesh(vertices - np.where(measured, off_mm, 0.0)[:, None] * normals, mesh_world.faces)

@@ -3,12 +3,14 @@
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.dense.cell_kernels import COLUMNS, columns_about
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def windowed_heights(
     vertices: np.ndarray,
     normals: np.ndarray,
+    wanted: np.ndarray,
     order: np.ndarray,
     keys: np.ndarray,
     spans: np.ndarray,
@@ -18,26 +20,25 @@ def windowed_heights(
     first: int,
     last: int,
 ) -> None:
-    """Fills ``height_mm``: how far along its normal the mean of the vertices about each one lies above it.
+    """Fills ``height_mm`` of the ``wanted`` vertices: how far along its normal the mean of those about each lies above.
 
     Weights are a Gaussian of ``window_mm`` that ends at ``reach_mm``, times the cosine between the normals where that
     is positive. ``order``, ``keys`` and ``spans`` as ``cells.Cells`` has them, cells as wide as the reach; ``first``
     and ``last`` count in that order.
     """
-    ranges, cell = np.empty((9, 2), np.int64), -1
+    ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
     falloff, most = -0.5 / (window_mm * window_mm), reach_mm * reach_mm
     for position in range(first, last):
+        own = order[position]
+        if not wanted[own]:
+            continue
         if keys[position] != cell:
             cell = keys[position]
-            for column in range(9):
-                low = cell + ((column // 3 - 1) * spans[1] + column % 3 - 1) * spans[2] - 1
-                ranges[column, 0] = np.searchsorted(keys, low)
-                ranges[column, 1] = np.searchsorted(keys, low + 3)
-        own = order[position]
+            columns_about(cell, keys, spans, ranges)
         x, y, z = vertices[own]
         n_x, n_y, n_z = normals[own]
         total, weighted = 0.0, 0.0
-        for column in range(9):
+        for column in range(COLUMNS):
             for at in range(ranges[column, 0], ranges[column, 1]):
                 other = order[at]
                 d_x, d_y, d_z = vertices[other, 0] - x, vertices[other, 1] - y, vertices[other, 2] - z

@@ -23,6 +23,7 @@ from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.posterior_check import posterior_check
 from pipeline.experiments.repeat import repeat
 from pipeline.experiments.robustness import robustness
+from pipeline.experiments.surfaces import surfaces
 from pipeline.experiments.views import views
 from pipeline.experiments.visible import visible
 from rig.atomic_write import write_atomically
@@ -58,6 +59,7 @@ class Task:
     report: Report
     simplex: int | None = None
     captures: bool = False
+    openmvs: Path | None = None
 
 
 def run_experiment(
@@ -70,16 +72,17 @@ def run_experiment(
     report: Report,
     simplex: int | None = None,
     captures: bool = False,
+    openmvs: Path | None = None,
 ) -> Outcome:
     """Figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a table and
     pictures are left there. ``simplex``: how many subjects of a table the simplex fits too;
-    ``captures``: whether those of ``shared`` count beside the studio's heads.
+    ``captures``: whether those of ``shared`` count beside the studio's heads; ``openmvs``: that peer's programs.
 
     ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
     """
     if name not in EXPERIMENTS:
         raise UnknownExperiment(name)
-    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, simplex, captures))
+    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, simplex, captures, openmvs))
     pictures = found.pop("pictures", {})
     text = found.pop("markdown", None) or markdown.of_figures(found["figures"])
     if folder is not None:
@@ -166,6 +169,14 @@ def _visible(task: Task) -> Outcome:
         return visible(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
 
 
+def _surfaces(task: Task) -> Outcome:
+    found = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
+    with Renderer.create() as renderer:
+        return surfaces(
+            task.head, found, renderer=renderer, report=task.report, openmvs=task.openmvs, folder=task.folder
+        )
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
@@ -192,6 +203,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "detail": _detail,
     "hidden": _hidden,
     "visible": _visible,
+    "surfaces": _surfaces,
 }
 
 

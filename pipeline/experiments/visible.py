@@ -1,5 +1,6 @@
 """All that the cameras see: studio heads under all the hair that the studio has, and captures with a truth beside them,
-by part: recall, precision, what head.ply and bust.ply differ by, seconds; and each in clay beside the truth.
+by part: recall, precision, errors of the face and of the head's regions, what head.ply and bust.ply differ by, seconds;
+and each in clay beside the truth.
 
 ``precision`` is of the whole closed surface, within 25 mm of what is seen. Its own guess at what nobody sees begins
 there, too, so that no closed surface reaches 1; ``precision_seen`` is of what the file itself calls seen.
@@ -12,16 +13,20 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
 from pipeline.dense.part_votes import SKIN
 from pipeline.dense.surface.fusion import BustSurface
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
-from pipeline.experiments.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
+from pipeline.eigenheads.regions import head_regions
+from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.experiments.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known, surface_error
 from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.pictures import labelled
 from pipeline.experiments.records import Records, key_of
+from pipeline.experiments.span import weighted_quantile
 from pipeline.experiments.visible_surface import score_visible
 from pipeline.reconstruct import reconstruct
 from pipeline.results.clay import clay
@@ -30,7 +35,7 @@ from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
-from rig.studio.scene.visible import VisiblePoints
+from rig.studio.scene.visible import PARTS, VisiblePoints
 from rig.studio.sensor.preset import PRESET
 
 Report = Callable[[str, float], None]
@@ -40,6 +45,15 @@ STYLES = (
 )  # fmt: skip
 SPLAT_MM = 1.8  # half the side of a point of the truth in pictures: points are 1.5 mm apart in the mean
 AZIMUTHS_DEG = (30.0, -75.0)
+SEEN_MM = 2.0  # from a visible point, 1.5 mm apart
+LEAST_PLACES = 50  # of a region, for figures of its own
+REGIONS_SCORED = (
+    "face",
+    "eyes",
+    "nose",
+    "mouth",
+    "ears",
+)  # the neck ends where each model ends it, hair hides the rest
 
 
 def visible(
@@ -95,13 +109,38 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
             picture, _row(subject.name, {k: Mesh(in_head.apply(m.vertices), m.faces) for k, m in meshes.items()})
         )
     whole = score_visible(subject.visible, bust.mesh_world)
+    faces = {"head": found.mesh_world, "bust": bust.mesh_world}
     seen = score_visible(subject.visible, seen_of(bust))
     return {
         **{key: value for key, value in whole.flat().items() if key.endswith(("within_2mm", "median", "closed"))},
         **{f"precision_seen_{part}_within_2mm": figures["within_2mm"] for part, figures in seen.precision.items()},
+        **{f"{k}_face_{key}": v for k, mesh in faces.items() for key, v in surface_error(subject, mesh).items()},
+        **region_errors(subject, found.mesh_world, head_regions(model)),
         "head_to_bust_median_mm": float(np.median(head_to_bust(found.mesh_world, bust))),
         "cpu_s": seconds,
+        "warnings": sorted({warning.code for warning in found.warnings}),
     }
+
+
+def region_errors(known: Known, head_world: Mesh, regions: Mapping[str, Bool[np.ndarray, " v"]]) -> dict[str, float]:
+    """Median, mean and 95th percentile (mm, by area) of the distance of true skin that two cameras see to the head, by
+    region of the head, carried to the truth by the nearest vertex."""
+    skin = known.visible.points[known.visible.part == PARTS.index("head")].astype(float)
+    seen = np.flatnonzero(KDTree(skin).query(known.mesh.vertices, distance_upper_bound=SEEN_MM)[0] < SEEN_MM)
+    hit = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(known.mesh.vertices[seen])
+    corner = head_world.faces[hit.triangles]
+    nearest = np.take_along_axis(corner, hit.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
+    area = vertex_areas(known.mesh.vertices, known.mesh.faces)[seen]
+    found: dict[str, float] = {}
+    for name, region in regions.items():
+        off, weight = hit.distances[region[nearest]], area[region[nearest]]
+        if name in REGIONS_SCORED and len(off) >= LEAST_PLACES:
+            found |= {
+                f"head_{name}_seen_median_mm": weighted_quantile(off, weight, 0.5),
+                f"head_{name}_seen_mean_mm": float(off @ weight / weight.sum()),
+                f"head_{name}_seen_p95_mm": weighted_quantile(off, weight, 0.95),
+            }
+    return found
 
 
 def seen_of(bust: BustSurface) -> Mesh:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
+from pipeline.imaging.projection import project_points
 from pipeline.parallel_for import thread_count
 from rig.camera import Camera
 from rig.mesh import Mesh
@@ -29,7 +30,9 @@ def depth_map(
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
     """``rasterise`` for a camera and world vertices."""
     k = camera.intrinsics
-    return rasterise(camera.project(vertices_world), camera_depths(camera, vertices_world), faces, k.height, k.width)
+    return rasterise(
+        project_points(camera, vertices_world), camera_depths(camera, vertices_world), faces, k.height, k.width
+    )
 
 
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.imaging.projection_kernels import project_all
 from rig.camera import Camera
 
 RADIUS_MOST = 1e6  # instead of an endless turning radius, which compiled loops with fast arithmetic may not meet
@@ -18,3 +19,8 @@ def packed_camera(camera: Camera) -> Float[np.ndarray, " 22"]:
     """Rotation (row by row), translation, and ``packed_lens``."""
     pose = camera.camera_from_world
     return np.concatenate([pose.rotation.ravel(), pose.translation, packed_lens(camera)])
+
+
+def project_points(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """``Camera.project``, compiled: a tenth of its seconds."""
+    return project_all(packed_camera(camera), np.ascontiguousarray(points_world, float))

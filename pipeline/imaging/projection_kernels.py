@@ -5,6 +5,8 @@ on, it is fx fy cx cy (px), and of a lens that distorts k1 k2 p1 p2 k3 and the t
 arithmetic is the calling loop's, fast or strict. Only ``distorted`` is always fast: strict, it cost the hull a tenth.
 """
 
+import numpy as np
+
 from pipeline.compiled import njit
 
 LENS = 12  # entry of a row at which the lens begins
@@ -82,3 +84,14 @@ def projection_slopes(camera, x, y, z):
         (xx * dx0 + xy * dy0, xx * dx1 + xy * dy1, xx * dx2 + xy * dy2),
         (yx * dx0 + yy * dy0, yx * dx1 + yy * dy1, yx * dx2 + yy * dy2),
     )
+
+
+@njit(cache=True, nogil=True)
+def project_all(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) of world points (n, 3), mm; NaN where ``project`` has NOWHERE."""
+    pixels = np.empty((len(points), 2))
+    for n in range(len(points)):
+        column, row = project(camera, points[n, 0], points[n, 1], points[n, 2])
+        seen = column < NOWHERE
+        pixels[n, 0], pixels[n, 1] = column if seen else np.nan, row if seen else np.nan
+    return pixels

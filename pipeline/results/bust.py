@@ -47,13 +47,15 @@ def make_bust(
     bias: WindowBias,
     settings: Settings,
     *,
+    head_skin_world: Mesh | None = None,
     report: Report,
 ) -> Bust:
     """The fused surface in the photographs' colours, hidden by its own parts where these stand before each other.
 
     Raises NoSurface where fewer than three views know any depth.
     """
-    surface = fuse(depth_maps, silhouettes, rig, head_world, votes, bias, settings.bust, report=report)
+    given = (depth_maps, silhouettes, rig, head_world, votes, bias, settings.bust)
+    surface = fuse(*given, head_skin_world=head_skin_world, report=report)
     mesh = surface.mesh_world
     normals = mesh.normals()
     depths = rastered_depths(rig, mesh)

@@ -23,6 +23,8 @@ from rig.mesh import Mesh
 
 INPUT_COLOUR = (70, 215, 255)  # sky blue, a little lighter
 FITTED_COLOUR = (255, 110, 20)  # vermilion, a little lighter
+PART_COLOURS = {"skin": (240, 228, 66), "hair": (0, 158, 115), "clothes": (204, 121, 167)}  # Okabe and Ito's, too
+TINT = 0.3  # of a part's colour where a pixel surely shows it
 AZIMUTHS_DEG = (-80, -60, -40, -20, 0, 20, 40, 60, 80)
 PANEL = (480, 360)  # width and height of one panel of the contact sheet
 PAPER = (245, 245, 245)
@@ -33,18 +35,33 @@ Resized = UInt8[np.ndarray, "_ _ 3"]  # a picture of any size, whatever others t
 
 
 def overlay(
-    image: ImageRgb, input_distance: Float32[np.ndarray, "h w"], fitted_mask: Bool[np.ndarray, "h w"], label: str = ""
+    image: ImageRgb,
+    input_distance: Float32[np.ndarray, "h w"],
+    fitted_mask: Bool[np.ndarray, "h w"],
+    label: str = "",
+    parts: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> ImageRgb:
-    """The image with the input contour (sky blue) and the fitted head's contour (vermilion)."""
+    """The image with the input contour (sky blue) and the fitted head's contour (vermilion), and tinted by the
+    probability of skin, hair and clothes where that is known: what is unknown keeps its colour."""
     line = max(1.0, 1.5 * image.shape[1] / 1024)
-    painted = image.copy()
+    painted = image.copy() if parts is None else tinted(image, parts)
     contours = [_near(input_distance, line), _near(_smooth_distance(fitted_mask), line)]
     for near in contours:
         _paint(painted, near, (0, 0, 0), line + 1.0, 0.45)
     for near, colour in zip(contours, (INPUT_COLOUR, FITTED_COLOUR), strict=True):
         _paint(painted, near, colour, line, 1.0)
     entries = [(label, (255, 255, 255))] if label else []
-    return legend(painted, [*entries, ("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)])
+    entries += [("input contour", INPUT_COLOUR), ("fitted head", FITTED_COLOUR)]
+    return legend(painted, entries + ([] if parts is None else list(PART_COLOURS.items())))
+
+
+def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
+    """Each pixel moved towards the parts' colours by their probabilities."""
+    own = box_around(parts.any(axis=2), 0)
+    share, out = TINT * parts[own], image.copy()
+    colours = np.array(list(PART_COLOURS.values()), np.float32)
+    out[own] = np.rint(out[own] * (1.0 - share.sum(axis=2, keepdims=True)) + share @ colours).astype(np.uint8)
+    return out
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:

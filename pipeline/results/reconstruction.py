@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.dense.parts import PartMap
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.fitting.fit import Fit
 from pipeline.imaging.silhouette import Silhouette
@@ -69,3 +70,4 @@ class Reconstruction:
     pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
     atlas: Atlas | None = None  # where the settings ask for it
     bust: Bust | None = None  # where the settings ask for it and the photographs carry it
+    parts: Mapping[str, PartMap] = field(default_factory=dict)  # skin, hair or clothes in a view's pixels, where told

@@ -150,7 +150,8 @@ def _shown(result: Reconstruction, capture: Capture) -> list[str]:
 
 def _write_overlay(folder: Path, result: Reconstruction, capture: Capture, name: str) -> None:
     distance = result.silhouettes[name].distance
-    drawn = overlay(capture.images[name], distance, result.fitted_masks[name], name)
+    parts = result.parts[name].probability if name in result.parts else None
+    drawn = overlay(capture.images[name], distance, result.fitted_masks[name], name, parts)
     write_image(folder / "overlays" / f"{name}.png", drawn)
 
 

@@ -30,8 +30,8 @@ from rig.errors import InputError
 from rig.rig import Rig
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
-STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise
-NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise
+STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise, and smaller holes: whites of eyes before a grey wall
+NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
 
@@ -118,7 +118,7 @@ def _without_specks(alpha: Float32[np.ndarray, "h w"]) -> tuple[Float32[np.ndarr
         main = int(np.argmax(areas[1:])) + 1
         alpha = np.where(mask & (labels != main), np.float32(0.49), alpha)
     labels, areas = _labelled(alpha <= 0.5, 8)
-    small = areas < NOISE_HOLE
+    small = areas < max(NOISE_HOLE, STRANGER_SHARE * np.count_nonzero(mask))
     small[0] = False
     if small.any():
         alpha = np.where(small[labels], np.float32(0.51), alpha)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.masks import box_around
+from pipeline.imaging.projection import project_points
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
 from pipeline.texture.visibility_kernels import sample_colours, visibility_weights
@@ -46,7 +47,7 @@ def see_points(
     settings: TextureSettings,
 ) -> Sight:
     """What ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
-    pixels, depths = camera.project(points), camera_depths(camera, points)
+    pixels, depths = project_points(camera, points), camera_depths(camera, points)
     towards = camera.centre_world - points
     facing = np.einsum("vi,vi->v", normals, towards) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
     weights = visibility_weights(

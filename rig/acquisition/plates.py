@@ -2,6 +2,7 @@
 
     plates/<camera>/000.png ...     (or plates/<camera>.png: what a capture folder's background/ holds is accepted too)
     plates/plates.json              when they were taken, the noise of each camera
+    plates.versions/<version>/...   those that were in use before, and those that were refused
 
 A session needs one plate of each camera in memory; captures get links to the files.
 """
@@ -11,7 +12,8 @@ import os
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,13 +21,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.acquisition.image_checks import noise_of
-from rig.acquisition.occupied import occupied
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.capture_folder import IMAGE_SUFFIXES
-from rig.formats.images import read_image, write_image
+from rig.formats.images import IMAGE_SUFFIXES, read_image, write_image
 
 FORMAT = "eigenhead-plates/1"
+VERSIONS_MOST = 6
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 
 
@@ -63,43 +64,84 @@ def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
     return Plates(files, first, noise, taken)
 
 
+@dataclass(frozen=True, slots=True)
+class PlatesVersion:
+    """Clean plates that are kept: ``taken`` is UTC, ISO 8601, ``refused`` the faults for which they were not put to
+    use."""
+
+    id: str
+    taken: str
+    cameras: tuple[str, ...]
+    refused: tuple[str, ...]
+    in_use: bool
+
+
 def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Plates:
-    """Replaces the plates of ``folder``. The old ones stay until the new ones are complete."""
-    fresh, old = folder.with_name(folder.name + ".new"), folder.with_name(folder.name + ".old")
-    for leftover in (fresh, old):
-        shutil.rmtree(leftover, ignore_errors=True)
+    """Puts new plates to use; those of ``folder`` become a version. They stay until the new ones are complete."""
+    return use_plates(folder, keep_plates(folder, images), tuple(images))
+
+
+def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refused: tuple[str, ...] = ()) -> str:
+    """Writes plates as a version beside those in use; its id. ``refused``: why they are not put to use."""
+    moment = datetime.now(UTC)
+    identity = moment.strftime("%Y%m%dT%H%M%S%fZ")
+    fresh = _versions(folder) / f"{identity}.new"
     targets = [
         (fresh / name / f"{i:03}.png", plate) for name, plates in images.items() for i, plate in enumerate(plates)
     ]
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda target: write_image(*target), targets))
         noise = dict(zip(images, pool.map(noise_of, images.values()), strict=True))
-    taken = datetime.now(UTC).isoformat(timespec="seconds")
-    document = {"format": FORMAT, "taken": taken, "noise": noise}
+    taken = moment.isoformat(timespec="seconds")
+    document = {"format": FORMAT, "id": identity, "taken": taken, "noise": noise, "refused": [*refused]}
     write_atomically(fresh / "plates.json", json.dumps(document, indent=1).encode())
+    fresh.rename(fresh.with_suffix(""))
+    return identity
+
+
+def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
+    """Puts a kept version to use; those in use become a version. Raises InputError for one that is not kept."""
+    wanted, kept = _versions(folder) / version, {found.id: found for found in plates_versions(folder)}
+    if version in kept and kept[version].in_use:
+        return read_plates(folder, names)
+    if version not in kept:
+        raise InputError("clean plates", [f"version {version!r:.40} is not kept"])
     if folder.exists():
-        folder.rename(old)
-    fresh.rename(folder)
-    for leftover in (old, _refused(folder)):
-        shutil.rmtree(leftover, ignore_errors=True)
-    files = {name: tuple(folder / name / f"{i:03}.png" for i in range(len(plates))) for name, plates in images.items()}
-    return Plates(files, {name: plates[0] for name, plates in images.items()}, noise, taken)
+        folder.rename(_versions(folder) / _version_of(folder).id)
+    wanted.rename(folder)
+    for old in plates_versions(folder)[VERSIONS_MOST:]:
+        if not old.in_use:
+            shutil.rmtree(_versions(folder) / old.id, ignore_errors=True)
+    with suppress(OSError):  # the first ones leave nothing behind
+        _versions(folder).rmdir()
+    return read_plates(folder, names)
 
 
-def occupied_plates(folder: Path, fresh: Mapping[str, tuple[ImageRgb, ...]], before: Plates) -> tuple[str, ...]:
-    """Cameras in whose fresh plates somebody is who is not on the plates ``before``. The pictures are kept beside
-    ``folder``: what is still there the next time, unmoved, belongs to the studio."""
-    first, refused = {name: images[0] for name, images in fresh.items()}, _refused(folder)
-    found = occupied(first, before.first)
-    if found and refused.is_dir() and not occupied(first, read_plates(refused, tuple(first)).first):
-        return ()
-    if found:
-        write_plates(refused, {name: (image,) for name, image in first.items()})
-    return found
+def plates_versions(folder: Path) -> list[PlatesVersion]:
+    """The plates in use and those kept beside them, newest first."""
+    kept = [path for path in _versions(folder).glob("*Z") if path.is_dir()] if _versions(folder).is_dir() else []
+    found = [_version_of(path) for path in kept]
+    if folder.is_dir():
+        found.append(replace(_version_of(folder), in_use=True))
+    return sorted(found, key=lambda version: version.id, reverse=True)
 
 
-def _refused(folder: Path) -> Path:
-    return folder.with_name(folder.name + ".refused")
+def _version_of(folder: Path) -> PlatesVersion:
+    """What plates.json says; the time of the folder where there is none, or nothing that can be read."""
+    try:
+        document = json.loads((folder / "plates.json").read_text(encoding="utf-8"))
+        taken = str(document["taken"])
+        identity = str(document.get("id") or datetime.fromisoformat(taken).strftime("%Y%m%dT%H%M%S%fZ"))
+        refused = tuple(map(str, document.get("refused", ())))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        moment = datetime.fromtimestamp(folder.stat().st_mtime, UTC)
+        identity, taken, refused = moment.strftime("%Y%m%dT%H%M%S%fZ"), moment.isoformat(timespec="seconds"), ()
+    cameras = sorted({path.stem for path in folder.iterdir() if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES})
+    return PlatesVersion(identity, taken, tuple(cameras), refused, in_use=False)
+
+
+def _versions(folder: Path) -> Path:
+    return folder.with_name(folder.name + ".versions")
 
 
 def link_plates(plates: Plates, background: Path) -> None:

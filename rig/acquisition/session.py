@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from rig.acquisition.image_checks import disturbed, noise_of
-from rig.acquisition.plates import NO_PLATES, Plates, occupied_plates, read_plates, write_plates
-from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify, examine, judge
+from rig.acquisition.judgement import examine, judge
+from rig.acquisition.plate_checks import PlatesRefused, occupied, plate_faults
+from rig.acquisition.plates import Plates, keep_plates, read_plates, use_plates, write_plates
+from rig.acquisition.shot import Fault, Shot, ShotFailed, Timing, certify
 from rig.acquisition.trigger import Fired, TriggerBox, TriggerError
 from rig.drivers.base import Driver, DriverError, Frame
 from rig.drivers.feed import CameraFeed, FeedState
@@ -142,24 +143,34 @@ class RigSession:
             return shot
 
     def take_plates(self) -> Plates:
-        """Takes the clean plates of the empty studio and keeps them. Raises ShotFailed, the old plates then stay."""
+        """Takes the clean plates of the empty studio and puts them to use. Raises ShotFailed, the old plates then stay;
+        PlatesRefused where the new ones show somebody whom the old ones do not."""
         with self._busy:
             self._lights_on()
             self._silent_until_s.clear()
             taken: dict[str, list[ImageRgb]] = {name: [] for name in self.config.names}
-            for _ in range(self.config.shot.plates):
+            pause_s = self.config.shot.plates_over_s / max(self.config.shot.plates - 1, 1)
+            for number in range(self.config.shot.plates):
+                time.sleep(pause_s if number else 0.0)
                 frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s)
                 for name, frame in frames.items():
                     taken[name].append(frame.image)
             faults = [*self._box_faults(), *self._plate_faults(taken)]
-            images = {name: tuple(images) for name, images in taken.items()}
-            if not faults:
-                remedy = "clear the studio; if it belongs there, take them once more"
-                there = occupied_plates(self.config.plates_folder, images, self.plates)
-                faults = [Fault("occupied", name, remedy) for name in there]
             if faults:
                 raise ShotFailed(faults)
+            images = {name: tuple(images) for name, images in taken.items()}
+            if somebody := occupied(images, self.plates):
+                version = keep_plates(
+                    self.config.plates_folder, images, tuple(f"{fault.camera}: {fault.detail}" for fault in somebody)
+                )
+                raise PlatesRefused(somebody, version)
             self.plates = write_plates(self.config.plates_folder, images)
+            return self.plates
+
+    def use_plates(self, version: str) -> Plates:
+        """Puts plates that were kept to use again. Raises InputError."""
+        with self._busy:
+            self.plates = use_plates(self.config.plates_folder, version, self.config.names)
             return self.plates
 
     def _open_box(self) -> None:
@@ -364,24 +375,19 @@ class RigSession:
         unmet = {name: feed.state().unmet for name, feed in self._feeds.items()}
         notes = [Fault("setting", name, line) for name, lines in unmet.items() for line in lines]
         missing = [name for name in images if name not in self.plates]
-        return notes + [Fault("plates", name, "take clean plates of the empty studio") for name in missing]
+        return notes + [Fault("plates", name, "there are none of it") for name in missing]
 
     def _plate_faults(self, taken: Mapping[str, list[ImageRgb]]) -> list[Fault]:
-        faults = []
-        wanted = self.config.shot.plates
+        wanted, faults = self.config.shot.plates, []
         for name, images in taken.items():
             if len(images) < wanted:
                 state = self._feeds[name].state() if name in self._feeds else None
                 why = self._broken.get(name) or (state.error if state is not None else None)
                 faults.append(Fault("missing", name, why or f"{len(images)} of {wanted} frames came"))
-                continue
-            if self._feeds[name].live and any(np.array_equal(images[0], other) for other in images[1:2]):
-                faults.append(Fault("frozen", name, "two clean plates are equal to the last bit"))
-            if disturbed(images, noise_of(images) or 0.0):
-                faults.append(Fault("disturbed", name, "something moved between the clean plates; take them again"))
-        first = {name: images[0] for name, images in taken.items() if images}
-        dark = judge(first, examine(first, NO_PLATES), NO_PLATES, self.config.shot)
-        return faults + [fault for fault in dark if fault.is_error]
+        came = {name: images for name, images in taken.items() if images}
+        complete = {name: images for name, images in came.items() if len(images) >= wanted}
+        live = [name for name in complete if self._feeds[name].live]
+        return faults + plate_faults(complete, live, self.config.shot)
 
 
 def _without_consequences(faults: list[Fault]) -> tuple[Fault, ...]:

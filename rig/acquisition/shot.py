@@ -1,11 +1,10 @@
 """What a shot delivers: pictures, a certificate of how far they belong to one moment, and every fault by its name.
 
-The judgement is made here, by pure functions of frames, clean plates and settings; rig.acquisition.session does the
-shooting.
+What the clock says is judged here, by pure functions of frames; what the pictures say in rig.acquisition.judgement;
+rig.acquisition.session does the shooting.
 """
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import median
 from typing import Literal, TypedDict
@@ -13,11 +12,9 @@ from typing import Literal, TypedDict
 import numpy as np
 from jaxtyping import UInt8
 
-from rig.acquisition.image_checks import Exposure, Registration, blur_px, exposure, register
-from rig.acquisition.plates import Plates
+from rig.acquisition.image_checks import Exposure, Registration
 from rig.drivers.base import Frame
 from rig.errors import EigenheadError
-from rig.formats.rig_toml import ShotConfig
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 Status = Literal["in sync", "late", "dropped", "missing", "recorded"]
@@ -39,19 +36,44 @@ FAULTS = {
     "blurred": "the picture is out of focus",
     "setting": "the camera did not take a setting of rig.toml",
     "plates": "there are no clean plates of the camera",
+    "empty": "nobody is in the camera's picture",
+    "cut-off": "the head is cut off by the edge of the picture",
     "disturbed": "something moved while the clean plates were taken",
-    "occupied": "somebody or something stands where the clean plates before show nothing",
+    "occupied": "the new clean plates show somebody whom the old ones do not",
 }
-WARNINGS = frozenset({"moved", "overexposed", "blurred", "setting", "plates"})
+REMEDIES = {
+    "trigger": "check the box's cable and power, and its port in rig.toml",
+    "late-trigger": "look at the box's outputs and their delays in rig.toml",
+    "missing": "check its cable, power and driver",
+    "dropped": "shoot again; if it stays, lower its frame rate or give it a network port of its own",
+    "late": "shoot again; if it stays, raise its frame rate or trigger it by the box",
+    "frozen": "start the camera anew",
+    "size": "set its resolution back, or calibrate again",
+    "lights-off": "turn the lamps on",
+    "dark": "look at its lens cap, iris and exposure",
+    "swapped": "their cables or identities are swapped: change them back",
+    "view": "put it back where it was, or take new clean plates and calibrate again",
+    "moved": "calibrate again, or put it back; until then its view is left out",
+    "overexposed": "close the iris, shorten the exposure or dim the lamps",
+    "blurred": "focus on the near eye, and have the subject sit still",
+    "setting": "set it at the camera, or take it out of rig.toml",
+    "plates": "take clean plates of the empty studio",
+    "empty": "seat the subject where all cameras look, and shoot again",
+    "cut-off": "move the seat or the camera so that the whole head is in the picture",
+    "disturbed": "take them again with nobody and nothing moving",
+    "occupied": "send everybody out and take them again, or use them all the same where the studio itself changed",
+}
+WARNINGS = frozenset({"moved", "overexposed", "blurred", "setting", "plates", "empty", "cut-off"})
 """Faults with which a capture is still worth reconstructing; the others end it."""
 
-LEVEL_WITHOUT_PLATES = 64.0  # a studio picture's mean, where there is no plate to compare with
-BLACK_LEVEL = 0.02  # of the plate's brightness: nothing can be seen in it
-# Measured on two rendered captures of eleven cameras: own background 0.35 to 0.75 (lamps off: 0.12 to 0.5), another
-# camera's up to 0.07. Between the two bounds the plates of the other cameras are asked.
-FOUND_LEAST, FOUND_SURELY = 0.1, 0.25
-MOVED_DARK_PX = 3.0  # the same with the lamps off: up to 2.6 px without any movement
 DROPPED_PERIODS = 0.8
+
+
+class FaultDocument(TypedDict):
+    code: str
+    camera: str | None
+    detail: str
+    remedy: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +89,17 @@ class Fault:
         """Whether it ends the capture."""
         return self.code not in WARNINGS
 
+    @property
+    def remedy(self) -> str:
+        """What to do."""
+        return REMEDIES[self.code]
+
+    def document(self) -> FaultDocument:
+        """For JSON."""
+        return {"code": self.code, "camera": self.camera, "detail": self.detail, "remedy": self.remedy}
+
     def __str__(self) -> str:
-        return f"{self.camera or 'rig'}: {self.code}: {self.detail}"
+        return f"{self.camera or 'rig'}: {self.code}: {self.detail}: {self.remedy}"
 
 
 class ShotFailed(EigenheadError):
@@ -114,12 +145,6 @@ class CheckDocument(TypedDict):
     blur_px: float | None
     background_found: float | None
     background_moved_px: float | None
-
-
-class FaultDocument(TypedDict):
-    code: str
-    camera: str | None
-    detail: str
 
 
 class ShotDocument(TypedDict):
@@ -181,6 +206,17 @@ class PictureCheck:
     blur_px: float | None
     registration: Registration | None
 
+    def document(self) -> CheckDocument:
+        """For JSON."""
+        registration = self.registration
+        return {
+            "mean": round(self.exposure.mean, 2),
+            "clipped_share": round(self.exposure.clipped_share, 5),
+            "blur_px": None if self.blur_px is None else round(self.blur_px, 2),
+            "background_found": None if registration is None else round(registration.found, 3),
+            "background_moved_px": None if registration is None else round(registration.moved_px, 2),
+        }
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
@@ -201,8 +237,8 @@ class Shot:
         return {
             "format": "eigenhead-shot/1",
             "sync": self.certificate.document(),
-            "checks": {name: _check_document(check) for name, check in self.checks.items()},
-            "faults": [{"code": f.code, "camera": f.camera, "detail": f.detail} for f in self.faults],
+            "checks": {name: check.document() for name, check in self.checks.items()},
+            "faults": [fault.document() for fault in self.faults],
         }
 
 
@@ -266,107 +302,7 @@ def _lateness(status: Status, skew_s: float, timing: Timing) -> str:
     after = f"came {skew_s * 1000:.0f} ms after it was due"
     if status == "dropped":
         return f"no frame of the release, the next one {after}"
-    return f"its frame {after}" if timing.triggered else f"it runs freely, and its next frame {after}: raise its fps"
-
-
-def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, PictureCheck]:
-    """Measures every picture, in parallel: OpenCV lets go of the interpreter."""
-
-    def one(name: str) -> PictureCheck:
-        image = images[name]
-        light = exposure(image)
-        plate = plates.first.get(name)
-        black = light.mean < BLACK_LEVEL * _level(name, plates)
-        return PictureCheck(light, blur_px(image), None if plate is None or black else register(image, plate))
-
-    with ThreadPoolExecutor(4) as pool:
-        return dict(zip(images, pool.map(one, images), strict=True))
-
-
-def judge(
-    images: Mapping[str, ImageRgb], checks: Mapping[str, PictureCheck], plates: Plates, shot: ShotConfig
-) -> list[Fault]:
-    """The faults that can be seen in the pictures: of light, of focus, and of what the cameras look at."""
-    light, lit = _light_faults(checks, plates, shot)
-    faults = [*light]
-    for name, check in checks.items():
-        if check.exposure.clipped_share > shot.clipped_most:
-            share = check.exposure.clipped_share * 100
-            faults.append(
-                Fault("overexposed", name, f"{share:.1f} % of the picture is burnt out: close the iris or shorten")
-            )
-        if lit[name] and check.blur_px is not None and check.blur_px > shot.blur_most_px:
-            faults.append(
-                Fault("blurred", name, f"edges are {check.blur_px:.1f} px wide, {shot.blur_most_px:g} px allowed")
-            )
-        if check.registration is not None:
-            faults.extend(_view_faults(name, images, check.registration, lit[name], plates, shot))
-    return faults
-
-
-def _light_faults(
-    checks: Mapping[str, PictureCheck], plates: Plates, shot: ShotConfig
-) -> tuple[list[Fault], dict[str, bool]]:
-    """Faults of light, and which cameras have enough of it."""
-    ratios = {name: check.exposure.mean / _level(name, plates) for name, check in checks.items()}
-    common = median(ratios.values()) if len(ratios) >= 3 else 1.0
-    faults: list[Fault] = []
-    if common < shot.dark_below:
-        faults.append(Fault("lights-off", None, f"the pictures have {common * 100:.0f} % of their usual brightness"))
-    for name, ratio in ratios.items():
-        if ratio < shot.dark_below * min(1.0, common):
-            of = "the other cameras' share" if common < shot.dark_below else "its usual brightness"
-            faults.append(
-                Fault("dark", name, f"{ratio / min(1.0, common) * 100:.0f} % of {of}: lens cap, iris or exposure")
-            )
-    return faults, {name: ratio >= shot.dark_below for name, ratio in ratios.items()}
-
-
-def _view_faults(
-    name: str, images: Mapping[str, ImageRgb], found: Registration, lit: bool, plates: Plates, shot: ShotConfig
-) -> list[Fault]:
-    if not found.conclusive:
-        return []
-    if found.found < (FOUND_SURELY if lit else FOUND_LEAST):
-        other = _whose_view(name, images[name], found, plates)
-        if other is not None or found.found < FOUND_LEAST:
-            return [_wrong_view(name, other)]
-    most_px = shot.moved_most_px if lit else max(shot.moved_most_px, MOVED_DARK_PX)
-    if found.moved_px > most_px:
-        detail = f"its background lies {found.moved_px:.1f} px from its clean plates: calibrate again, or put it back"
-        return [Fault("moved", name, detail)]
-    return []
-
-
-def _whose_view(name: str, image: ImageRgb, own: Registration, plates: Plates) -> str | None:
-    """The camera whose clean plate fits the picture far better than the own one does."""
-    others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
-    best = max(others, key=lambda other: others[other], default=None)
-    return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * own.found) else None
-
-
-def _wrong_view(name: str, other: str | None) -> Fault:
-    if other is not None:
-        return Fault("swapped", name, f"it shows the view of {other}: their cables or identities are swapped")
-    return Fault(
-        "view", name, "its background is not that of its clean plates: was it moved? Put it back or take new plates"
-    )
-
-
-def _level(name: str, plates: Plates) -> float:
-    plate = plates.first.get(name)
-    return LEVEL_WITHOUT_PLATES if plate is None else max(float(plate[::4, ::4].mean()), 1.0)
-
-
-def _check_document(check: PictureCheck) -> CheckDocument:
-    registration = check.registration
-    return {
-        "mean": round(check.exposure.mean, 2),
-        "clipped_share": round(check.exposure.clipped_share, 5),
-        "blur_px": None if check.blur_px is None else round(check.blur_px, 2),
-        "background_found": None if registration is None else round(registration.found, 3),
-        "background_moved_px": None if registration is None else round(registration.moved_px, 2),
-    }
+    return f"its frame {after}" if timing.triggered else f"it runs freely, and its next frame {after}"
 
 
 def _ms(seconds: float | None) -> float | None:

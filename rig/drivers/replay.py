@@ -10,8 +10,7 @@ from pathlib import Path
 from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, ImageRgb
 from rig.drivers.frame_clock import Pace
 from rig.errors import InputError
-from rig.formats.capture_folder import IMAGE_SUFFIXES
-from rig.formats.images import read_image
+from rig.formats.images import IMAGE_SUFFIXES, read_image
 from rig.formats.rig_toml import CameraConfig
 
 _FPS = 10.0

@@ -1,34 +1,55 @@
-"""Rigs in other programs' files: COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML.
+"""Rigs in other programs' files: COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML,
+Metashape's XML, RealityCapture's XMP and CSV, nerfstudio's ``transforms.json``, EasyMocap's YAML; and out to Blender.
 
 Every reader turns its file into the ``eigenhead-cameras/1`` document and lets ``rig_from_document`` judge it, so that
-all formats meet the same checks. Sources of the layouts: https://colmap.github.io/format.html (with the parameter order
-of ``src/colmap/sensor/models.h``), https://mprib.github.io/caliscope, https://anipose.readthedocs.io.
+all formats meet the same checks. Where each layout is described stands at its module's head.
 
-Pixels: COLMAP puts (0.5, 0.5) at the centre of the top-left pixel, this project (0, 0); the two TOML formats follow
-OpenCV and need no shift. Lengths: caliscope is in metres; COLMAP's scale is free and taken as millimetres; aniposelib's
-is that of its board, see ``_aniposelib_unit``.
+Pixels: this project and OpenCV put (0, 0) at the centre of the top-left pixel; COLMAP, Metashape, RealityCapture and
+nerfstudio (0.5, 0.5). Lengths become millimetres: caliscope, Metashape, RealityCapture and EasyMocap are in metres;
+COLMAP's scale is free and taken as millimetres; aniposelib's and nerfstudio's are told by the size of the rig.
 """
 
 from collections.abc import Callable
 from pathlib import Path
 
 from rig.errors import InputError
+from rig.formats.blender_script import write_blender
 from rig.formats.cameras_json import read_rig, write_rig
 from rig.formats.colmap import read_colmap, write_colmap
+from rig.formats.metashape import read_metashape, write_metashape
 from rig.formats.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
+from rig.formats.opencv_yaml import read_yaml, write_yaml
+from rig.formats.realitycapture import COLUMNS, read_csv, read_xmp, write_csv, write_xmp
+from rig.formats.transforms_json import read_transforms, write_transforms
 from rig.rig import Rig
 
-FORMATS = ("eigenhead", "colmap", "colmap-text", "caliscope", "aniposelib")
-
-
+WRITERS: dict[str, Callable[[Rig, Path], None]] = {
+    "eigenhead": write_rig,
+    "colmap": lambda rig, folder: write_colmap(rig, folder, binary=True),
+    "colmap-text": write_colmap,
+    "caliscope": write_caliscope,
+    "aniposelib": write_aniposelib,
+    "metashape": write_metashape,
+    "realitycapture": write_xmp,
+    "realitycapture-csv": write_csv,
+    "nerfstudio": write_transforms,
+    "opencv-yaml": write_yaml,
+    "blender": write_blender,
+}
+FORMATS = tuple(WRITERS)
+NO_RIG = (
+    "holds no cameras.json (nor a file of COLMAP, caliscope, aniposelib, Metashape, RealityCapture, nerfstudio or "
+    "EasyMocap)"
+)
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
 
 
 def find_rig_file(folder: Path) -> Path | None:
     """The file in ``folder`` that holds the rig, for ``read_rig_file``; None if there is none.
 
-    In this order: ``cameras.json``; a COLMAP model under ``sparse/0``, ``sparse`` or at the top (its ``cameras.bin`` or
-    ``cameras.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys.
+    In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
+    ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
+    an XML file of Metashape's; RealityCapture's XMP files, beside the pictures or at the top, or its CSV.
     """
     if (folder / "cameras.json").is_file():
         return folder / "cameras.json"
@@ -39,35 +60,50 @@ def find_rig_file(folder: Path) -> Path | None:
                 return path
     if (folder / "camera_array.toml").is_file():
         return folder / "camera_array.toml"
-    return next((path for path in sorted(folder.glob("*.toml")) if looks_like_aniposelib(path)), None)
+    aniposelib = (path for path in sorted(folder.glob("*.toml")) if looks_like_aniposelib(path))
+    named = (folder / name for name in ("transforms.json", "intri.yml") if (folder / name).is_file())
+    metashape = (path for path in sorted(folder.glob("*.xml")) if b"<chunk" in _head(path))
+    sidecars = (path for place in ("images", ".") for path in sorted((folder / place).glob("*.xmp")))
+    tables = (path for path in sorted(folder.glob("*.csv")) if _head(path).startswith(",".join(COLUMNS[:8]).encode()))
+    return next((path for found in (aniposelib, named, metashape, sidecars, tables) for path in found), None)
 
 
 def read_rig_file(path: Path) -> Rig:
     """The rig in a file of any known format. Raises InputError naming every fault found in it."""
+    if path.name == "transforms.json":
+        return read_transforms(path)
     if path.suffix == ".json":
         return read_rig(path)
     if path.suffix in (".bin", ".txt"):
         return read_colmap(path.parent, path.suffix)
-    if path.suffix == ".toml":
-        return read_toml(path)
-    raise InputError(path.name, ["is no rig file: wanted cameras.json, COLMAP's cameras.txt or .bin, or a .toml"])
+    if path.suffix == ".xmp":
+        return read_xmp(path.parent)
+    readers = {".toml": read_toml, ".xml": read_metashape, ".csv": read_csv, ".yml": read_yaml, ".yaml": read_yaml}
+    if path.suffix not in readers:
+        raise InputError(path.name, [f"is no rig's file; known are those of {', '.join(FORMATS[:-1])}"])
+    return readers[path.suffix](path)
 
 
 def rig_file_parts(path: Path) -> tuple[Path, ...]:
-    """The files from which ``read_rig_file`` reads ``path``: of a COLMAP model two, of the other formats one."""
-    return (path, path.with_stem("images")) if path.suffix in (".bin", ".txt") else (path,)
+    """The files from which ``read_rig_file`` reads ``path``: of most formats one."""
+    if path.suffix in (".bin", ".txt"):
+        return path, path.with_stem("images")
+    if path.suffix == ".xmp":
+        return tuple(sorted(path.parent.glob("*.xmp")))
+    return (path, path.with_name("extri.yml")) if path.name == "intri.yml" else (path,)
 
 
 def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
-    """Writes a rig in a format of ``FORMATS``; COLMAP's are folders. Raises InputError for another format."""
-    writers: dict[str, Callable[[Rig, Path], None]] = {
-        "eigenhead": write_rig,
-        "colmap": lambda rig, folder: write_colmap(rig, folder, binary=True),
-        "colmap-text": write_colmap,
-        "caliscope": write_caliscope,
-        "aniposelib": write_aniposelib,
-    }
-    assert tuple(writers) == FORMATS
-    if kind not in writers:
+    """Writes a rig in a format of ``FORMATS``; COLMAP's, XMP and YAML are folders. Raises InputError for another."""
+    if kind not in WRITERS:
         raise InputError("format", [f"{kind!r} is none of {', '.join(FORMATS)}"])
-    writers[kind](rig, path)
+    WRITERS[kind](rig, path)
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file that may be one of ours; none where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4096).removeprefix(b"\xef\xbb\xbf")
+    except OSError:
+        return b""

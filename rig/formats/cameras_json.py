@@ -10,6 +10,7 @@ from rig.atomic_write import write_atomically
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
 from rig.geometry import RigidTransform, nearest_rotation
+from rig.recorded_lens import COEFFICIENTS, LensModel, RecordedLens
 from rig.rig import Rig
 
 FORMAT = "eigenhead-cameras/1"
@@ -100,13 +101,12 @@ def name_fault(name: Any) -> str | None:
 
 def _camera_document(camera: Camera) -> CameraDocument:
     k = camera.intrinsics
-    d = k.distortion
     document: CameraDocument = {
         "name": camera.name,
         "width": k.width,
         "height": k.height,
         "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy},
-        "distortion": {"model": "brown-conrady", "k1": d.k1, "k2": d.k2, "p1": d.p1, "p2": d.p2, "k3": d.k3},
+        "distortion": _lens_document(camera),
         "camera_from_world": {
             "rotation": camera.camera_from_world.rotation.tolist(),
             "translation": camera.camera_from_world.translation.tolist(),
@@ -115,6 +115,24 @@ def _camera_document(camera: Camera) -> CameraDocument:
     if camera.covariance is not None:
         document["covariance"] = camera.covariance.tolist()
     return document
+
+
+def _lens_document(camera: Camera) -> dict[str, str | float]:
+    d, lens = camera.intrinsics.distortion, camera.recorded
+    if lens is None:
+        return {"model": "brown-conrady", "k1": d.k1, "k2": d.k2, "p1": d.p1, "p2": d.p2, "k3": d.k3}
+    return {"model": lens.model, **dict(zip(COEFFICIENTS[lens.model], lens.coefficients, strict=True))}
+
+
+def _read_lens(lens: Any, where: str, faults: list[str]) -> tuple[Distortion, RecordedLens | None]:
+    """Our own lens, or a pinhole and the lens that its pictures are undistorted from."""
+    model = lens.get("model", "brown-conrady") if isinstance(lens, dict) else "brown-conrady"
+    known: LensModel | None = next((name for name in COEFFICIENTS if name == model), None)
+    if known is None and model != "brown-conrady":
+        faults.append(f"{where}.model is {model!r:.80}, wanted 'brown-conrady', {' or '.join(map(repr, COEFFICIENTS))}")
+    keys = COEFFICIENTS[known] if known else ("k1", "k2", "p1", "p2", "k3")
+    values = _read_numbers(lens, keys, where, faults, default=0.0)
+    return (Distortion(), RecordedLens(known, tuple(values))) if known else (Distortion(*values), None)
 
 
 def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
@@ -129,11 +147,7 @@ def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
         where = entry["name"]
     width, height = (_read_size(entry.get(key), f"{where}.{key}", faults) for key in ("width", "height"))
     fx, fy, cx, cy = _read_numbers(entry.get("intrinsics"), ("fx", "fy", "cx", "cy"), f"{where}.intrinsics", faults)
-    lens = entry.get("distortion", {})
-    if isinstance(lens, dict) and lens.get("model", "brown-conrady") != "brown-conrady":
-        faults.append(f"{where}.distortion.model is {lens['model']!r:.80}, wanted 'brown-conrady'")
-    keys = ("k1", "k2", "p1", "p2", "k3")
-    coefficients = _read_numbers(lens, keys, f"{where}.distortion", faults, default=0.0)
+    distortion, recorded = _read_lens(entry.get("distortion", {}), f"{where}.distortion", faults)
     pose = entry.get("camera_from_world")
     pose = pose if isinstance(pose, dict) else {}
     rotation = _read_array(pose.get("rotation"), (3, 3), f"{where}.camera_from_world.rotation", faults)
@@ -149,8 +163,9 @@ def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
         faults.append(f"{where}.intrinsics: fx and fy must be positive")
     if len(faults) > before or rotation is None or translation is None or not width or not height:
         return None
-    intrinsics = Intrinsics(width, height, fx, fy, cx, cy, Distortion(*coefficients))
-    return Camera(entry["name"], intrinsics, RigidTransform(nearest_rotation(rotation), translation), covariance)
+    intrinsics = Intrinsics(width, height, fx, fy, cx, cy, distortion)
+    pose = RigidTransform(nearest_rotation(rotation), translation)
+    return Camera(entry["name"], intrinsics, pose, covariance, recorded)
 
 
 def _rotation_faults(rotation: np.ndarray, where: str) -> list[str]:

@@ -1,7 +1,7 @@
 """One synchronised shot of every camera, and the folder that holds it.
 
 cameras.json                       (or a COLMAP, caliscope or aniposelib file: rig.formats.cameras_file)
-images/<camera>.png|jpg|jpeg|tif|webp
+images/<camera>.png|jpg|jpeg|tif|webp, RAW, DNG or HEIC
 background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
 features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
@@ -18,27 +18,25 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, Features
 from rig.errors import InputError
-from rig.formats.cameras_file import find_rig_file, read_rig_file, rig_file_parts
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import decode_image_file, write_image
+from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, write_image
 from rig.formats.unread_keys import unread_keys
 from rig.plausibility import rig_faults
 from rig.rig import Rig
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
-
 
 PLATES_MOST = 32  # clean plates read per camera
 
 
 def read_capture(folder: Path) -> tuple[Capture, Rig]:
-    """Reads a capture folder. Raises InputError that names every fault in it."""
+    """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Raises InputError
+    that names every fault in it."""
     faults: list[str] = []
     folder = capture_root(folder)
     rig_file = find_rig_file(folder)
     if rig_file is None:
-        raise InputError(folder.name, ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+        raise InputError(folder.name, [NO_RIG])
     try:
         rig = read_rig_file(rig_file)
     except InputError as error:
@@ -70,7 +68,7 @@ def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
         mask = _image_file(folder / "masks", camera.name, faults)
         plates = _plate_files(folder / "background", camera.name, faults)
         if image is None:
-            faults.append(f"images/{camera.name}.png is missing (or .jpg, .jpeg, .tif, .webp)")
+            faults.append(f"images/{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)")
         if not plates and mask is None:
             faults.append(
                 f"background/{camera.name}.png is missing: a clean plate, or masks/{camera.name}.png, is needed"
@@ -98,12 +96,13 @@ def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
     if (folder / "features.json").is_file():
         data = (folder / "features.json").read_bytes()
         digests["features.json"] = hashlib.sha256(data).hexdigest()
-        features = features_from_bytes(data, rig, faults)
+        features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
     return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
-    """Writes a capture folder of PNG files; every file under a temporary name first."""
+    """Writes a capture folder of PNG files, the pictures as ``rig``'s cameras took them; every file under a temporary
+    name first."""
     write_rig(rig, folder / "cameras.json")
     files: list[tuple[Path, np.ndarray]] = []
     for name, image in capture.images.items():
@@ -121,6 +120,16 @@ def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
         write_atomically(folder / "features.json", text.encode())
 
 
+def _in_read_pictures(features: Features, rig: Rig) -> Features:
+    """Points that were picked in the files, where the pictures are undistorted as they are read."""
+
+    def moved(name: str, pixel: np.ndarray) -> np.ndarray:
+        lens = rig[name].recorded
+        return pixel if lens is None else lens.undistorted(pixel[None], rig[name].intrinsics.matrix())[0]
+
+    return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
+
+
 def _decode(folder: Path, kind: str, name: str, path: Path, *, rig: Rig) -> tuple[np.ndarray | None, str, str]:
     k = rig[name].intrinsics
     where = path.relative_to(folder).as_posix()
@@ -128,6 +137,8 @@ def _decode(folder: Path, kind: str, name: str, path: Path, *, rig: Rig) -> tupl
     if pixels is not None and pixels.shape[:2] != (k.height, k.width):
         height, width = pixels.shape[:2]
         return None, "", size_fault(where, (width, height), (k.width, k.height))
+    if pixels is not None and (lens := rig[name].recorded) is not None:
+        pixels = lens.undistort(pixels, k.matrix(), smooth=kind != "masks")
     if pixels is not None and kind == "masks":
         pixels = pixels > 0
         if not pixels.any():

@@ -16,18 +16,21 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.formats.cameras_json import CAMERAS_MOST
-from rig.formats.foreign import judged_rig, parsed
+from rig.formats.foreign import camera_names, judged_rig, lens_entry, parsed
 from rig.geometry import vector_from_rotation
 from rig.rig import Rig
 
-# name: (number in the binary file, parameter names in their order). Fisheye and other models have no counterpart here.
+# name: (number in the binary file, parameter names in their order). FOV and thin prisms have no counterpart here.
 COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
     "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
     "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k1")),
     "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
     "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": (5, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
     "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
 }
 
 
@@ -41,7 +44,7 @@ def read_colmap(folder: Path, suffix: str = ".bin") -> Rig:
     binary = suffix == ".bin"
     cameras = parsed(files[0], _binary_cameras if binary else _text_cameras)
     images = parsed(files[1], _binary_images if binary else _text_images)
-    names = _image_names([image.name for image in images])
+    names = camera_names([image.name for image in images])
     faults: list[str] = []
     entries = []
     for name, image in zip(names, images, strict=True):
@@ -49,7 +52,7 @@ def read_colmap(folder: Path, suffix: str = ".bin") -> Rig:
         if camera is None:
             faults.append(f"image {name!r} names camera {image.camera}, which cameras{suffix} lacks")
             continue
-        entries.append(_colmap_entry(name, image, camera, faults))
+        entries.append(_colmap_entry(name, image, camera))
     return judged_rig(entries, subject, faults)
 
 
@@ -179,18 +182,8 @@ def _model_fault(model: str, number: Any) -> str:
     return f"camera {number!s:.20} has the model {model}; known are {', '.join(COLMAP_MODELS)}"
 
 
-def _image_names(files: list[str]) -> list[str]:
-    """Camera names: the images' stems or, where those repeat (``cam00/shot.png``), the folders they lie in."""
-    paths = [Path(file.replace("\\", "/")) for file in files]
-    stems = [path.stem for path in paths]
-    folders = [path.parent.name for path in paths]
-    return folders if len(set(stems)) < len(stems) and all(folders) else stems
-
-
-def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[str]) -> dict[str, object]:
+def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera) -> dict[str, object]:
     parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
-    if any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
-        faults.append(f"image {name!r}: k4, k5, k6 of FULL_OPENCV are not zero; calibrate with k1 k2 p1 p2 k3 only")
     focal = parameters.get("f", 0.0)
     w, x, y, z = _unit_quaternion(image.pose[:4])
     rotation = [
@@ -208,7 +201,7 @@ def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: l
             "cx": parameters["cx"] - 0.5,
             "cy": parameters["cy"] - 0.5,
         },
-        "distortion": {key: parameters.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")},
+        "distortion": lens_entry(parameters, fisheye="FISHEYE" in camera.model),
         "camera_from_world": {"rotation": rotation, "translation": list(image.pose[4:])},
     }
 
@@ -219,9 +212,13 @@ def _unit_quaternion(values: list[float]) -> tuple[float, ...]:
     return tuple(value / length for value in values) if 0.9 < length < 1.1 else (math.nan,) * 4
 
 
-def _colmap_parameters(camera: Camera) -> list[float]:
-    k, d = camera.intrinsics, camera.intrinsics.distortion
-    return [k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, d.k1, d.k2, d.p1, d.p2, d.k3, 0.0, 0.0, 0.0]
+def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
+    """The model's name and its parameters."""
+    k, lens = camera.intrinsics, camera.recorded
+    frame = [k.fx, k.fy, k.cx + 0.5, k.cy + 0.5]
+    if lens is None:
+        return "FULL_OPENCV", [*frame, *k.distortion.opencv().tolist(), 0.0, 0.0, 0.0]
+    return "OPENCV_FISHEYE" if lens.model == "kannala-brandt" else "FULL_OPENCV", [*frame, *lens.coefficients]
 
 
 def _colmap_pose(camera: Camera) -> list[float]:
@@ -236,8 +233,8 @@ def _text_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for number, camera in enumerate(rig, start=1):
         k = camera.intrinsics
-        parameters = " ".join(map(repr, _colmap_parameters(camera)))
-        cameras.append(f"{number} FULL_OPENCV {k.width} {k.height} {parameters}")
+        model, parameters = _colmap_model(camera)
+        cameras.append(f"{number} {model} {k.width} {k.height} {' '.join(map(repr, parameters))}")
         images += [f"{number} {' '.join(map(repr, _colmap_pose(camera)))} {number} {camera.name}{suffix}", ""]
     points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
     return "\n".join([*cameras, ""]).encode(), "\n".join([*images, ""]).encode(), points.encode()
@@ -246,10 +243,11 @@ def _text_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
 def _binary_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
     count = struct.pack("<Q", len(rig))
     cameras, images = [count], [count]
-    model = COLMAP_MODELS["FULL_OPENCV"][0]
     for number, camera in enumerate(rig, start=1):
         k = camera.intrinsics
-        cameras.append(struct.pack("<iiQQ12d", number, model, k.width, k.height, *_colmap_parameters(camera)))
+        model, parameters = _colmap_model(camera)
+        head = struct.pack("<iiQQ", number, COLMAP_MODELS[model][0], k.width, k.height)
+        cameras.append(head + struct.pack(f"<{len(parameters)}d", *parameters))
         images.append(struct.pack("<i7di", number, *_colmap_pose(camera), number))
         images.append(f"{camera.name}{suffix}".encode() + b"\0" + struct.pack("<Q", 0))
     return b"".join(cameras), b"".join(images), struct.pack("<Q", 0)

@@ -5,14 +5,20 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
 
 from rig.errors import InputError
-from rig.formats.cameras_json import FORMAT, rig_from_document
+from rig.formats.cameras_json import FORMAT, name_fault, rig_from_document
+from rig.formats.images import IMAGE_SUFFIXES, picture_size
+from rig.recorded_lens import COEFFICIENTS, LensModel
 from rig.rig import Rig
 
 T = TypeVar("T")
+MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
+LENS_LOSS_PX = 0.02  # a lens may lose so much on the way in: a tenth of what a camera's place is known by
+METRES_MOST = 30.0  # the widest head rig, in metres; in millimetres it would fit in a hand
 BYTES_MOST = 1 << 29  # a sparse model of a rig is a few megabytes; its 2D points may be many
 
 
@@ -41,6 +47,23 @@ def judged_rig(entries: Sequence[Mapping[str, object]], subject: str, faults: li
     return rig
 
 
+def camera_names(files: list[str]) -> list[str]:
+    """Camera names: the pictures' stems or, where those repeat (``cam00/shot.png``), the folders they lie in."""
+    paths = [Path(file.replace("\\", "/")) for file in files]
+    stems = [path.stem for path in paths]
+    folders = [path.parent.name for path in paths]
+    return folders if len(set(stems)) < len(stems) and all(folders) else stems
+
+
+def lens_entry(parameters: Mapping[str, float], *, fisheye: bool = False) -> dict[str, str | float]:
+    """The ``distortion`` of ``eigenhead-cameras/1`` of coefficients in OpenCV's names; those that are missing are 0."""
+    model: LensModel | None = "kannala-brandt" if fisheye else None
+    if model is None and any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
+        model = "rational"
+    keys = COEFFICIENTS[model] if model else ("k1", "k2", "p1", "p2", "k3")
+    return {"model": model or "brown-conrady", **{key: parameters.get(key, 0.0) for key in keys}}
+
+
 def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[str]) -> np.ndarray:
     """``value`` as an array; on a fault, one of NaN of the wanted shape, so that the other faults are still found."""
     try:
@@ -51,3 +74,52 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
         faults.append(f"{where} is missing or no list of {' x '.join(map(str, shape)) + ' ' if shape else ''}numbers")
         return np.full(shape or (3, 3), np.nan)
     return array
+
+
+def xml_root(data: bytes) -> ElementTree.Element:
+    """The root of an XML file without declarations of its own: entities may unfold to any size."""
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise ValueError("declares entities or a document type, which no exporter writes")
+    try:
+        return ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"is no XML: {error}") from None
+
+
+def sized(folder: Path, name: str, faults: list[str]) -> tuple[int, int]:
+    """Width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold them.
+    Where there is none, a fault that says where to put it."""
+    for place in (folder, folder / "images", folder.parent / "images"):
+        for path in sorted(place.glob(f"{name}.*")) if name_fault(name) is None else ():
+            if path.suffix.lower() in IMAGE_SUFFIXES:
+                try:
+                    return picture_size(path)
+                except InputError as error:
+                    faults.append(f"{path.name} {error.faults[0]}")
+    faults.append(f"{name}: its picture is wanted beside the file or in images/, which tells the size in pixels")
+    return 1024, 1024
+
+
+def brown_conrady(radial: Sequence[float], radius: float, focal: float, where: str, faults: list[str]) -> list[float]:
+    """k1 k2 k3 of a radial polynomial k1 k2 k3 k4 ..., fitted over the picture where k4 is not zero.
+
+    Args:
+        radius: how far the picture reaches, of ``X / Z``.
+        focal: px; the fit may miss by ``LENS_LOSS_PX`` of it.
+    """
+    if not any(radial[3:]) or not np.isfinite([*radial, radius, focal]).all():
+        return list(radial[:3])
+    r2 = np.linspace(0.0, max(radius, 1e-3) ** 2, 400)
+    powers = r2[:, None] ** np.arange(1, len(radial) + 1) * np.sqrt(r2)[:, None]
+    wanted = powers @ np.array(radial)
+    found = np.linalg.lstsq(powers[:, :3], wanted, rcond=None)[0]
+    miss_px = focal * np.abs(powers[:, :3] @ found - wanted).max()
+    if not miss_px <= LENS_LOSS_PX:
+        faults.append(f"{where}.k4 bends the picture by {miss_px:.2f} px more than k1 k2 k3 can: calibrate without it")
+    return found.tolist()
+
+
+def corner_radius(size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]) -> float:
+    """How far the corners lie from the axis, of ``X / Z``."""
+    across, down = (max(c, n - c) / f if f > 0 else np.nan for n, f, c in zip(size, focal, centre, strict=True))
+    return float(np.hypot(across, down))

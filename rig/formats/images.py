@@ -1,8 +1,15 @@
-"""Picture files: read by their content, written so that no reader meets half of one."""
+"""Picture files: read by their content, written so that no reader meets half of one.
+
+Ordinary pictures (8 or 16 bits) are decoded by OpenCV, RAW and DNG by LibRaw, HEIC by libheif; all become 8-bit sRGB.
+An EXIF flag of orientation is not obeyed: calibrations hold for the sensor's own rows and columns.
+"""
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,6 +21,9 @@ from rig.capture import ImageRgb
 from rig.errors import InputError
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")  # JPEG covers the MPO that many phones write into a .jpg
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+HEIC_SUFFIXES = (".heic", ".heif")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *RAW_SUFFIXES, *HEIC_SUFFIXES)
 
 
 PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
@@ -45,21 +55,108 @@ def read_image(path: Path) -> ImageRgb:
     return pixels
 
 
+def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height as the header says: a small file may claim any size. Raises InputError where there is none."""
+    with _faults_of(path.name):
+        return _header_size(path.read_bytes(), path.suffix.lower())[0]
+
+
+def open_picture(path: Path) -> Image.Image:
+    """The picture for Pillow, decoded as far as it must be: for thumbnails. Raises InputError."""
+    if path.suffix.lower() in (*RAW_SUFFIXES, *HEIC_SUFFIXES):
+        return Image.fromarray(read_image(path))
+    with _faults_of(path.name):
+        return Image.open(path, formats=IMAGE_FORMATS)
+
+
 def decode_image_file(path: Path, where: str, *, grey: bool) -> tuple[np.ndarray | None, str, str]:
-    data = path.read_bytes()
+    """Pixels (RGB, or one channel), the sha256 of the file, and the fault (then no pixels) as a sentence."""
+    data, suffix = path.read_bytes(), path.suffix.lower()
     try:
-        with Image.open(BytesIO(data), formats=IMAGE_FORMATS) as header:  # reads the header only
-            width, height = header.size
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return None, "", f"{where} is damaged or no PNG, JPEG, TIFF or WebP image"
-    if width * height > PIXELS_MOST:
-        return None, "", f"{where} is {width} x {height} pixels; at most {PIXELS_MOST:,} are read"
-    flags = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB
-    # The calibration holds for the sensor's own rows and columns, whatever an EXIF flag says of the picture.
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        pixels = None
-    if pixels is None or (path.suffix.lower() == ".png" and b"IEND" not in data[-16:]):
+        with _faults_of(where):
+            (width, height), profile = _header_size(data, suffix)
+        if width * height > PIXELS_MOST:
+            raise InputError(where, [f"is {width} x {height} pixels; at most {PIXELS_MOST:,} are read"])
+        with _faults_of(where, "its pixels cannot be decoded"):
+            pixels = _decoded(data, suffix, grey=grey)
+    except InputError as error:
+        return None, "", f"{where} {error.faults[0]}"
+    if suffix == ".png" and b"IEND" not in data[-16:]:
         return None, "", f"{where} is damaged: its pixels cannot be decoded"
+    if profile and not grey:
+        pixels = _in_srgb(pixels, profile)
     return pixels, hashlib.sha256(data).hexdigest(), ""
+
+
+@contextmanager
+def _faults_of(where: str, told: str = "") -> Iterator[None]:
+    """What decoders raise for a damaged file, as InputError."""
+    said = f"is damaged: {told}" if told else "is damaged or no PNG, JPEG, TIFF, WebP, RAW or HEIC picture"
+    try:
+        yield
+    except Image.DecompressionBombError as error:
+        raise InputError(where, [f"claims to be huge; at most {PIXELS_MOST:,} pixels are read"]) from error
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, cv2.error) as error:
+        raise InputError(where, [said]) from error
+
+
+def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
+    """Width and height, and the colour profile (empty: sRGB)."""
+    if suffix in RAW_SUFFIXES:
+        with _raw(data) as raw:
+            return (raw.sizes.width, raw.sizes.height), b""
+    if suffix in HEIC_SUFFIXES:
+        header = _heif(data)
+        return header.size, header.info.get("icc_profile") or b""
+    with Image.open(BytesIO(data), formats=IMAGE_FORMATS) as header:  # reads the header only
+        return header.size, header.info.get("icc_profile") or b""
+
+
+def _decoded(data: bytes, suffix: str, *, grey: bool) -> np.ndarray:
+    if suffix in RAW_SUFFIXES:
+        with _raw(data) as raw:
+            # As the camera balanced it, no brightness of each picture's own: eleven cameras must stay comparable.
+            pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8, user_flip=0)
+    elif suffix in HEIC_SUFFIXES:
+        pixels = np.asarray(_heif(data).to_pillow().convert("RGB"))
+    else:
+        flags = (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB) | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if pixels is None:
+            raise ValueError("not decoded")
+        return pixels
+    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if grey else np.ascontiguousarray(pixels)
+
+
+@contextmanager
+def _raw(data: bytes) -> Iterator[Any]:
+    import rawpy  # 0.1 s, and a library that few captures need
+
+    try:
+        with rawpy.imread(BytesIO(data)) as raw:
+            yield raw
+    except rawpy.LibRawError as error:
+        raise ValueError(str(error)) from error
+
+
+def _heif(data: bytes) -> Any:
+    try:
+        import pi_heif
+    except ModuleNotFoundError:
+        raise InputError("picture", ["is HEIC, which needs the extra heic: pip install 'eigenhead[heic]'"]) from None
+    return pi_heif.open_heif(BytesIO(data))
+
+
+def _in_srgb(pixels: ImageRgb, profile: bytes) -> ImageRgb:
+    """Colours of another profile (Display P3, Adobe RGB) as sRGB; a profile that cannot be read is taken for it."""
+    from PIL import ImageCms
+
+    try:
+        source = ImageCms.ImageCmsProfile(BytesIO(profile))
+        if "srgb" in ImageCms.getProfileDescription(source).lower():
+            return pixels
+        into = ImageCms.createProfile("sRGB")
+        turned = ImageCms.profileToProfile(Image.fromarray(pixels), source, into, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError):
+        return pixels
+    return pixels if turned is None else np.array(turned)

@@ -13,11 +13,10 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.foreign import judged_rig, number_array, parsed
+from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, judged_rig, lens_entry, number_array, parsed
 from rig.geometry import rotation_from_vector, vector_from_rotation
+from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
-
-METRES_MOST = 30.0  # the widest head rig, in metres; in millimetres it would fit in a hand
 
 
 def read_toml(path: Path) -> Rig:
@@ -48,7 +47,7 @@ def write_caliscope(rig: Rig, path: Path) -> None:
             "name": camera.name,
             "rotation_count": 0,
             "ignore": False,
-            "fisheye": False,
+            "fisheye": camera.recorded is not None and camera.recorded.model == "kannala-brandt",
         }
         keys |= _toml_intrinsics(camera)
         keys["rotation"] = camera.camera_from_world.rotation.tolist()
@@ -62,6 +61,8 @@ def write_aniposelib(rig: Rig, path: Path) -> None:
     blocks = []
     for number, camera in enumerate(rig):
         keys: dict[str, object] = {"name": camera.name, **_toml_intrinsics(camera)}
+        if camera.recorded is not None and camera.recorded.model == "kannala-brandt":
+            keys["fisheye"] = True
         keys["rotation"] = vector_from_rotation(camera.camera_from_world.rotation).tolist()
         keys["translation"] = camera.camera_from_world.translation.tolist()
         blocks.append(_toml_block(f"cam_{number}", keys))
@@ -75,18 +76,18 @@ def _toml_entry(name: str, table: Any, millimetres: float, faults: list[str]) ->
         return {}
     if isinstance(table.get("name"), str):
         name = table["name"]
-    if table.get("fisheye") is True:
-        faults.append(f"{name} is a fisheye camera, which is not supported")
+    fisheye = table.get("fisheye") is True
     if table.get("rotation_count") not in (None, 0):
         faults.append(f"{name}.rotation_count is {table['rotation_count']!r:.20}: turn its images and calibrate again")
     matrix = number_array(table.get("matrix"), (3, 3), f"{name}.matrix", faults)
     rotation = number_array(table.get("rotation"), None, f"{name}.rotation", faults)
     translation = number_array(table.get("translation"), (3,), f"{name}.translation", faults)
-    lens = number_array(table.get("distortions", [0.0] * 5), None, f"{name}.distortions", faults)
+    lens = number_array(table.get("distortions", [0.0] * 4), None, f"{name}.distortions", faults)
     if rotation.shape == (3,):
         rotation = rotation_from_vector(rotation) if np.isfinite(rotation).all() else np.full((3, 3), np.nan)
-    if lens.ndim != 1 or not 1 <= len(lens) <= 14 or lens[5:].any():
-        faults.append(f"{name}.distortions must be at most 5 coefficients (k1 k2 p1 p2 k3)")
+    names = COEFFICIENTS["kannala-brandt" if fisheye else "rational"]
+    if lens.ndim != 1 or not 1 <= len(lens) <= 14 or lens[len(names) :].any():
+        faults.append(f"{name}.distortions must be at most {len(names)} coefficients ({' '.join(names)})")
     if matrix.shape == (3, 3) and abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
         faults.append(f"{name}.matrix has skew, which is not supported")
     size = table.get("size")
@@ -95,15 +96,10 @@ def _toml_entry(name: str, table: Any, millimetres: float, faults: list[str]) ->
         "name": name,
         "width": width,
         "height": height,
-        "intrinsics": {key: float(matrix[at]) for key, at in _MATRIX_PLACES.items()},
-        "distortion": dict(
-            zip(("k1", "k2", "p1", "p2", "k3"), np.resize(np.append(lens, [0.0] * 5), 5).tolist(), strict=True)
-        ),
+        "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
+        "distortion": lens_entry(dict(zip(names, lens.ravel().tolist(), strict=False)), fisheye=fisheye),
         "camera_from_world": {"rotation": rotation.tolist(), "translation": (millimetres * translation).tolist()},
     }
-
-
-_MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 
 
 def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]]) -> float:
@@ -136,7 +132,9 @@ def _toml_intrinsics(camera: Camera) -> dict[str, list]:
     return {
         "size": [k.width, k.height],
         "matrix": k.matrix().tolist(),
-        "distortions": k.distortion.opencv().tolist(),
+        "distortions": k.distortion.opencv().tolist()
+        if camera.recorded is None
+        else list(camera.recorded.coefficients),
     }
 
 

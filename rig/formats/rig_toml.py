@@ -87,6 +87,7 @@ class ShotConfig:
     open_timeout_s: float = 10.0
     warm_up_frames: int = 3
     plates: int = 5
+    plates_over_s: float = 3.0  # from the first clean plate to the last: in that time a person who sits still moves
     skew_most_ms: float = 40.0  # in which a head that drifts at 25 mm/s moves 1 mm
     clipped_most: float = 0.05  # share of pixels at 255 in every channel
     dark_below: float = 0.25  # brightness relative to the clean plates
@@ -147,6 +148,22 @@ def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject:
     if faults or config is None:
         raise InputError(subject, faults)
     return dataclasses.replace(config, folder=folder)
+
+
+def adjusted(
+    config: RigConfig, cameras: Mapping[str, Mapping[str, float | None]], outputs: tuple[int, ...] | None
+) -> RigConfig:
+    """The rig with other ``exposure_ms``, ``gain_db`` and ``white_balance_k`` of cameras, and other lamps (None: those
+    of rig.toml). Raises InputError that names every fault."""
+    changed = dataclasses.replace(
+        config,
+        cameras=tuple(dataclasses.replace(camera, **cameras.get(camera.name, {})) for camera in config.cameras),
+        lights=config.lights if outputs is None else dataclasses.replace(config.lights, outputs=outputs),
+    )
+    faults = _rig_faults(changed)
+    if faults:
+        raise InputError("rig", faults)
+    return changed
 
 
 def _rig_faults(config: RigConfig) -> list[str]:

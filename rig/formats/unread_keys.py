@@ -7,15 +7,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from rig.recorded_lens import COEFFICIENTS
+
 READ = {
     "": {"format", "unit", "cameras"},
     "cameras": {"name", "width", "height", "intrinsics", "distortion", "camera_from_world", "covariance"},
     "cameras.intrinsics": {"fx", "fy", "cx", "cy"},
     "cameras.camera_from_world": {"rotation", "translation"},
 }
-LENS_MODELS = {
+LENS_MODELS: dict[str, set[str]] = {
     "brown-conrady": {"model", "k1", "k2", "p1", "p2", "k3"},
-    "kannala-brandt": {"model", "k1", "k2", "k3", "k4"},
+    **{model: {"model", *keys} for model, keys in COEFFICIENTS.items()},
 }
 TOLD_MOST = 8
 
@@ -23,7 +25,7 @@ TOLD_MOST = 8
 def unread_keys(path: Path) -> tuple[str, ...]:
     """A sentence for every key of a rig file that is not read; nothing for the files of other programs, which have keys
     of their own, and for a file that cannot be read at all, which its reader refuses."""
-    if path.suffix != ".json":
+    if path.suffix != ".json" or path.name == "transforms.json":
         return ()
     try:
         document = json.loads(path.read_text(encoding="utf-8-sig"))

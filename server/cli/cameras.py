@@ -105,18 +105,26 @@ def refine(
 @app.command(epilog="Example: eigenhead convert cameras.json --to colmap --out sparse/0")
 def convert(
     source: Annotated[Path, typer.Argument(help="A rig's file, or a folder that holds one.", exists=True)],
-    out: Annotated[Path, typer.Option(help="The file to write; for COLMAP the folder.")],
-    to: Annotated[str, typer.Option(help="eigenhead, colmap, colmap-text, caliscope or aniposelib.")] = "eigenhead",
+    out: Annotated[
+        Path, typer.Option(help="The file to write; for COLMAP, RealityCapture's XMP and OpenCV's YAML the folder.")
+    ],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="eigenhead, colmap, colmap-text, caliscope, aniposelib, metashape, realitycapture, "
+            "realitycapture-csv, nerfstudio, opencv-yaml or blender."
+        ),
+    ] = "eigenhead",
     json_out: Json = False,
 ) -> None:
     """Convert calibrations to and from other programs."""
     from rig.errors import InputError
-    from rig.formats.cameras_file import FORMATS, find_rig_file, read_rig_file, write_rig_file
+    from rig.formats.cameras_file import FORMATS, NO_RIG, find_rig_file, read_rig_file, write_rig_file
 
     one_of(lambda: FORMATS)(to)
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:
-        raise InputError(str(source), ["holds no cameras.json, COLMAP model, camera_array.toml or aniposelib file"])
+        raise InputError(str(source), [NO_RIG])
     rig = read_rig_file(file)
     write_rig_file(rig, out, to)
     answer({"out": str(out), "cameras": list(rig.names)}, json_out, [f"{out}  {len(rig)} cameras"])

@@ -23,11 +23,13 @@ from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_egl
 
 OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", CACHE})  # not read in ServiceSettings
-# The tables of server.storage.database in words of the databases' own: SQLAlchemy takes longer to load than all checks.
+# The tables of server.storage.database and of the job engine in words of the databases' own: SQLAlchemy takes longer
+# to load than all checks.
 TABLES = {
-    "sqlite": "SELECT name FROM sqlite_master WHERE name = 'eigenhead_workers'",
-    "postgresql": "SELECT tablename FROM pg_tables WHERE tablename = 'eigenhead_workers'",
+    "sqlite": "SELECT name FROM sqlite_master WHERE name = '{}'",
+    "postgresql": "SELECT tablename FROM pg_tables WHERE tablename = '{}'",
 }
+JOBS = {"sqlite": "workflow_status", "postgresql": "dbos.workflow_status"}
 NOW = {
     "sqlite": "((julianday('now') - 2440587.5) * 86400.0)",
     "postgresql": "extract(epoch from clock_timestamp())",
@@ -60,6 +62,7 @@ def examine(settings: ServiceSettings) -> dict[str, Finding]:
         "models": _models,
         "cache": _cache,
         "database": _database,
+        "results": _results,
         "variables": _variables,
         "rig": _rig,
         "port": _port,
@@ -139,25 +142,20 @@ def _cache(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _database(settings: ServiceSettings) -> tuple[bool, str]:
     """Reads it where there is one."""
-    scheme, _, rest = settings.url.partition("://")
-    connection: Connection
-    if scheme == "sqlite":
-        path = Path(rest.removeprefix("/"))
-        if not path.is_file():
-            left = [name for name in ("captures", "jobs") if any((settings.data / name).glob("*"))]
-            if left:
-                return False, f"{path} is not there, but {' and '.join(left)} are: restore its copy beside them"
-            return True, f"{path}, `eigenhead serve` will make it; no API key"
-        connection = _read_only(path)
-    else:
-        import psycopg
-
-        connection = psycopg.connect(f"postgresql://{rest}", connect_timeout=10)
+    kind = _kind(settings)
+    connection = _connected(settings)
+    if connection is None:
+        left = [name for name in ("captures", "jobs") if any((settings.data / name).glob("*"))]
+        if left:
+            return (
+                False,
+                f"{_sqlite(settings)} is not there, but {' and '.join(left)} are: restore its copy beside them",
+            )
+        return True, f"{_sqlite(settings)}, `eigenhead serve` will make it; no API key"
     with closing(connection):
-        if scheme == "sqlite" and _rows(connection, "PRAGMA quick_check(1)") != [("ok",)]:
+        if kind == "sqlite" and _rows(connection, "PRAGMA quick_check(1)") != [("ok",)]:
             return False, f"{settings.place} is damaged: stop the service, keep the file, and restore a copy of it"
-        kind = "sqlite" if scheme == "sqlite" else "postgresql"
-        if not _rows(connection, TABLES[kind]):
+        if not _rows(connection, TABLES[kind].format("eigenhead_workers")):
             return True, f"{settings.place}, empty: `eigenhead serve` will make its tables"
         alive = (
             f"SELECT count(*) FROM eigenhead_workers WHERE stopped IS NULL AND seen > {NOW[kind]} - {settings.silent_s}"
@@ -165,6 +163,41 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
         ((count,),) = _rows(connection, alive)
         ((keys,),) = _rows(connection, "SELECT count(*) FROM eigenhead_api_keys")
     return True, f"{settings.place}, {count} workers alive, {keys} API keys"
+
+
+def _results(settings: ServiceSettings) -> tuple[bool, str]:
+    """Names jobs that succeeded and whose folder is gone: removed by hand, or not in the backup that was restored."""
+    kind = _kind(settings)
+    connection = _connected(settings)
+    if connection is None:
+        return True, "none yet"
+    with closing(connection):
+        if not _rows(connection, TABLES[kind].format("workflow_status")):
+            return True, "none yet"
+        query = f"SELECT workflow_uuid FROM {JOBS[kind]} WHERE name = 'reconstruct' AND status = 'SUCCESS'"
+        jobs = [str(job) for (job,) in _rows(connection, query)]
+    missing = [job for job in jobs if not (settings.data / "jobs" / job / "result").is_dir()]
+    if not missing:
+        return True, f"of {len(jobs)} jobs, all there"
+    told = f"{', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}"
+    return False, f"of {len(jobs)} jobs {len(missing)} are gone ({told}): restore `jobs` from a backup, or restart them"
+
+
+def _kind(settings: ServiceSettings) -> str:
+    return "sqlite" if settings.url.startswith("sqlite:") else "postgresql"
+
+
+def _connected(settings: ServiceSettings) -> Connection | None:
+    """A connection to read with; None where the file of SQLite is not there."""
+    if _kind(settings) == "sqlite":
+        return _read_only(_sqlite(settings)) if _sqlite(settings).is_file() else None
+    import psycopg
+
+    return psycopg.connect(f"postgresql://{settings.url.partition('://')[2]}", connect_timeout=10)
+
+
+def _sqlite(settings: ServiceSettings) -> Path:
+    return Path(settings.url.removeprefix("sqlite:///"))
 
 
 def _rows(connection: Connection, query: str) -> list[tuple[Any, ...]]:

@@ -266,7 +266,7 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden or visible."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible or surfaces."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
@@ -275,6 +275,7 @@ def experiments(
         int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
     ] = None,
     captures: Annotated[bool, typer.Option(help="hidden, visible: the captures of --shared, too.")] = False,
+    openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
     shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
     out: Annotated[
         Path | None, typer.Option(help="Keeps rows there, so that a stopped run goes on; and the table and pictures.")
@@ -291,6 +292,7 @@ def experiments(
             subjects=subjects,
             simplex=simplex,
             captures=captures,
+            openmvs=openmvs,
             shared=shared,
             folder=out,
             report=report,

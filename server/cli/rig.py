@@ -98,10 +98,16 @@ def rig_board(
 
 
 @rig_app.command("plates", epilog="Example: eigenhead rig plates --rig rig.toml")
-def rig_plates(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
-    """Take new clean plates of the empty studio."""
+def rig_plates(
+    rig: RigFile = Path("rig.toml"),
+    use: Annotated[str, typer.Option(help="Put these to use instead: an id under plates.versions.")] = "",
+    json_out: Json = False,
+) -> None:
+    """Take new clean plates of the empty studio, or put earlier or refused ones to use."""
     from rig.acquisition.commands import take_plates
+    from rig.acquisition.plates import use_plates
     from rig.formats.rig_toml import read_rig_config
 
-    taken = sorted(take_plates(read_rig_config(rig)).files)
+    config = read_rig_config(rig)
+    taken = sorted((use_plates(config.plates_folder, use, config.names) if use else take_plates(config)).files)
     answer({"cameras": taken}, json_out, [f"clean plates of {len(taken)} cameras"])

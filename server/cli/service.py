@@ -46,7 +46,7 @@ def worker(
     from server.worker.worker import run_worker
 
     settings = service_settings(data=data, queue=queue, concurrency=concurrency)
-    set_up(settings.log_json)
+    set_up(settings.log_json, jobs=settings.data / "jobs")
     run_worker(settings, until_eof=until_eof)
 
 

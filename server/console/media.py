@@ -3,6 +3,7 @@ attributes of results. Each asks who the browser's session is, as the API asks f
 
 import asyncio
 import threading
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,10 +11,9 @@ import numpy as np
 from fastapi import Depends, Request, Response
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from nicegui import app as pages
-from PIL import Image
 
 from rig.errors import EigenheadError
-from rig.formats.images import IMAGE_FORMATS
+from rig.formats.images import open_picture
 from server.console import comparison
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
@@ -72,6 +72,18 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     if not path.is_file():
         make_thumbnail(service.store.folder("captures", capture_id) / "files" / name, path)
     return FileResponse(path, headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/checks")
+def checks(who: Reader, capture_id: str) -> Response:
+    """What was measured of a capture's pictures, by camera."""
+    return JSONResponse(who[0].store.checks(capture_id), headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/holdings")
+def holdings(who: Reader, capture_id: str) -> Response:
+    """What a removal of the capture takes, and what stays."""
+    return JSONResponse(asdict(who[0].captures.holdings(capture_id)), headers={"Cache-Control": "no-store"})
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.image")
@@ -158,7 +170,7 @@ def cameras_file(who: Reader, calibration_id: str) -> Response:
 def make_thumbnail(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = target.with_suffix(f".{threading.get_ident()}")
-    with Image.open(source, formats=IMAGE_FORMATS) as picture:
+    with open_picture(source) as picture:
         picture.draft("RGB", (THUMBNAIL_WIDTH * 2, THUMBNAIL_WIDTH * 2))  # JPEG decodes at a fraction of its size
         picture = picture.convert("RGB")
         picture.thumbnail((THUMBNAIL_WIDTH, THUMBNAIL_WIDTH * 2), reducing_gap=2.0)

@@ -49,6 +49,17 @@ class NewCapture(Received):
     board: bool = Field(False, description="of the calibration board: needs no calibration, cannot be reconstructed")
 
 
+class NewImport(Received):
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz", "label": "Anna"}]}
+    )
+
+    url: str = Field(max_length=2000, description="of an archive of a capture, at a server that the operator allowed")
+    session: Id | None = None
+    label: Text = ""
+    expression: Text = ""
+
+
 class SessionEdit(Received):
     """What is not given stays as it is."""
 
@@ -77,14 +88,31 @@ class NewFeatures(Received):
     points: dict[str, dict[str, list[float]]]
 
 
+class JobWebhook(Received):
+    """Told when this one job ends."""
+
+    url: str = Field(pattern="^https?://", max_length=2000, description="at a server that the operator allowed")
+    secret: str | None = Field(
+        None, pattern="^whsec_[A-Za-z0-9+/]{32,}={0,2}$", description="signs the messages (standardwebhooks.com)"
+    )
+
+
 class NewJob(Received):
     model_config = ConfigDict(
         json_schema_extra={
-            "examples": [{"capture_id": EXAMPLE_ID, "settings": {"detail": "fine", "outputs": {"atlas": True}}}]
+            "examples": [
+                {
+                    "capture_id": EXAMPLE_ID,
+                    "name": "Anna, fine",
+                    "settings": {"detail": "fine", "outputs": {"atlas": True}},
+                }
+            ]
         }
     )
 
     capture_id: Id
+    name: Text = Field("", description="for people; need not be unique")
+    webhook: JobWebhook | None = None
     model: str | None = Field(None, max_length=200)
     settings: JobSettings | None = Field(None, description="of the pipeline; what is not given has its default")
     queue: str | None = Field(None, max_length=32)
@@ -129,6 +157,15 @@ class Size(Answer):
     height: int
 
 
+class FaultOut(Answer):
+    """What is wrong with a capture that was accepted."""
+
+    code: str = Field(description="as in docs/rig.md, among them moved, overexposed, blurred, setting, plates, cut-off")
+    camera: str | None = Field(description="null: the rig as a whole")
+    detail: str
+    remedy: str
+
+
 class CaptureOut(Answer):
     id: str
     created: Moment
@@ -143,6 +180,10 @@ class CaptureOut(Answer):
     bytes: int
     inputs: dict[str, str] = Field(description="sha256 of every file, by name")
     shot: JsonObject | None = Field(None, description="the rig's sync certificate")
+    verdict: Literal["good", "usable", "poor"] | None = Field(
+        None, description="good: no fault; poor: shoot again; null: not judged (of the board, or of an earlier version)"
+    )
+    faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
 
 
 class CaptureList(Answer):
@@ -185,12 +226,13 @@ class ResultList(Answer):
 
 class JobOut(Answer):
     id: str
+    name: str
     state: State
     stage: str
     progress: float = Field(ge=0, le=1)
     eta_s: float | None
     error: JobError | None
-    notice: str | None = Field(None, description="why a queued job cannot begin, and what to do")
+    notice: str | None = Field(None, description="why a queued job cannot begin or a result is gone; what to do")
     capture_id: str | None
     session: str | None
     model: str | None
@@ -327,6 +369,31 @@ class RigOut(Answer):
     cameras: list[CameraOut]
     faults: list[str]
     calibration: str | None
+
+
+class CameraSettingsEdit(Received):
+    """What is not given stays as it is; null leaves it as the camera has it."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"exposure_ms": 8.0, "gain_db": 0.0}]})
+
+    exposure_ms: float | None = Field(None, ge=0.001, le=60_000)
+    gain_db: float | None = Field(None, ge=-60, le=60)
+    white_balance_k: int | None = Field(None, ge=1000, le=20_000)
+
+
+class CameraSettingsOut(Answer):
+    exposure_ms: float | None
+    gain_db: float | None
+    white_balance_k: int | None
+    unmet: list[str] = Field(description="what the camera did not take, and why")
+
+
+class Lights(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"outputs": [0, 1]}]})
+
+    outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
+        max_length=4, description="light outputs of the trigger box that are on during a shot"
+    )
 
 
 class BackgroundOut(Answer):

@@ -1,5 +1,6 @@
 """``eigenhead serve``: the service and, unless told otherwise, a worker process beside it."""
 
+import signal
 import socket
 import subprocess
 import sys
@@ -49,8 +50,14 @@ class WorkerProcess:
         self._thread.join()
 
     def _start(self) -> "subprocess.Popen[bytes]":
+        """With SIGINT blocked, which the worker and its children inherit: Ctrl-C reaches all of a terminal, and is for
+        the service, which then ends its worker."""
         command = python_command("cli", "worker", "--until-eof")
-        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=sys.__stderr__, env=self._environment)
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=sys.__stderr__, env=self._environment)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
     def _watch(self) -> None:
         pause = WORKER_PAUSE_S

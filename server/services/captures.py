@@ -5,10 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import cast
 
+from rig.acquisition.shot import Fault, ShotDocument
+from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
+from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs, refuse_board
 from server.services.rigs import SHOT_BYTES, RigBackend
 from server.settings import ServiceSettings
@@ -52,19 +56,21 @@ class Captures:
     def take(self, about: About, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
         """Triggers the rig now. ``board``: pictures of the calibration board. Raises Unavailable, and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
-        if about.session is not None:
-            self._store.session(about.session)
+        if not board:
+            self._check_consent(about.session)
         with self._store.incoming() as folder:
             capture = folder / "capture"
             shot = self._rig.capture(capture, seed=seed, board=board)
             with self._children.one() as child:
                 ingest = child.remote(ingest_board if board else ingest_folder)
-                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels)
+                judged = {} if board else {"measured": "checks" in shot}
+                content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
             return self._add(capture, "rig", content, about, shot)
 
     def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
         """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
-        fault."""
+        fault, Conflict where the service asks for consent."""
+        self._check_consent(about.session)
         limits = self.archive_limits(archive)
         (folder / "capture").mkdir()
         with self._children.one() as child:
@@ -151,6 +157,26 @@ class Captures:
         self.check_unused(identity)
         self._store.remove_capture(identity)
 
+    def holdings(self, identity: str) -> Holdings:
+        """What a removal would take and what would stay. Raises NotFound."""
+        return holdings(self._store, self._jobs, identity)
+
+    def erase(self, identity: str) -> None:
+        """Cancels the capture's jobs, then removes its images, heads, caches and what the job database holds of them,
+        with or without a session. Raises NotFound, and Unavailable while a worker still writes."""
+        self._store.capture(identity)
+        erase_captures(self._store, self._jobs, [identity])
+
+    def _check_consent(self, session: str | None) -> None:
+        """Raises NotFound; Conflict where the service asks for consent and the session has no note of it."""
+        consent = "" if session is None else self._store.session(session).consent
+        if self._settings.ask_consent and not consent.strip():
+            detail = (
+                "Consent comes before the first picture: begin a session of the subject with a note of who agreed to "
+                "what and when, and take or upload into it."
+            )
+            raise Conflict("consent-missing", detail)
+
     def _add(
         self,
         folder: Path,
@@ -159,8 +185,10 @@ class Captures:
         about: About,
         shot: Mapping[str, object] | None = None,
     ) -> CaptureRecord:
-        if about.session is not None:
-            self._store.session(about.session)
+        if not content.board:
+            self._check_consent(about.session)
+        faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
+        self._store.put_checks(folder, all_checks(shot, content))
         record = CaptureRecord(
             id=new_id(),
             created=datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
@@ -175,6 +203,21 @@ class Captures:
             board=content.board,
             features="features.json" in content.inputs,
             shot=shot,
+            verdict=None if content.board else verdict_of(faults, [camera.name for camera in content.cameras]),
+            faults=faults,
         )
         self._store.add_capture(folder, record)
         return record
+
+
+def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
+    """The faults in a real rig's certificate; the simulated studio's pictures are judged as uploads are."""
+    if shot is None or "checks" not in shot:
+        return ()
+    return tuple(Fault(f["code"], f["camera"], f["detail"]) for f in cast(ShotDocument, shot)["faults"])
+
+
+def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
+    """What the shot and the check of its files measured of each camera."""
+    taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
+    return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

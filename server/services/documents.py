@@ -2,6 +2,8 @@
 
 from typing import TypedDict
 
+from rig.acquisition.shot import FaultDocument
+
 
 class SizeDocument(TypedDict):
     name: str
@@ -23,6 +25,8 @@ class CaptureDocument(TypedDict):
     bytes: int
     inputs: dict[str, str]
     shot: dict[str, object] | None
+    verdict: str | None
+    faults: list[FaultDocument]
 
 
 class ErrorDocument(TypedDict):

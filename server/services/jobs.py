@@ -10,21 +10,24 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import cast
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS, DBOSClient, DBOSConfig, EnqueueOptions, WorkflowStatus
+from dbos import DBOS, DBOSClient, EnqueueOptions, WorkflowStatus
 from sqlalchemy.exc import IntegrityError
 
 from pipeline.settings import settings_from_document
 from rig.errors import EigenheadError, InputError
 from server.errors import URN, Conflict, NotFound, TooMany
+from server.log import log_file
+from server.origins import target
 from server.services.records import Failure, Job
 from server.settings import ServiceSettings
 from server.storage.database import alive_workers, job_index, workers
 from server.storage.events import EventLog, JobEvent
-from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest
+from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
 from server.storage.store import Store, StoredFile, is_id, new_id
 
 APPLICATION = "eigenhead"
@@ -48,10 +51,13 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None."""
+    """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None; what
+    people call it, and who is told of its end beside the service's webhooks."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None
+    name: str = ""
+    webhook: JobWebhook | None = None
 
     def check(self) -> None:
         """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""
@@ -80,18 +86,6 @@ class JobFailed(EigenheadError):
 
     def __str__(self) -> str:
         return self.detail
-
-
-def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
-    return {
-        "name": APPLICATION,
-        "system_database_url": settings.url,
-        "application_version": APPLICATION_VERSION,
-        "executor_id": executor_id,
-        "enable_otlp": False,
-        "log_level": "WARNING",
-        "notification_listener_polling_interval_sec": 1.0,
-    }
 
 
 def migrate(settings: ServiceSettings) -> None:
@@ -124,8 +118,8 @@ class Jobs:
     ) -> Job:
         """Queues a reconstruction of a capture and returns the job. A known idempotency key returns the first job.
 
-        Raises InputError for work that cannot be done, NotFound, DiskFull, Conflict where the key's first request was
-        another one, TooMany.
+        Raises InputError for work that cannot be done, Unusable for a webhook that may not be called, NotFound,
+        DiskFull, Conflict where the key's first request was another one, TooMany.
         """
         wanted.check()
         capture = self._store.capture(capture_id)
@@ -138,6 +132,11 @@ class Jobs:
             "model": wanted.model,
             "settings": wanted.settings or {},
         }
+        if wanted.name:
+            request["name"] = wanted.name
+        if wanted.webhook is not None:
+            target(wanted.webhook["url"], self._settings.webhook_origins)
+            request["webhook"] = wanted.webhook
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def submit_session(self, session: str, wanted: Work, *, key: str, priority: int) -> list[Job]:
@@ -181,6 +180,10 @@ class Jobs:
         """Raises NotFound."""
         return self._job(self._known(job_id))
 
+    def webhook(self, job_id: str) -> JobWebhook | None:
+        """The job's own, if it was given one. Raises NotFound."""
+        return (_request(self._known(job_id)) or {}).get("webhook")
+
     def state(self, job_id: str) -> str:
         return STATES[self._known(job_id, load=False).status]
 
@@ -223,18 +226,38 @@ class Jobs:
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
-        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict where there is no result."""
+        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict without a result."""
         job = self.get(job_id)
         if job.state != "succeeded":
             raise Conflict("no-result", f"The job is {job.state}; it has no result.")
+        if job.notice is not None:
+            raise Conflict("result-missing", job.notice)
         return job.files
+
+    def log(self, job_id: str) -> str:
+        """What its workers said of the job. Raises NotFound."""
+        self.state(job_id)
+        try:
+            return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError as error:
+            raise NotFound("log of the job", job_id, "it has not begun, or was cancelled") from error
+
+    def without_result(self) -> list[str]:
+        """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
+        rows = self.client.list_workflows(
+            name=WORKFLOW, status=STATUSES["succeeded"], sort_desc=True, load_input=False, load_output=False
+        )
+        return [row.workflow_id for row in rows if not self._result(row.workflow_id).is_dir()]
+
+    def _result(self, job_id: str) -> Path:
+        return self._store.folder("jobs", job_id) / "result"
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
         """A file of a result, found in the job's record. Raises NotFound, Conflict."""
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound("file", name, f"GET /v1/jobs/{job_id}/result lists what there is")
-        return StoredFile(self._store.folder("jobs", job_id) / "result" / name, file["sha256"])
+        return StoredFile(self._result(job_id) / name, file["sha256"])
 
     def restart(self, job_id: str, wanted: Work, *, key: str = "local") -> Job:
         """A new job for the same capture, which names the old one. What is None is as in that. Raises InputError,
@@ -282,8 +305,12 @@ class Jobs:
             detail = f"{active} jobs are queued or running for this key, which is the most; wait for one to end."
             raise TooMany("too-many-jobs", detail, retry_after_s=10)
 
-    def _notice(self, queue: str | None) -> str | None:
-        """What keeps a queued job from beginning."""
+    def _notice(self, job_id: str, state: str, queue: str | None) -> str | None:
+        """What keeps a queued job from beginning, or that the files of one that succeeded are gone."""
+        if state == "succeeded" and not self._result(job_id).is_dir():
+            return "Its result is not in the data folder any more: restore it from a backup, or restart the job."
+        if state != "queued":
+            return None
         with self._engine.connect() as connection:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
@@ -308,12 +335,13 @@ class Jobs:
         attributes = row.attributes or {}
         return Job(
             id=row.workflow_id,
+            name="" if request is None else request.get("name", ""),
             state=state,
             stage=progress.get("stage") or ("done" if state == "succeeded" else state),
             progress=1.0 if state == "succeeded" else progress.get("progress", 0.0),
             eta_s=progress.get("eta_s"),
             error=failure(row) if state == "failed" else None,
-            notice=self._notice(row.queue_name) if state == "queued" else None,
+            notice=self._notice(row.workflow_id, state, row.queue_name),
             capture_id=None if request is None else request["capture_id"],
             session=attributes.get("session"),
             model=None if request is None else request.get("model"),

@@ -17,9 +17,11 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job at this moment. ``notice`` says why a queued one cannot begin; ``files`` are those of a result, by name."""
+    """A job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone;
+    ``files`` are those of a result, by name."""
 
     id: str
+    name: str
     state: str
     stage: str
     progress: float
@@ -85,6 +87,16 @@ class RigState:
     cameras: tuple[RigCamera, ...]
     faults: tuple[str, ...]
     calibration: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What a camera was set to (None: left as the camera has it); ``unmet`` has a line for each it did not take."""
+
+    exposure_ms: float | None
+    gain_db: float | None
+    white_balance_k: int | None
+    unmet: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import structlog
 from rig.errors import EigenheadError
 from server.errors import NotFound
 from server.services.jobs import DELIVERY, FINISHED
-from server.services.service import Service
+from server.services.service import Check, Service
 from server.storage.store import folder_bytes, newest
 
 LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
@@ -28,6 +28,7 @@ def sweep(service: Service) -> dict[str, int]:
     gone["caches"] = _caches(service)
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
+    _find_missing(service)
     if any(gone.values()):
         log.info("swept", **gone)
     return gone
@@ -118,6 +119,13 @@ def _deliveries(service: Service) -> int:
     if rows:
         client.delete_workflows([row.workflow_id for row in rows])
     return len(rows)
+
+
+def _find_missing(service: Service) -> None:
+    """What readiness says of results that somebody else removed, or that a backup lacks."""
+    missing = service.jobs.without_result()
+    detail = f"{len(missing)} jobs have no result folder any more: {', '.join(missing[:3])}" if missing else "all there"
+    service.known["results"] = Check(ok=True, detail=detail)
 
 
 def _age_s(moment: str | None) -> float:

@@ -4,9 +4,11 @@ A calibration that was put to use lies in ``<data>/rig/cameras.json`` and goes i
 then the rig's own one does (the studio's layout, or what rig.toml names).
 """
 
+import json
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -15,19 +17,22 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.acquisition.commands import board_shot
-from rig.acquisition.plates import link_plates
+from rig.acquisition.plate_checks import PlatesRefused
+from rig.acquisition.plates import PlatesVersion, link_plates, plates_versions
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import ShotDocument, ShotFailed
+from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras_json import read_rig, write_rig
 from rig.formats.capture_folder import write_capture
 from rig.formats.images import write_image
-from rig.formats.rig_toml import RigConfig, read_rig_config
+from rig.formats.rig_toml import RigConfig, adjusted, read_rig_config
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.records import CleanPlates, RigCamera, RigState
+from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
 from server.settings import ServiceSettings
+from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
 from server.tasks.child import Child, WorkFailed
 from server.tasks.simulate import SimulatedCertificate, look, simulated
 
@@ -35,6 +40,7 @@ ImageRgb = UInt8[np.ndarray, "h w 3"]
 PREVIEW_WIDTH = 640
 PREVIEW_QUALITY = 80
 SHOT_BYTES = 64 << 20
+LIST = "GET /v1/rig lists them"
 
 
 class RigBackend(Protocol):
@@ -56,8 +62,32 @@ class RigBackend(Protocol):
         """A JPEG of what the camera sees now. Raises NotFound or Unavailable."""
         ...
 
+    def camera_settings(self, camera: str) -> CameraSettings:
+        """Exposure, gain and white balance as asked for. Raises NotFound."""
+        ...
+
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+        """Other settings from now on; a rig that is open is opened anew. Raises NotFound, InputError, Conflict."""
+        ...
+
+    def lights(self) -> tuple[int, ...]:
+        """The light outputs that are on during a shot."""
+        ...
+
+    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        """Other lamps from now on. Raises InputError, Conflict."""
+        ...
+
     def take_background(self) -> CleanPlates:
-        """New clean plates of the empty studio. Raises Unavailable."""
+        """New clean plates of the empty studio. Raises Unavailable, and Conflict where they show somebody."""
+        ...
+
+    def plates(self) -> list[PlatesVersion]:
+        """The clean plates that are kept, newest first."""
+        ...
+
+    def use_plates(self, version: str) -> None:
+        """Puts clean plates that are kept to use. Raises NotFound."""
         ...
 
     def use(self, calibration: Path) -> None:
@@ -98,13 +128,34 @@ class SimulatedRig:
 
     def preview(self, camera: str) -> bytes:
         if camera not in self._rig():
-            raise NotFound("camera of the rig", camera, "GET /v1/rig lists them")
+            raise NotFound("camera of the rig", camera, LIST)
         with self._one_at_a_time:
             return jpeg(self._child.remote(look)(cameras=[camera])[camera])
+
+    def camera_settings(self, camera: str) -> CameraSettings:
+        if camera not in self._rig():
+            raise NotFound("camera of the rig", camera, LIST)
+        return CameraSettings(None, None, None, ())
+
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+        self.camera_settings(camera)
+        raise fixed_studio()
+
+    def lights(self) -> tuple[int, ...]:
+        return ()
+
+    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        raise fixed_studio()
 
     def take_background(self) -> CleanPlates:
         """The studio takes clean plates with every shot; there is nothing to keep."""
         return CleanPlates(self._rig().names, 2, "the simulated studio takes them with each shot")
+
+    def plates(self) -> list[PlatesVersion]:
+        return []
+
+    def use_plates(self, version: str) -> None:
+        raise NotFound("version of the clean plates", version, "the simulated studio takes them with each shot")
 
     def use(self, calibration: Path) -> None:
         _check_names(read_rig(calibration), self._rig().names)
@@ -125,8 +176,10 @@ class RealRig:
     """Cameras of a rig.toml: opened at the first need and kept open; a rig that cannot be opened is tried again."""
 
     def __init__(self, path: Path, calibration: Path) -> None:
-        self._config: RigConfig = read_rig_config(path)
-        self._path, self._calibration = path, calibration
+        self._from_file: RigConfig = read_rig_config(path)
+        self._adjusted = calibration.with_name("adjusted.json")
+        self._config = adjusted(self._from_file, self._adjustment().cameras, self._adjustment().lights)
+        self._calibration = calibration
         self._session: RigSession | None = None
         self._lock = threading.RLock()
 
@@ -183,21 +236,79 @@ class RealRig:
 
     def preview(self, camera: str) -> bytes:
         if camera not in self._config.names:
-            raise NotFound("camera of the rig", camera, "GET /v1/rig lists them")
+            raise NotFound("camera of the rig", camera, LIST)
         with self._lock:
             image = self._opened().look([camera]).get(camera)
         if image is None:
             raise Unavailable("camera-missing", f"{camera} delivers no picture; GET /v1/rig says why.", [camera])
         return jpeg(image)
 
+    def camera_settings(self, camera: str) -> CameraSettings:
+        wanted = next((found for found in self._config.cameras if found.name == camera), None)
+        if wanted is None:
+            raise NotFound("camera of the rig", camera, LIST)
+        with self._lock:
+            state = None if self._session is None else self._session.states().get(camera)
+        unmet = () if state is None else state.unmet
+        return CameraSettings(wanted.exposure_ms, wanted.gain_db, wanted.white_balance_k, unmet)
+
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+        self.camera_settings(camera)
+        with self._lock:
+            before = self._adjustment()
+            of_camera = before.cameras.get(camera, {}) | dict(changes)
+            self._adjust(replace(before, cameras=before.cameras | {camera: of_camera}))
+            return self.camera_settings(camera)
+
+    def lights(self) -> tuple[int, ...]:
+        return self._config.lights.outputs
+
+    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        with self._lock:
+            self._adjust(replace(self._adjustment(), lights=outputs))
+            return self.lights()
+
+    def _adjustment(self) -> RigAdjustment:
+        """What was changed over HTTP; a file that cannot be read is as none."""
+        with suppress(OSError, ValueError):
+            return RIG_ADJUSTMENT.read(json.loads(self._adjusted.read_bytes()))
+        return RigAdjustment({})
+
+    def _adjust(self, wanted: RigAdjustment) -> None:
+        """Keeps the adjustment; a rig that is open is opened anew, which is how drivers take settings."""
+        config = adjusted(self._from_file, wanted.cameras, wanted.lights)
+        self._adjusted.parent.mkdir(exist_ok=True)
+        write_atomically(self._adjusted, json.dumps(RIG_ADJUSTMENT.document(wanted), indent=1).encode())
+        self._config = config
+        if self._session is not None:
+            self.close()
+            with suppress(Unavailable):  # the rig's state says what is missing
+                self._opened()
+
     def take_background(self) -> CleanPlates:
         with self._lock:
             try:
                 plates = self._opened().take_plates()
+            except PlatesRefused as error:
+                faults = [f"{fault.camera}: {fault.detail}" for fault in error.faults]
+                detail = (
+                    "The new clean plates show somebody, or a changed studio; the old ones stay in use. Take them "
+                    f"again with nobody there, or put them to use all the same: version {error.version}."
+                )
+                raise Conflict("plates-occupied", detail, faults) from error
             except ShotFailed as error:
                 faults = [str(fault) for fault in error.faults]
                 raise Unavailable("plates-failed", str(error), faults) from error
         return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, "")
+
+    def plates(self) -> list[PlatesVersion]:
+        return plates_versions(self._config.plates_folder)
+
+    def use_plates(self, version: str) -> None:
+        with self._lock:
+            if all(kept.id != version for kept in self.plates()):
+                raise NotFound("version of the clean plates", version, "GET /v1/rig/background lists them")
+            self._opened().use_plates(version)
 
     def use(self, calibration: Path) -> None:
         rig = read_rig(calibration)
@@ -235,6 +346,11 @@ class RealRig:
             if self._config.calibration_file is not None:
                 return read_rig(self._config.calibration_file)
         return None
+
+
+def fixed_studio() -> Conflict:
+    detail = "The simulated studio's cameras and lamps have no settings; serve a rig.toml of real ones."
+    return Conflict("simulated-rig", detail)
 
 
 def open_rig(settings: ServiceSettings) -> RigBackend:

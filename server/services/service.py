@@ -75,7 +75,7 @@ class Service:
         """Cancels a job and tells the webhooks; a finished one stays as it is."""
         job, did = self.jobs.cancel(job_id)
         if did:
-            self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue)
+            self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, own=self.jobs.webhook(job_id))
         return job
 
 
@@ -95,7 +95,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
         sessions=Sessions(store, jobs),
         calibrations=Calibrations(store, jobs.client, settings.queue),
         keys=Keys(engine),
-        webhooks=Webhooks(engine),
+        webhooks=Webhooks(engine, settings.webhook_origins),
         uploads=ResumableUploads(store, settings),
         threads=Threads(checks=settings.checks_at_once),
         children=children,

@@ -1,16 +1,13 @@
 """Sessions: one subject's captures, and their erasure."""
 
-import time
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 
-from server.errors import Unavailable
-from server.services.jobs import FINISHED, Jobs
+from server.services.erasure import erase_captures
+from server.services.jobs import Jobs
 from server.services.records import Session
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store, new_id
-
-CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
 
 class Sessions:
@@ -50,32 +47,10 @@ class Sessions:
         own record goes last, so that an erasure that was cut short can be asked for again. Raises NotFound, and
         Unavailable while a worker still writes."""
         self._store.session(identity)
-        captures = self._captures(identity)
+        captures = [capture.id for capture in self._captures(identity)]
         jobs = {job.id for job in self._jobs.find(session=identity, limit=100_000)}
-        for capture in captures:
-            jobs |= {job.id for job in self._jobs.find(capture=capture.id, limit=100_000)}
-        active = [job for job in jobs if self._jobs.state(job) not in FINISHED]
-        for job in jobs:
-            self._jobs.cancel(job)
-        self._await_workers(active)
-        for job in jobs:
-            self._delete_job(job)
-        for capture in captures:
-            self._store.remove_capture(capture.id)
+        erase_captures(self._store, self._jobs, captures, jobs)
         self._store.remove(self._store.folder("sessions", identity).with_suffix(".json"))
-
-    def _await_workers(self, jobs: list[str]) -> None:
-        """Until no worker writes to the jobs any more, each of which then lacks its attempt's folder: it would put back
-        what is erased here. One that was killed will not write either, but leaves its folder."""
-        deadline = time.monotonic() + CANCEL_S
-        folders = [self._store.folder("jobs", job) for job in jobs]
-        while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:
-            time.sleep(0.05)
-
-    def _delete_job(self, job_id: str) -> None:
-        self._jobs.delete(job_id)
-        if self._store.folder("jobs", job_id).exists():
-            raise Unavailable("still-writing", "A worker still writes; ask for the erasure again.")
 
     def _captures(self, identity: str) -> list[CaptureRecord]:
         return [record for record in self._store.captures() if record.session == identity]

@@ -11,7 +11,7 @@ import hmac
 import json
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 from typing import Any
 
@@ -20,20 +20,23 @@ import sqlalchemy as sa
 from dbos import EnqueueOptions
 
 from server.errors import NotFound
+from server.origins import target
 from server.services.jobs import APPLICATION_VERSION, DELIVERY
 from server.services.records import NewWebhook, Webhook
 from server.storage.database import now_sql, webhooks
-from server.storage.records import WebhookMessage
+from server.storage.records import JobWebhook, WebhookMessage
 
 WEBHOOKS_QUEUE = "webhooks"
+OWN = "own"  # in the place of an id: the job's own webhook
 TIMEOUT_S = 10.0
 
 
 class Webhooks:
     """The addresses that are told, and the telling."""
 
-    def __init__(self, engine: sa.Engine) -> None:
-        self._engine = engine
+    def __init__(self, engine: sa.Engine, origins: Collection[str] = ()) -> None:
+        """``origins``: where a job's own webhook may be."""
+        self._engine, self._origins = engine, origins
 
     def add(self, url: str) -> NewWebhook:
         """The new webhook with its secret, which is shown this once."""
@@ -54,16 +57,18 @@ class Webhooks:
             if not connection.execute(sa.delete(webhooks).where(webhooks.c.id == identity)).rowcount:
                 raise NotFound("webhook", identity)
 
-    def announce(self, job_id: str, state: str, enqueue: Callable[..., Any]) -> None:
+    def announce(self, job_id: str, state: str, enqueue: Callable[..., Any], own: JobWebhook | None = None) -> None:
         """Queues one delivery a webhook; doing it again for the same job and state changes nothing."""
-        for hook in self.all():
-            identity = f"hook-{hook.id}-{job_id}-{state}"
+        for hook_id in [*(hook.id for hook in self.all()), *([] if own is None else [OWN])]:
+            identity = f"hook-{hook_id}-{job_id}-{state}"
             message: WebhookMessage = {
-                "webhook": hook.id,
+                "webhook": hook_id,
                 "type": f"job.{state}",
                 "job_id": job_id,
                 "id": identity,
             }
+            if own is not None and hook_id == OWN:
+                message["own"] = own
             options: EnqueueOptions = {
                 "workflow_name": DELIVERY,
                 "queue_name": WEBHOOKS_QUEUE,
@@ -73,16 +78,35 @@ class Webhooks:
             enqueue(options, message)
 
     def post(self, message: WebhookMessage) -> int:
-        """One attempt. Raises httpx.HTTPError where the other side does not take it; a removed webhook is done."""
+        """One attempt. Raises httpx.HTTPError where the other side does not take it, Unusable where a job's own webhook
+        may not be called any more; a removed webhook is done."""
+        if "own" in message:
+            return self._post_own(message, message["own"])
         with self._engine.connect() as connection:
             hook = connection.execute(sa.select(webhooks).where(webhooks.c.id == message["webhook"])).one_or_none()
         if hook is None:
             return 0
-        body = json.dumps({"type": message["type"], "data": {"job_id": message["job_id"]}}).encode()
-        headers = signed_headers(message["id"], int(time.time()), body, hook.secret) | {
-            "content-type": "application/json"
-        }
+        body, headers = _signed(message, hook.secret)
         return httpx.post(hook.url, content=body, headers=headers, timeout=TIMEOUT_S).raise_for_status().status_code
+
+    def _post_own(self, message: WebhookMessage, hook: JobWebhook) -> int:
+        """To an address that a caller named: judged now, whatever it was when the job was made."""
+        aim = target(hook["url"], self._origins)
+        body, headers = _signed(message, hook["secret"])
+        with httpx.Client(trust_env=False, timeout=TIMEOUT_S) as client:
+            headers |= aim.headers
+            return (
+                client.post(aim.url, content=body, headers=headers, extensions=aim.extensions)
+                .raise_for_status()
+                .status_code
+            )
+
+
+def _signed(message: WebhookMessage, secret: str | None) -> tuple[bytes, dict[str, str]]:
+    """The body and headers of a message; without a secret it is not signed."""
+    body = json.dumps({"type": message["type"], "data": {"job_id": message["job_id"]}}).encode()
+    signed = {} if secret is None else signed_headers(message["id"], int(time.time()), body, secret)
+    return body, signed | {"content-type": "application/json"}
 
 
 def signed_headers(identity: str, timestamp: int, body: bytes, secret: str) -> dict[str, str]:

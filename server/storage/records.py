@@ -5,10 +5,13 @@ job engine keeps the requests and results of jobs as they are, across upgrades o
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Generic, NotRequired, TypedDict, TypeVar
 
 from pydantic import TypeAdapter
+
+from rig.acquisition.shot import Fault
+from rig.acquisition.verdict import ViewDocument
 
 JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
 T = TypeVar("T")
@@ -26,18 +29,21 @@ class CameraSize:
 @dataclass(frozen=True, slots=True)
 class CaptureContent:
     """What is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the calibration
-    board, which show no head."""
+    board, which show no head. ``checks``: what was measured of each camera's picture."""
 
     cameras: tuple[CameraSize, ...]
     front: str
     inputs: dict[str, str]
     bytes: int
     board: bool = False
+    faults: tuple[Fault, ...] = ()
+    checks: Mapping[str, ViewDocument] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
-    """A capture: where it came from, what people say of it, what is in it, and the certificate of the rig's shot."""
+    """A capture: where it came from, what people say of it, what is in it, the certificate of the rig's shot, and the
+    verdict on it with its faults (None of what was not judged: the board, captures of earlier versions)."""
 
     id: str
     created: str
@@ -52,6 +58,8 @@ class CaptureRecord:
     features: bool
     shot: Mapping[str, object] | None = None
     board: bool = False
+    verdict: str | None = None
+    faults: tuple[Fault, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +93,14 @@ class UploadRecord:
     capture: str | None
 
 
+@dataclass(frozen=True, slots=True)
+class RigAdjustment:
+    """What differs from rig.toml: settings of cameras by name, and the lamps that are on during a shot."""
+
+    cameras: dict[str, dict[str, float | None]]
+    lights: tuple[int, ...] | None = None
+
+
 class RecordFormat(Generic[T]):
     """How records of one kind are written: an object that names its format."""
 
@@ -104,7 +120,15 @@ class RecordFormat(Generic[T]):
 CAPTURE = RecordFormat(CaptureRecord, "eigenhead-capture/1")
 SESSION = RecordFormat(SessionRecord, "eigenhead-session/1")
 CALIBRATION = RecordFormat(CalibrationRecord, "eigenhead-calibration/1")
+RIG_ADJUSTMENT = RecordFormat(RigAdjustment, "eigenhead-rig-adjustment/1")
 UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
+
+
+class JobWebhook(TypedDict):
+    """The address that is told of one job; ``secret`` signs the messages."""
+
+    url: str
+    secret: str | None
 
 
 class JobRequest(TypedDict):
@@ -114,6 +138,8 @@ class JobRequest(TypedDict):
     model: str | None
     settings: Mapping[str, object]
     restart_of: NotRequired[str]
+    name: NotRequired[str]
+    webhook: NotRequired[JobWebhook]
 
 
 class FileEntry(TypedDict):
@@ -134,9 +160,10 @@ class CalibrationOutcome(TypedDict):
 
 
 class WebhookMessage(TypedDict):
-    """One delivery, as the job engine keeps it."""
+    """One delivery, as the job engine keeps it, to a webhook of the service or to a job's own."""
 
     webhook: str
+    own: NotRequired[JobWebhook]
     type: str
     job_id: str
     id: str

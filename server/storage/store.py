@@ -1,8 +1,9 @@
 """Artefacts on disk: captures, sessions, results.
 
-    <data>/captures/<id>/record.json  files/...          one folder a capture, as the contract lays it out
+    <data>/captures/<id>/record.json  files/...          one folder a capture, as the contract lays it out; checks.json
+                                                         has what was measured of each camera's picture
     <data>/sessions/<id>.json
-    <data>/jobs/<id>/result/...                          and attempt-*/ while a worker writes
+    <data>/jobs/<id>/result/...  log.txt                 and attempt-*/ while a worker writes
     <data>/cache/captures/<id>/...                       what is worth keeping of a capture, and can be made anew
     <data>/calibrations/<id>/...  rig/...                 see server.services.calibrations, server.services.rigs
     <data>/incoming/<id>/                                what is being received; swept after a crash
@@ -28,6 +29,7 @@ from typing import TypeVar
 
 import structlog
 
+from rig.acquisition.verdict import ViewDocument
 from rig.atomic_write import write_atomically
 from server.errors import DiskFull, NotFound
 from server.storage.records import CAPTURE, SESSION, CaptureRecord, RecordFormat, SessionRecord
@@ -109,6 +111,18 @@ class Store:
         if record is None:
             raise NotFound("capture", identity)
         return record
+
+    def put_checks(self, folder: Path, checks: Mapping[str, ViewDocument]) -> None:
+        """Into a capture's folder that is not yet in its place."""
+        write_atomically(folder / "checks.json", _encoded(checks))
+
+    def checks(self, identity: str) -> dict[str, ViewDocument]:
+        """What was measured of a capture's pictures, by camera; nothing of one of an earlier version. Raises
+        NotFound."""
+        with suppress(FileNotFoundError, ValueError):
+            return json.loads((self.folder("captures", identity) / "checks.json").read_bytes())
+        self.capture(identity)
+        return {}
 
     def captures(self) -> Iterator[CaptureRecord]:
         """The records of all captures, newest first."""

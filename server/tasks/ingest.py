@@ -9,18 +9,19 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
+from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import find_rig_file, read_rig_file
-from rig.formats.capture_folder import IMAGE_SUFFIXES, capture_root, read_shot, size_fault, stray_faults
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
+from rig.formats.capture_folder import capture_root, read_shot, size_fault, stray_faults
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
-from rig.formats.images import IMAGE_FORMATS
+from rig.formats.images import IMAGE_SUFFIXES, picture_size
+from rig.formats.rig_toml import ShotConfig
 from rig.plausibility import rig_faults
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import Bench, Report
@@ -47,9 +48,11 @@ def ingest_archive(
     return described
 
 
-def ingest_folder(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> CaptureContent:
-    """The same for a folder of our own making (a shot of the rig)."""
-    return check_capture(Path(folder), image_pixels, report)
+def ingest_folder(
+    bench: Bench, report: Report, *, folder: str, image_pixels: int, measured: bool = False
+) -> CaptureContent:
+    """The same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was taken."""
+    return check_capture(Path(folder), image_pixels, report, measured=measured)
 
 
 def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> CaptureContent:
@@ -61,8 +64,7 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
     files = sorted((root / "images").iterdir())
     sizes = {}
     for path in files:
-        with Image.open(path, formats=IMAGE_FORMATS) as header:
-            sizes[path.stem] = header.size
+        sizes[path.stem] = picture_size(path)
     huge = [f"{name} is {w} x {h} pixels" for name, (w, h) in sizes.items() if w * h > image_pixels]
     if huge:
         raise InputError("capture", [f"{fault}; at most {image_pixels:,} are accepted" for fault in huge])
@@ -75,10 +77,10 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
     )
 
 
-def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureContent:
+def check_capture(root: Path, image_pixels: int, report: Report, *, measured: bool = False) -> CaptureContent:
     rig_file = find_rig_file(root)
     if rig_file is None:
-        raise InputError("capture", ["holds no cameras.json (nor a COLMAP, caliscope or aniposelib file)"])
+        raise InputError("capture", [NO_RIG])
     try:
         rig = read_rig_file(rig_file)
     except InputError as error:
@@ -86,6 +88,7 @@ def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureConte
     faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)] + stray_faults(root, rig)
     digests: dict[str, str] = {}
     empty: list[str] = []
+    views: dict[str, ViewCheck] = {}
     for number, camera in enumerate(rig):
         report("check", number / len(rig))
         of_camera = _size_faults(root, camera, image_pixels)
@@ -93,6 +96,7 @@ def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureConte
             shot = read_shot(root, rig.subset([camera.name]), of_camera)
             digests |= shot.digests
             empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
+            views |= _view_of(shot, camera.name, measured)
         faults += [fault for fault in of_camera if not fault.startswith("features.json")]  # judged below, for all
     if (root / "features.json").is_file():
         features = features_from_bytes((root / "features.json").read_bytes(), rig, faults)
@@ -108,7 +112,18 @@ def check_capture(root: Path, image_pixels: int, report: Report) -> CaptureConte
         front=rig.front_camera(),
         inputs=dict(sorted(digests.items())),
         bytes=sum((root / name).stat().st_size for name in digests),
+        faults=tuple(view_faults(views, ShotConfig())),
+        checks={name: view.document() for name, view in views.items()},
     )
+
+
+def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
+    """The camera's picture, judged; nothing where it cannot be read."""
+    image = shot.images.get(name)
+    if image is None:
+        return {}
+    plates = shot.backgrounds.get(name, ())
+    return {name: check_view(image, plates[0] if plates else None, shot.masks.get(name), place_only=measured)}
 
 
 def _shows_its_plate(shot: Capture, name: str) -> bool:
@@ -139,13 +154,9 @@ def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
     for path in _images_of(root, camera.name):
         name = path.relative_to(root).as_posix()
         try:
-            with Image.open(path, formats=IMAGE_FORMATS) as header:
-                width, height = header.size
-        except Image.DecompressionBombError:
-            faults.append(f"{name} claims to be huge; at most {image_pixels:,} pixels are accepted")
-            continue
-        except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
-            faults.append(f"{name} is damaged or no PNG, JPEG, TIFF or WebP image")
+            width, height = picture_size(path)
+        except InputError as error:
+            faults += [f"{name} {fault}" for fault in error.faults]
             continue
         if width * height > image_pixels:
             faults.append(f"{name} is {width} x {height} pixels; at most {image_pixels:,} pixels are accepted")

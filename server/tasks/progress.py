@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
+import structlog
+
 if TYPE_CHECKING:
     from server.storage.events import EventLog
 
@@ -19,6 +21,8 @@ PACE_S = 2.0  # of work, before a machine's pace counts as much as the expectati
 FRACTION_LEAST = 0.05  # below it a stage's own fraction says little of its end
 
 Clock = Callable[[], float]
+
+log = structlog.get_logger()
 
 
 class JobProgress:
@@ -113,6 +117,8 @@ class ProgressMeter:
         stage, now = self._progress.stage, time.monotonic()
         if not stage or (stage == self._last[0] and now - self._last[1] < EVERY_S):
             return
+        if stage != self._last[0]:
+            log.info("stage", stage=stage)
         self._last = (stage, now)
         share, left_s = round(self._progress.progress(), 4), round(self._progress.remaining_s(), 1)
         self._log.append(self._job_id, {"state": "running", "stage": stage, "progress": share, "eta_s": left_s})

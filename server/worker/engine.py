@@ -1,4 +1,4 @@
-"""What the worker needs of the job engine's inside.
+"""What the worker needs of the job engine: its configuration, and one thing of its inside.
 
 The public ``resume_workflow`` takes a job from whoever has it by now, revives a cancelled one, and forgets how many
 workers the job took down with it. ``DBOS._recover_pending_workflows`` is what the engine itself does at its start: it
@@ -7,7 +7,22 @@ changes only rows that still belong to the named executors. A test holds its sha
 
 from collections.abc import Sequence
 
-from dbos import DBOS
+from dbos import DBOS, DBOSConfig
+
+from server.services.jobs import APPLICATION, APPLICATION_VERSION
+from server.settings import ServiceSettings
+
+
+def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
+    return {
+        "name": APPLICATION,
+        "system_database_url": settings.url,
+        "application_version": APPLICATION_VERSION,
+        "executor_id": executor_id,
+        "enable_otlp": False,
+        "log_level": "WARNING",
+        "notification_listener_polling_interval_sec": 1.0,
+    }
 
 
 def take_over(executors: Sequence[str]) -> list[str]:

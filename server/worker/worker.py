@@ -35,19 +35,19 @@ from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
 from server.errors import Refused, unusable_input
 from server.services import calibrations
-from server.services.jobs import DELIVERY, WORKFLOW, JobFailed, engine_config
+from server.services.jobs import DELIVERY, WORKFLOW, JobFailed
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
-from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, WebhookMessage
+from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
-from server.worker.engine import take_over
+from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers, process_identity
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
@@ -67,7 +67,7 @@ class Worker:
         self._children = Children(settings.concurrency, niceness=5)  # a busy machine still answers requests
         self._work: CaptureWork = function_at(settings.work)
         self._stop = threading.Event()
-        self._webhooks = Webhooks(self.engine)
+        self._webhooks = Webhooks(self.engine, settings.webhook_origins)
         self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
 
@@ -127,13 +127,13 @@ class Worker:
                     files = publish(job_id, fit(job_id, request))
                 except JobFailed as error:
                     log.warning("job failed", kind=error.kind, detail=error.detail)
-                    worker.settle(job_id, "failed")
+                    worker.settle(job_id, "failed", request.get("webhook"))
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
                     log.info("job cancelled")
                     raise
-                worker.settle(job_id, "succeeded")
+                worker.settle(job_id, "succeeded", request.get("webhook"))
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
@@ -157,6 +157,7 @@ class Worker:
     def ingest(self, job_id: str, request: JobRequest) -> None:
         """Fails early and clearly on what would make the fit fail late."""
         self.events.append(job_id, {"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None})
+        self.store.folder("jobs", job_id).mkdir(parents=True, exist_ok=True)  # where its log goes
         log.info("job started", capture=request["capture_id"])
         try:
             record = self.store.capture(request["capture_id"])
@@ -232,15 +233,16 @@ class Worker:
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 
-    def settle(self, job_id: str, state: str) -> None:
+    def settle(self, job_id: str, state: str, own: JobWebhook | None = None) -> None:
         """Tells the world how the job ended: the last event of its stream, with what the operator must see to, and the
-        webhooks."""
-        moved = moved_cameras(self.store.folder("jobs", job_id) / "result" / "report.json")
-        if moved:
-            log.warning("camera moved", details=moved)
+        webhooks, the job's own too."""
+        warnings = warnings_of(self.store.folder("jobs", job_id) / "result" / "report.json")
+        for warning in warnings:
+            log.warning(warning["message"], code=warning["code"])
+        moved = [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
         with suppress(SQLAlchemyError):
             self.events.append(job_id, {"state": state, "camera_moved": moved} if moved else {"state": state})
-        self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options)
+        self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options, own=own)
 
     def _failure(self, error: BaseException) -> BaseException:
         if isinstance(error, Cancelled):
@@ -302,13 +304,12 @@ class Worker:
         return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
 
 
-def moved_cameras(report: Path) -> list[str]:
-    """What a result's report.json says of cameras that have moved since their calibration."""
+def warnings_of(report: Path) -> list[dict[str, str]]:
+    """The warnings of a result's report.json: ``code`` and ``message``."""
     try:
-        warnings = json.loads(report.read_bytes())["warnings"]
+        return json.loads(report.read_bytes())["warnings"]
     except (OSError, ValueError, KeyError):  # no result, or another kind of work
         return []
-    return [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
 
 
 class _StateWatch:

@@ -1,25 +1,26 @@
 """Seconds of a job's stages, from image files to result files, warm: medians and least of several rounds; peak memory.
 
 python -m tests.benchmarks.image_stages --detail photo --surface head --json
+python -m tests.benchmarks.image_stages --rounds 2    # the default job
 
-``segmentation`` is eleven 1024 x 768 images, ``texture`` colours the model's full mesh from them; ``hull``, which no
-job needs, is the visual hull of the silhouettes. ``total`` is from opening the first file to the last one written,
-``cpu`` the processor seconds of it in all threads, which a busy machine stretches least.
+``segmentation`` is eleven 1024 x 768 images, ``texture`` colours the model's full mesh from them. ``total`` is from
+opening the first file to the last one written. Processor seconds are those of all threads, which a busy machine
+stretches least; peak memory is the most that the process held in a stage, libraries and model included (Linux).
 """
 
 import argparse
 import json
-import resource
+import re
 import sys
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pipeline.eigenheads.model import load_model
-from pipeline.multiview.visual_hull import visual_hull
+from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.reconstruct import reconstruct
 from pipeline.results.write import write_result
 from pipeline.settings import Settings
@@ -27,45 +28,86 @@ from rig.formats.capture_folder import read_capture
 from rig.render.renderer import Renderer
 
 
+class Meter:
+    """Seconds by the clock and of the processor, and peak memory (MB), stage by stage: a job's ``report``."""
+
+    def __init__(self) -> None:
+        self.wall, self.cpu, self.peak_mb = dict[str, float](), dict[str, float](), dict[str, float]()
+        self._stage, self._since = "", (0.0, 0.0)
+
+    def __call__(self, stage: str, share: float) -> None:
+        if share == 0.0 and stage != self._stage:
+            self.enter(stage)
+
+    def enter(self, stage: str) -> None:
+        """What follows belongs to ``stage``; nothing does where that is empty."""
+        now = time.perf_counter(), time.process_time()
+        if self._stage:
+            for seconds, here, before in zip((self.wall, self.cpu), now, self._since, strict=True):
+                seconds[self._stage] = seconds.get(self._stage, 0.0) + here - before
+            self.peak_mb[self._stage] = max(_peak_mb(), self.peak_mb.get(self._stage, 0.0))
+        _forget_peak()
+        self._stage, self._since = stage, now
+
+
+def _peak_mb() -> float:
+    """The most memory held since ``_forget_peak``."""
+    return int(re.findall(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())[0]) / 1024
+
+
+def _forget_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")  # proc(5): resets the peak resident set size
+
+
+def one_round(capture_folder: Path, out: Path, model: HeadModel, settings: Settings, renderer: Renderer) -> Meter:
+    """A job from its files to its results."""
+    meter = Meter()
+    meter.enter("read")
+    capture, rig = read_capture(capture_folder)
+    result = reconstruct(capture, rig, model, settings, renderer=renderer, report=meter)
+    meter.enter("write")
+    write_result(out, result, capture)
+    meter.enter("")
+    for seconds in (meter.wall, meter.cpu):
+        seconds["total"] = sum(seconds.values())
+    meter.peak_mb["total"] = max(meter.peak_mb.values())
+    return meter
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--capture", type=Path, default=Path("../shared/data/captures/scan-a"))
-    parser.add_argument("--detail", choices=("span", "kernel", "photo", "fine"), default="span")
+    parser.add_argument("--detail", choices=("span", "kernel", "photo", "fine"), help="the default where none is asked")
     parser.add_argument("--surface", choices=("head", "bust", "both"), help="both where nothing is asked")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    model, settings = load_model(), replace(Settings(), detail=arguments.detail)
+    model, settings = load_model(), replace(Settings(), detail=arguments.detail or Settings().detail)
     if arguments.surface:
         settings = replace(settings, outputs=replace(settings.outputs, surface=arguments.surface))
-    rounds: list[dict[str, float]] = []
-    own: dict[str, float] = {}
     with Renderer.create() as renderer, tempfile.TemporaryDirectory() as scratch:
-        for _ in range(1 + arguments.rounds):
-            started, spent = time.perf_counter(), time.process_time()
-            capture, rig = read_capture(arguments.capture)
-            opened = time.perf_counter()
-            result = reconstruct(capture, rig, model, settings, renderer=renderer, report=lambda *_: None)
-            found = time.perf_counter()
-            write_result(Path(scratch), result, capture)
-            written, spent = time.perf_counter(), time.process_time() - spent
-            visual_hull(result.silhouettes, rig)
-            hull = time.perf_counter() - written
-            own = {"read": opened - started, "write": written - found, "total": written - started}
-            own |= {"cpu": spent, "hull": hull}
-            rounds.append({**result.seconds, **own})
-    del rounds[0]  # it compiles, or reads what was compiled
-    stages = ["read", *(name for name in rounds[0] if name not in own), "write", "total", "cpu", "hull"]
-    median = {name: round(float(np.median([row[name] for row in rounds])), 3) for name in stages}
-    least = {name: round(min(row[name] for row in rounds), 3) for name in stages}
-    found = {"rounds": arguments.rounds, "detail": arguments.detail, "median_s": median, "least_s": least}
-    found["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024  # kB on Linux
+        given = (arguments.capture, Path(scratch), model, settings, renderer)
+        rounds = [one_round(*given) for _ in range(1 + arguments.rounds)][1:]  # the first reads what was compiled
+    stages = list(rounds[0].wall)
+    found: dict[str, object] = {"rounds": arguments.rounds, "detail": arguments.detail or "default"}
+    for name, rows in (("s", [row.wall for row in rounds]), ("cpu_s", [row.cpu for row in rounds])):
+        found[f"median_{name}"] = {at: round(float(np.median([row[at] for row in rows])), 3) for at in stages}
+        found[f"least_{name}"] = {at: round(min(row[at] for row in rows), 3) for at in stages}
+    found["peak_memory_mb"] = {at: round(max(row.peak_mb[at] for row in rounds)) for at in stages}
     if arguments.json:
         json.dump(found, sys.stdout)
         sys.stdout.write("\n")
     else:
-        sys.stdout.write("".join(f"{name:<14} {median[name]:7.3f} s   least {least[name]:.3f}\n" for name in stages))
-        sys.stdout.write(f"peak memory    {found['peak_memory_mb']} MB\n")
+        sys.stdout.write(table(found, stages))
+
+
+def table(found: dict[str, Any], stages: list[str]) -> str:
+    """A row a stage."""
+    lines = [f"{'':<14}{'s':>8}{'least':>8}{'CPU s':>8}{'least':>8}{'peak MB':>9}\n"]
+    for at in stages:
+        row = [found[name][at] for name in ("median_s", "least_s", "median_cpu_s", "least_cpu_s")]
+        lines.append(f"{at:<14}" + "".join(f"{value:8.2f}" for value in row) + f"{found['peak_memory_mb'][at]:9}\n")
+    return "".join(lines)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
 """Real services for the tests: processes of their own, on free ports, with data folders of their own."""
 
+import fcntl
 import os
 import signal
 import socket
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,15 +44,18 @@ class RunningService:
     def url(self) -> str:
         return f"http://127.0.0.1:{self.port}"
 
-    def start(self) -> None:
+    def start(self, terminal: int | None = None) -> None:
+        """``terminal``: an open pseudo-terminal that becomes the service's own, so that Ctrl-C there reaches it."""
         command = [sys.executable, "-m", "server.cli", "serve", "--data", str(self.data), "--port", str(self.port)]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 command + ([] if self.worker else ["--no-worker"]),
                 env=os.environ | self.environment,
                 cwd=ROOT,
+                stdin=terminal,
                 stderr=log,
                 start_new_session=True,
+                preexec_fn=None if terminal is None else lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
             )
         self.await_answer()
 
@@ -85,20 +90,36 @@ class RunningService:
 
 
 @contextmanager
-def running_service(data: Path, *, worker: bool = True, **settings: str) -> Iterator[RunningService]:
+def running_service(
+    data: Path, *, worker: bool = True, terminal: int | None = None, **settings: str
+) -> Iterator[RunningService]:
     """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given, and there are no pages,
     which take their time to import. A test that fails shows the end of the log."""
     chosen = {"work": "tests.support.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
     environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
     service = RunningService(data, environment, free_port(), worker)
     try:
-        service.start()
+        service.start(terminal)
         yield service
     except BaseException:
         sys.stdout.write(f"{service.log}:\n{service.log.read_text()[-4000:]}")
         raise
     finally:
         service.stop()
+
+
+def worker_pids(service: RunningService) -> list[int]:
+    """Worker processes of a service's data folder, told by their environment."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (folder / "cmdline").read_bytes()
+            environment = (folder / "environ").read_bytes()
+        except OSError:
+            continue
+        if b"\0worker\0" in command and f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0":
+            found.append(int(folder.name))
+    return found
 
 
 def free_port() -> int:

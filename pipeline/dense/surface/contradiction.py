@@ -1,46 +1,66 @@
 """Outlines that the depth of other views contradicts: a mask that leaves out what two of them see solid is wrong there.
 
 A surface lies inside every silhouette, hidden or not. Where points of two views fall outside a third one's, that one's
-outline says nothing any more, so that one bad mask cuts no hole through what the others know.
+outline says nothing any more, so that one bad mask cuts no hole through what the others know. Near an outline it is the
+depth that errs: matching windows make what is thin (frames of glasses, a collar's edge) wider by their own size, in
+every view alike.
 """
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import ndimage
 
 from pipeline.compiled import njit
 from pipeline.dense.surface.view_stack import ViewStack
 from pipeline.dense.surface.vote_kernels import CENTRE, DEPTH, FRAME, OUTLINE, SIGMA, nearest_pixel, seen_at
 from pipeline.imaging.projection_kernels import LENS, NEAREST_MM
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import map_in_threads
 
 BLOCK = 4  # pixels along the side of what is decided at once
 STRIDE = 3  # every third pixel of every third row stands for the others
 CLEAR_PX = 2.5  # a point nearer to the outline is ordinary: blur, hair, calibration
 SURE_MM = 1.0  # points with a larger deviation do not count
 VIEWS_LEAST = 2  # that see something solid
+WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
 SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
 
 def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
     """The views without the outlines that others contradict, and by view the share of its crop that was."""
-    shares = np.zeros(len(views.cameras))
+
+    def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
+        height, width = views.sizes[v]
+        blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
+        _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
+        solid = np.bitwise_count(blocks) >= VIEWS_LEAST
+        own = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
+        return _beyond_windows(solid, own.reshape(height, width)) if solid.any() else None
+
+    wrong = map_in_threads(wrong_pixels, len(views.cameras))
+    shares = np.array([0.0 if mask is None else mask.mean() for mask in wrong])
+    if not shares.any():  # as usual: a hundred megabytes need no copy
+        return views, shares
     pixels = views.pixels.copy()
-
-    def one(first: int, last: int) -> None:
-        for v in range(first, last):
-            height, width = views.sizes[v]
-            blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
-            _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
-            wrong = cv2.dilate((np.bitwise_count(blocks) >= VIEWS_LEAST).view(np.uint8), np.ones((3, 3), np.uint8))
-            shares[v] = wrong.mean()
-            if wrong.any():
-                whole = np.kron(wrong, np.ones((BLOCK, BLOCK), np.uint8))[:height, :width].ravel()
-                own = pixels[views.starts[v] : views.starts[v] + height * width]
-                own[whole > 0, OUTLINE] = SILENT_PX
-
-    in_threads(len(views.cameras), one)
+    for start, mask in zip(views.starts, wrong, strict=True):
+        if mask is not None:
+            pixels[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX
     return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
+
+
+def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels in and next to solid blocks, of those connected ones that reach farther beyond the outline than windows
+    make anything wider."""
+    height, width = outline_px.shape
+    count, labels = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
+    middle = BLOCK // 2
+    rows, columns = (
+        np.minimum(middle + BLOCK * np.arange(n), size - 1)
+        for n, size in zip(solid.shape, (height, width), strict=True)
+    )
+    farthest = ndimage.maximum(np.where(solid, outline_px[np.ix_(rows, columns)], 0.0), labels, np.arange(count))
+    wrong = np.asarray(farthest)[labels] > WIDENED_PX
+    return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,46 +1,55 @@
 """Triangles of a mesh that cross each other (compiled).
 
-Triangles are sorted into cubic cells by their centroids; a cell is as wide as the widest triangle, so that those which
-meet lie in neighbouring cells. Two cross if an edge of one goes through the other (strictly: touching is no crossing).
+Triangles are sorted into cubic cells by the middles of their boxes; a cell is as wide as the widest box, so that those
+which meet lie in neighbouring cells. Two cross if an edge of one goes through the other (strictly: touching is no
+crossing).
 """
 
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.dense.cell_kernels import COLUMNS, columns_about
+
+
+@njit(cache=True, nogil=True)
+def triangle_boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Lowest and highest corner of the box about each triangle, (f, 6)."""
+    boxes = np.empty((len(faces), 6))
+    for f in range(len(faces)):
+        for axis in range(3):
+            a, b, c = vertices[faces[f, 0], axis], vertices[faces[f, 1], axis], vertices[faces[f, 2], axis]
+            boxes[f, axis], boxes[f, 3 + axis] = min(min(a, b), c), max(max(a, b), c)
+    return boxes
 
 
 @njit(cache=True, nogil=True)
 def crossing_triangles(
     vertices: np.ndarray,
     faces: np.ndarray,
+    boxes: np.ndarray,
     order: np.ndarray,
     keys: np.ndarray,
     spans: np.ndarray,
     active: np.ndarray,
     crossing: np.ndarray,
+    first: int,
+    last: int,
 ) -> None:
-    """Marks triangles that cross another, for pairs of which one is ``active``.
+    """Marks triangles that cross another, for pairs of which one is ``active`` and stands from ``first`` to ``last`` in
+    the order; threads that mark one triangle write the same.
 
     ``order`` sorts the triangles by ``keys`` (given sorted): the rank of their cell in a box of ``spans`` cells, whose
     outermost cells are empty.
     """
-    boxes = np.empty((len(faces), 6))
-    for f in range(len(faces)):
-        for axis in range(3):
-            a, b, c = vertices[faces[f, 0], axis], vertices[faces[f, 1], axis], vertices[faces[f, 2], axis]
-            boxes[f, axis], boxes[f, 3 + axis] = min(min(a, b), c), max(max(a, b), c)
-    ranges, cell = np.empty((9, 2), np.int64), -1
-    for position in range(len(order)):
+    ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
+    for position in range(first, last):
         f = order[position]
         if not active[f]:
             continue
         if keys[position] != cell:
             cell = keys[position]
-            for column in range(9):
-                low = cell + ((column // 3 - 1) * spans[1] + column % 3 - 1) * spans[2] - 1
-                ranges[column, 0] = np.searchsorted(keys, low)
-                ranges[column, 1] = np.searchsorted(keys, low + 3)
-        for column in range(9):
+            columns_about(cell, keys, spans, ranges)
+        for column in range(COLUMNS):
             for at in range(ranges[column, 0], ranges[column, 1]):
                 g = order[at]
                 if (active[g] and g <= f) or not _boxes_meet(boxes, f, g):

@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.dense.cells import sorted_into_cells
-from pipeline.dense.surface.crossing_kernels import crossing_triangles
+from pipeline.dense.surface.crossing_kernels import crossing_triangles, triangle_boxes
+from pipeline.parallel_for import in_threads
 from rig.mesh import Mesh
 
 ROUNDS_MOST = 40
@@ -15,13 +16,13 @@ def crossing_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
     """Triangles that cross another one, among pairs of which one is ``active`` (all of them, if None)."""
-    corners = vertices[faces]
-    low = corners.min(axis=1)
-    wide = max(float((corners.max(axis=1) - low).max()), 1e-9)
-    cells = sorted_into_cells(corners.mean(axis=1), wide)
+    boxes = triangle_boxes(vertices, faces)
+    low, high = boxes[:, :3], boxes[:, 3:]
+    cells = sorted_into_cells(0.5 * (low + high), max(float((high - low).max()), 1e-9))
     crossing = np.zeros(len(faces), bool)
     chosen = np.ones(len(faces), bool) if active is None else active
-    crossing_triangles(vertices, faces, *cells, chosen, crossing)
+    given = (vertices, faces, boxes, *cells, chosen, crossing)
+    in_threads(len(faces), lambda first, last: crossing_triangles(*given, first, last))
     return crossing
 
 

@@ -13,13 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.dense.depth_map import DepthMap
-from pipeline.dense.part_votes import SKIN, UNSEEN, PartVotes, part_codes
+from pipeline.dense.part_votes import SKIN, UNSEEN, PartVotes, part_codes, part_shares
 from pipeline.dense.surface.contradiction import silence_contradicted
 from pipeline.dense.surface.crossings import without_crossings
 from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
 from pipeline.dense.surface.quality import deviation_mm
 from pipeline.dense.surface.refinement import refine_vertices
 from pipeline.dense.surface.signed_distance import Level, NoSurface, solve
+from pipeline.dense.surface.skin import drawn_to_skin
 from pipeline.dense.surface.view_stack import stack_views
 from pipeline.dense.window_bias import WindowBias, without_bias
 from pipeline.diagnostics import ReportWarning
@@ -60,6 +61,7 @@ def fuse(
     bias: WindowBias,
     settings: BustSettings,
     *,
+    head_skin_world: Mesh | None = None,
     report: Report,
 ) -> BustSurface:
     """The closed surface that the views agree on.
@@ -72,6 +74,7 @@ def fuse(
         votes: what the places show; without them all that is seen counts as skin.
         bias: what the depth maps' windows err.
         settings: spacing of the vertices.
+        head_skin_world: what of the fitted head the photographs measured, where they did; seen skin agrees with it.
         report: called with the stage's progress.
 
     Raises:
@@ -89,10 +92,15 @@ def fuse(
     report("bust", 0.6)
     net, safe = closed_net(level)
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
-    mesh, _ = without_crossings(without_bias(mesh, measured.views > 0, bias), safe)
+    seen = measured.views > 0
+    mesh = without_bias(mesh, seen, bias)
+    if head_skin_world is not None:
+        skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, 0]
+        mesh = drawn_to_skin(mesh, seen * skin, head_skin_world)
+    mesh, _ = without_crossings(mesh, safe)
     report("bust", 0.9)
     shown = np.full(len(mesh.vertices), SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
-    part = np.where(measured.views > 0, shown, UNSEEN).astype(np.uint8)
+    part = np.where(seen, shown, UNSEEN).astype(np.uint8)
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(_mask_warnings(names, contradicted))
     return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, warnings)

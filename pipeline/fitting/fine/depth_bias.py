@@ -45,7 +45,7 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
     row, corner, blend = skin[found.row[on_face]], faces[found.triangle[on_face]], found.blend[on_face]
     normal = interpolated(normals[corner], blend)
     off_mm = ((surface.points[row] - interpolated(vertices[corner], blend)) * normal).sum(axis=1)
-    return OnFace(row, normal, off_mm, (windowed_height(vertices, normals)[corner] * blend).sum(axis=1))
+    return OnFace(row, normal, off_mm, (windowed_height(vertices, normals, face)[corner] * blend).sum(axis=1))
 
 
 def measure_bias(seen: OnFace) -> WindowBias:

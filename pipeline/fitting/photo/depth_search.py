@@ -22,6 +22,7 @@ from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations,
 from pipeline.fitting.rim import Views
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import rasterise
+from pipeline.imaging.projection import project_points
 from pipeline.parallel_for import thread_count
 from pipeline.settings import PhotoSettings
 from rig.camera import Camera
@@ -98,11 +99,11 @@ def visibility_of(
         facing, ends = np.zeros(len(points), np.float32), np.zeros((2, len(points), 2))
         if not speaks[k]:
             return facing, ends[0], ends[1]
-        pixel, depth = camera.project(coarse_world.vertices), camera_depths(camera, coarse_world.vertices)
+        pixel, depth = project_points(camera, coarse_world.vertices), camera_depths(camera, coarse_world.vertices)
         depth, _ = rasterise(pixel, depth, coarse_world.faces, *distance.shape)
         facing = facing_of(points, outward, camera, depth, distance, settings)
         seen = np.flatnonzero(facing)
-        here, further = camera.project(points[seen]), camera.project(points[seen] + outward[seen])
+        here, further = project_points(camera, points[seen]), project_points(camera, points[seen] + outward[seen])
         ends[:, seen] = here, further - here
         return facing, ends[0], ends[1]
 

@@ -177,7 +177,7 @@ class StudioDevices:
             f"\n[trigger]\nport = {json.dumps(str(self.port_link))}",
             "\n[lights]\noutputs = [0, 1]\nsettle_s = 0.3",
             # frames of a loopback are stamped by programs that wait for a processor, not by hardware
-            f"\n[shot]\nplates = {self._takes}\nskew_most_ms = 60",
+            f"\n[shot]\nplates = {self._takes}\nplates_over_s = 0.5\nskew_most_ms = 60",
         ]
         for channel, name in enumerate(self.names):
             identity = json.dumps(self.streams.url(name))
@@ -227,7 +227,9 @@ class StudioDevices:
     def _on_lights(self, mask: int) -> None:
         self._lamps = mask
         for name in self.names:
-            self.streams.show(name, self._films[self._look(name)])
+            film = self._films.get(self._look(name))
+            if film is not None:  # else a refresh is under way, which shows it at its end
+                self.streams.show(name, film)
 
     def _strength(self, kind: str, camera: str) -> float:
         return max((f.strength for f in self.faults if f.kind == kind and f.camera in (camera, None)), default=0.0)

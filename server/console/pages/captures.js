@@ -1,10 +1,13 @@
 // Sessions and captures at the left, the pictures of the chosen one at the right.
-import { clock, keepSession, openSession, send, size } from "/console/static/words.js";
+import { Outline, Verdict, checksOf, faultsOf, verdictTag } from "/console/static/verdict.js";
+import { clock, keepSession, openSession, send, sessionName, size } from "/console/static/words.js";
 
 export default {
+  mixins: [checksOf],
+  components: { Outline, Verdict },
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ chosen: null, outlines: false, drawing: 0, large: null, over: false, uploads: [], busy: "", session: openSession(), form: null, erasing: false, draft: {}, writing: false, method: "", model: "" }),
+  data: () => ({ chosen: null, outlines: false, drawing: 0, large: null, removal: null, over: false, uploads: [], busy: "", session: openSession(), form: null, erasing: false, draft: {}, writing: false, method: "", model: "" }),
   computed: {
     sessions() { return this.state.sessions || []; },
     open() { return this.sessions.find((s) => s.id === this.session) || null; },
@@ -19,6 +22,7 @@ export default {
       else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
     }, immediate: true },
     session(id) { keepSession(id); this.erasing = false; this.large = null; },
+    "current.id": { handler(id) { this.readChecks(id); }, immediate: true },
     current: { handler(c) { if (!this.writing) this.draft = c ? { label: c.label, expression: c.expression, session: c.session || "" } : {}; }, immediate: true },
   },
   template: `
@@ -31,7 +35,7 @@ export default {
             <a class="b" :href="'/features/' + current.id">Pick features</a>
             <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct', current.id, { method, model })">Reconstruct</button>
           </template>
-          <button class="b" id="remove" :disabled="!!busy" @click="act('remove', current.id)">Remove</button>
+          <button class="b" id="remove" :disabled="!!busy" @click="askRemoval">Remove ...</button>
         </template>
       </header>
       <div class="columns" style="grid-template-columns: 19rem minmax(0, 1fr)">
@@ -44,6 +48,7 @@ export default {
               <label class="field">Consent<input v-model="form.consent" maxlength="500" placeholder="who signed what, when"></label>
               <div class="line"><button class="b main-action" :disabled="!!busy">Begin</button><button type="button" class="b quiet" @click="form = null">Leave it</button></div></form>
             <template v-else-if="open">
+              <label class="field">Subject<input :value="open.label" maxlength="500" id="rename" @change="act('edit_session', open.id, { label: $event.target.value })"></label>
               <label class="field">Consent<input :value="open.consent" maxlength="500" placeholder="no note" @change="act('edit_session', open.id, { consent: $event.target.value })"></label>
               <div v-if="erasing" class="stack" style="gap: .4rem" role="alertdialog" aria-label="Erase the session"><p class="warn">Erase {{ name(open) }}: {{ count(open.id) }} {{ count(open.id) === 1 ? 'capture' : 'captures' }}, heads, jobs and caches? It cannot be taken back.</p>
                 <div class="line"><button class="b danger" id="erase-for-good" :disabled="!!busy" @click="act('erase', open.id); erasing = false">Erase for good</button><button class="b quiet" @click="erasing = false">Keep</button></div></div>
@@ -60,7 +65,7 @@ export default {
           </div>
           <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures">
             <button v-for="c in captures" :key="c.id" class="row-button" :aria-current="current && c.id === current.id" @click="chosen = c.id">
-              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
+              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
               <span class="small muted">{{ clock(c.created) }} &middot; {{ c.source === 'rig' ? 'rig' : 'upload' }} &middot; {{ c.cameras.length }} cameras &middot; {{ size(c.bytes) }}</span>
               <span v-if="c.session || c.expression || c.features" class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression, c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
             </button>
@@ -70,6 +75,10 @@ export default {
           <div v-if="!state.loading && !current" class="empty" style="height: 100%; align-content: center">
             <h2>{{ open ? 'No captures in this session yet' : 'No captures yet' }}</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
             <a class="b main-action" href="/">Go to the rig</a></div>
+          <div v-if="removal && current && removal.id === current.id" class="panel pad stack small" role="alertdialog" aria-label="Remove the capture" id="removal" style="border-color: var(--warn); margin-bottom: .7rem">
+            <p><strong>Remove</strong> takes the {{ removal.pictures }} pictures with clean plates and caches ({{ size(removal.bytes) }}); it can be taken back for 10 s. <strong v-if="removal.heads.length" class="warn">{{ removal.heads.length }} {{ removal.heads.length === 1 ? 'head' : 'heads' }} ({{ size(removal.head_bytes) }}) with photographs of the face in the overlays would stay.</strong><span v-else>No head was made of it.</span></p>
+            <p><strong>Erase for good</strong> takes {{ ['the pictures', removal.heads.length && (removal.heads.length === 1 ? 'the head' : 'all ' + removal.heads.length + ' heads'), removal.jobs.length && 'all other jobs'].filter(Boolean).join(', ') }} and every record of them. It cannot be taken back.</p>
+            <div class="line wrap"><button class="b" id="keep-capture" @click="removal = null">Keep</button><button class="b" id="remove-pictures" :disabled="!!busy || removal.active.length > 0" :title="removal.active.length ? 'Jobs that are queued or running need it' : ''" @click="act('remove', current.id); removal = null">Remove the pictures</button><button class="b danger" id="erase-capture" :disabled="!!busy" @click="act('erase_capture', current.id); removal = null">Erase for good</button></div></div>
           <form v-if="current && large === null" class="line wrap" style="align-items: end; margin-bottom: .7rem" aria-label="About the capture" @submit.prevent @focusin="writing = true" @focusout="writing = false">
             <label class="field grow">Label<input v-model="draft.label" maxlength="500" :placeholder="clock(current.created)" @change="act('edit', current.id, { label: draft.label })"></label>
             <label class="field grow">Expression<input v-model="draft.expression" maxlength="500" placeholder="neutral, smile ..." @change="act('edit', current.id, { expression: draft.expression })"></label>
@@ -77,11 +86,13 @@ export default {
             <label class="field">Solver<select v-model="method" id="method"><option value="">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
             <label v-if="models.length > 1" class="field">Model<select v-model="model" id="model"><option value="">default</option><option v-for="m in models.filter(m => m !== 'default')" :key="m">{{ m }}</option></select></label>
           </form>
+          <verdict v-if="current && large === null && !current.board" :capture="current" style="margin-bottom: .7rem"></verdict>
           <div v-if="current && large === null" class="thumbs four">
             <button v-for="(camera, i) in current.cameras" :key="current.id + camera" class="thumb" style="padding: 0; border: 0; cursor: zoom-in" :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }" :aria-label="'Enlarge ' + camera" @click="large = i">
               <img :src="address(camera, '.jpg')" :alt="'Picture of ' + camera" loading="lazy">
               <img v-if="outlines && !current.board" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
-              <span>{{ camera }}{{ camera === current.front ? ' · front' : '' }}</span></button>
+              <outline v-else :view="view(current.id, camera)" :size="current.sizes[camera]"></outline>
+              <span>{{ camera }}{{ camera === current.front ? ' · front' : '' }} <b v-if="faultsOf(current, camera).length" class="warn">{{ faultsOf(current, camera).join(', ') }}</b><small v-else class="muted">{{ measures(current.id, camera) }}</small></span></button>
           </div>
           <div v-else-if="current" style="height: 100%; display: grid; grid-template-rows: auto minmax(0, 1fr); gap: .6rem">
             <div class="line"><strong>{{ current.cameras[large] }}</strong><span class="push group"><button class="b" @click="step(-1)" aria-label="Previous camera">&larr;</button><button class="b" @click="step(1)" aria-label="Next camera">&rarr;</button></span><button class="b" @click="large = null">All cameras <kbd>Esc</kbd></button></div>
@@ -90,14 +101,18 @@ export default {
         </div>
       </div>
     </section>`,
-  created() { this.clock = clock; this.size = size; },
+  created() { Object.assign(this, { clock, size, faultsOf, verdictTag }); },
   mounted() { window.addEventListener("keydown", this.key); },
   unmounted() { window.removeEventListener("keydown", this.key); },
   methods: {
     address(camera, kind) { return `/console/captures/${this.current.id}/${encodeURIComponent(camera)}${kind}`; },
+    async askRemoval() {
+      const id = this.current.id, answer = await fetch(`/console/captures/${id}/holdings`);
+      if (answer.ok) this.removal = { id, ...(await answer.json()) };
+    },
     act(name, id, more) { this.busy = name; this.$emit("act", { name, id, ...more }); },
     acted() { this.busy = ""; },
-    name(session) { return session ? session.label || clock(session.created) : ""; },
+    name(session) { return sessionName(session, this.sessions); },
     count(id) { return (this.state.captures || []).filter((c) => c.session === id).length; },
     begin() { this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) }; this.act("new_session", "", this.form); this.form = null; },
     tag(c) {

@@ -1,12 +1,14 @@
 """Captures: what there is, uploads, silhouettes over the images, jobs to start, removal with undo."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
-from typing import NotRequired, TypedDict
+from typing import NotRequired, TypedDict, cast
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model_names import list_models
+from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
 from rig.errors import InputError
 from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.removal import removals
@@ -14,6 +16,7 @@ from server.services.captures import TEXT_MOST, About
 from server.services.jobs import Work
 from server.services.service import Service
 from server.storage.records import CaptureRecord
+from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
 SHOWN = 500
 
@@ -22,6 +25,13 @@ class LatestJob(TypedDict):
     id: str
     state: str
     progress: float
+
+
+class SyncLine(TypedDict):
+    """What the rig's certificate says, for people."""
+
+    text: str
+    good: bool
 
 
 class CaptureLine(TypedDict):
@@ -40,6 +50,10 @@ class CaptureLine(TypedDict):
     job: LatestJob | None
     board: bool
     size: dict[str, str | int]
+    sizes: dict[str, tuple[int, int]]
+    verdict: str | None
+    faults: list[FaultDocument]
+    sync: SyncLine | None
 
 
 class SessionLine(TypedDict):
@@ -114,7 +128,28 @@ def capture_line(record: CaptureRecord, job: LatestJob | None) -> CaptureLine:
         "job": job,
         "board": record.board,
         "size": asdict(record.cameras[0]),
+        "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
+        "verdict": record.verdict,
+        "faults": [fault.document() for fault in record.faults],
+        "sync": None if record.shot is None else sync_line(record.shot),
     }
+
+
+def sync_line(shot: Mapping[str, object]) -> SyncLine:
+    """How far the pictures of a shot belong to one moment."""
+    lines = sync_of(shot)
+    late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
+    if late:
+        return {"text": f"not in sync: {', '.join(late)}", "good": False}
+    spread_ms = cast(SyncDocument, shot["sync"])["spread_ms"] if "sync" in shot else None
+    within = "" if spread_ms is None else f", within {spread_ms:.1f} ms"
+    return {"text": f"{len(lines)} cameras in sync{within}", "good": True}
+
+
+def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
+    """Status and skew of each camera in a capture's certificate, of a real rig or of the simulated studio."""
+    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
+    return certificate.get("cameras", {})
 
 
 def sessions_list(service: Service) -> list[SessionLine]:
@@ -169,10 +204,18 @@ def erase(page: Page, event: Chosen) -> str:
     return "Erased: images, heads, jobs and all that was kept of them."
 
 
-def remove(page: Page, event: Chosen) -> None:
+def erase_capture(page: Page, event: Chosen) -> str:
+    page.service.captures.erase(event["id"])
+    shared.clear()
+    return "Erased for good: the capture, its heads, jobs and all that was kept of them."
+
+
+def discard(page: Page, event: Chosen) -> None:
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
-    title = f"capture {record.label or identity[-6:]}"
+    heads = len(service.captures.holdings(identity).heads)
+    stays = f"; {heads} {'head' if heads == 1 else 'heads'} with overlay photographs stay" if heads else ""
+    title = f"the {len(record.cameras)} pictures of capture {record.label or identity[-6:]}{stays}"
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 
@@ -190,7 +233,8 @@ CapturesPage.actions = {
     "new_session": Action("capture", new_session),
     "edit_session": Action("capture", edit_consent),
     "erase": Action("capture", erase),
-    "remove": Action("capture", remove),
+    "erase_capture": Action("capture", erase_capture),
+    "remove": Action("capture", discard),
 }
 
 

@@ -1,6 +1,7 @@
 // Eleven tiles. Pictures and their exposure and sharpness come by one stream; the rest is the page's state.
 import { liveView } from "/console/static/live.js";
-import { clock, fixed, keepSession, openSession, typing } from "/console/static/words.js";
+import { Outline, Verdict, checksOf, faultsOf } from "/console/static/verdict.js";
+import { clock, fixed, keepSession, openSession, sessionName, typing } from "/console/static/words.js";
 
 const COUNT_S = 3;
 const STALE_MS = 2500;
@@ -8,12 +9,15 @@ const EXPOSURE = { dark: 50, bright: 205, clipped: 0.02 }; // mean grey level of
 const SOFT_PX = 2.0; // spread of an edge from which a contour is measurably worse
 
 export default {
-  mixins: [liveView],
+  mixins: [liveView, checksOf],
+  components: { Outline, Verdict },
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ now: Date.now(), count: 0, busy: "", session: openSession(), label: "", expression: "" }),
+  data: () => ({ now: Date.now(), count: 0, busy: "", session: openSession(), label: "", expression: "", asking: null, dismissed: sessionStorage.getItem("eigenhead-plates") || "" }),
   watch: {
     session(id) { keepSession(id); },
+    dismissed(id) { sessionStorage.setItem("eigenhead-plates", id); },
+    "state.shot.id": { handler(id) { this.readChecks(id); }, immediate: true },
     "state.sessions": { handler(all) { if (all && this.session && !this.open) this.session = ""; }, immediate: true },
   },
   computed: {
@@ -47,6 +51,8 @@ export default {
       const sharp = this.cameras.filter((c) => typeof this.live[c.name].blur_px === "number").length;
       return `Exposure is in order. ${sharp ? `So is sharpness, in the ${sharp} of ${this.cameras.length} judged so far.` : "Sharpness is looked at next."} ${this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot."}`;
     },
+    shot() { return this.state.shot; },
+    refused() { const found = this.state.plates?.refused; return found && found.id !== this.dismissed ? found : null; },
     columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
   },
   template: `
@@ -56,7 +62,21 @@ export default {
         <button class="b" :disabled="!!busy" @click="plates">{{ busy === 'plates' ? 'Taking plates ...' : 'Clean plates' }} <kbd>B</kbd></button>
         <button class="b main-action" id="capture" :disabled="!!busy" style="min-width: 10.5rem; justify-content: center" @click="start">{{ busy === 'capture' ? 'Capturing ...' : count ? 'Stop' : 'Capture' }} <kbd>{{ count ? 'Esc' : 'Space' }}</kbd></button>
       </header>
-      <div class="tiles" :style="{ gridTemplateColumns: 'repeat(' + columns + ', minmax(0, 1fr))', gridTemplateRows: 'repeat(' + Math.ceil((cameras.length + 1) / columns) + ', minmax(0, 1fr))' }">
+      <div v-if="refused" class="panel pad stack small" role="alertdialog" aria-label="Clean plates refused" id="refused-plates" style="border-color: var(--warn)">
+        <p><strong class="warn">Somebody seems to be in the new clean plates.</strong> The old ones of {{ clock(state.plates.taken) }} stay in use. Send everybody out and press B again; where the studio itself has changed, use the new ones.</p>
+        <details><summary>{{ refused.faults.length }} cameras differ</summary><ul class="faults"><li v-for="fault in refused.faults" :key="fault">{{ fault }}</li></ul></details>
+        <div class="line wrap"><button class="b main-action" @click="dismissed = refused.id">Keep the old ones</button><button class="b" id="use-refused" :disabled="!!busy" @click="usePlates(refused.id)">Use the new ones all the same</button></div></div>
+      <div v-if="shot" class="panel pad scroll stack grow" tabindex="0" role="region" aria-label="The shot" :data-shot="shot.id">
+        <div class="line wrap" style="align-items: start"><verdict :capture="shot" class="grow"></verdict>
+          <span class="line wrap"><button class="b" :class="{ 'main-action': shot.verdict === 'usable' }" id="keep" :disabled="!!busy" @click="decide('keep')">Keep <kbd>K</kbd></button>
+          <button class="b" :class="{ 'main-action': shot.verdict === 'poor' }" id="retake" :disabled="!!busy" title="Removes this shot (it can be taken back) and counts down to the next" @click="decide('retake')">Retake <kbd>R</kbd></button>
+          <button class="b" :class="{ 'main-action': shot.verdict === 'good' }" id="reconstruct" :disabled="!!busy" @click="decide('reconstruct')">Reconstruct <kbd>Enter</kbd></button></span></div>
+        <div class="thumbs four"><div v-for="camera in shot.cameras" :key="shot.id + camera" class="thumb" :data-camera="camera" :style="{ aspectRatio: shot.sizes[camera][0] + ' / ' + shot.sizes[camera][1] }">
+          <img :src="'/console/captures/' + shot.id + '/' + encodeURIComponent(camera) + '.jpg'" :alt="'Picture of ' + camera">
+          <outline :view="view(shot.id, camera)" :size="shot.sizes[camera]"></outline>
+          <span>{{ camera }}{{ camera === shot.front ? ' · front' : '' }} <b v-if="faultsOf(shot, camera).length" class="warn">{{ faultsOf(shot, camera).join(', ') }}</b><small v-else class="muted">{{ measures(shot.id, camera) }}</small></span></div></div>
+      </div>
+      <div v-show="!shot" class="tiles" :style="{ gridTemplateColumns: 'repeat(' + columns + ', minmax(0, 1fr))', gridTemplateRows: 'repeat(' + Math.ceil((cameras.length + 1) / columns) + ', minmax(0, 1fr))' }">
         <article v-for="camera in cameras" :key="camera.name" class="panel tile" :data-camera="camera.name" :data-frames="live[camera.name]?.frames || 0" :aria-label="camera.name">
           <div class="picture"><canvas :ref="el => keep(camera.name, el)" width="320" height="240" role="img" :aria-label="'Live picture of ' + camera.name"></canvas>
             <p v-if="waiting(camera)">{{ waiting(camera) }}</p></div>
@@ -76,15 +96,22 @@ export default {
           <ul v-if="advice.length" class="faults small"><li v-for="(a, i) in advice" :key="i" :class="a.kind">{{ a.text }}</li></ul>
           <p v-else class="muted small">{{ ready }}</p>
           <div class="small stack" style="gap: .3rem; margin-top: auto">
-            <label class="field">Session<select v-model="session" id="session"><option value="">none</option><option v-for="s in state.sessions || []" :key="s.id" :value="s.id">{{ s.label || clock(s.created) }}</option></select></label>
+            <label class="field">Session<select v-model="session" id="session"><option value="">none</option><option v-for="s in state.sessions || []" :key="s.id" :value="s.id">{{ sessionName(s, state.sessions) }}</option></select></label>
             <div class="line"><label class="field grow">Label<input v-model="label" maxlength="500"></label><label class="field grow">Expression<input v-model="expression" maxlength="500" placeholder="neutral"></label></div></div>
+          <div v-if="state.plates" class="small muted line wrap"><span>Clean plates of {{ clock(state.plates.taken) }}</span><button v-if="state.plates.before" class="b push" id="undo-plates" :disabled="!!busy" @click="usePlates(state.plates.before.id)">Use those of {{ clock(state.plates.before.taken) }}</button></div>
           <div class="small muted line"><i :class="['dot', calibration.kind]"></i><a href="/calibration" class="cut" aria-label="Calibration">{{ calibration.text }}<template v-if="state.in_use?.rms_px">, {{ fixed(state.in_use.rms_px, 2) }} px</template></a>
             <a v-if="state.last" href="/captures" class="push">Captures</a></div>
         </aside>
       </div>
+      <div v-if="asking" class="keys" role="dialog" aria-label="Consent before the first shot">
+        <form class="panel pad stack" style="width: min(30rem, 92vw)" @submit.prevent="consent"><h2>Consent comes before the first shot</h2>
+          <p class="small muted">A session holds one person's captures, so that they can be erased together.</p>
+          <label class="field">Subject<input v-model="asking.label" id="subject" maxlength="500" required placeholder="name or number" :disabled="!!asking.id"></label>
+          <label class="field">Consent<input v-model="asking.consent" id="consent" maxlength="500" required placeholder="who signed what, when"></label>
+          <div class="line"><button class="b main-action" :disabled="!!busy">Go on</button><button type="button" class="b quiet" @click="asking = null">No shot</button></div></form></div>
       <div v-if="count" class="countdown" role="alert"><span>{{ count }}</span></div>
     </section>`,
-  created() { this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; },
+  created() { this.faultsOf = faultsOf; this.clock = clock; this.sessionName = sessionName; this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; },
   mounted() {
     window.addEventListener("keydown", this.key);
     this.clockTimer = setInterval(() => (this.now = Date.now()), 500);
@@ -113,19 +140,43 @@ export default {
       if (seen.fault) return seen.fault;
       return this.now - seen.at > STALE_MS ? "The picture stands still" : "";
     },
-    start() { if (this.count) this.stop(); else if (!this.busy) this.countDown(); },
+    start() {
+      if (this.count) this.stop();
+      else if (this.busy) return;
+      else if (this.state.ask_consent && !this.open?.consent) this.asking = { id: this.open?.id || "", label: this.open?.label || "", consent: "" };
+      else this.countDown();
+    },
+    consent() {
+      this.begun = this.asking.id ? null : { label: this.asking.label, known: (this.state.sessions || []).map((s) => s.id) };
+      this.busy = "consent";
+      this.$emit("act", { name: this.asking.id ? "edit_session" : "new_session", ...this.asking });
+    },
     countDown() {
       this.count = COUNT_S;
       this.counter = setInterval(() => { this.count -= 1; if (this.count === 0) { clearInterval(this.counter); this.act("capture"); } }, 1000);
     },
     stop() { clearInterval(this.counter); this.count = 0; },
+    usePlates(id) { if (!this.busy) { this.busy = "use_plates"; this.$emit("act", { name: "use_plates", id }); } },
     plates() { if (!this.busy) this.act("plates"); },
     act(name) { this.busy = name; this.$emit("act", { name, label: this.label, expression: this.expression, session: this.open?.id }); },
-    acted() { this.busy = ""; },
+    acted(name) {
+      this.busy = "";
+      if (name === "new_session" && this.begun) {
+        const made = (this.state.sessions || []).find((s) => s.label === this.begun.label && !this.begun.known.includes(s.id));
+        if (made) this.session = made.id;
+        this.begun = null;
+      }
+      if (["new_session", "edit_session"].includes(name) && this.asking && this.open?.consent) { this.asking = null; this.countDown(); }
+      if (name === "retake" && !this.shot) this.countDown();
+    },
+    decide(name) { if (this.shot && !this.busy) { this.busy = name; this.$emit("act", { name, id: this.shot.id }); } },
     key(event) {
       if (typing(event)) return;
       if (event.key === " ") { event.preventDefault(); if (!event.repeat) this.start(); }
       else if (event.key === "Escape") this.stop();
+      else if (this.shot && "kK".includes(event.key)) this.decide("keep");
+      else if (this.shot && "rR".includes(event.key)) this.decide("retake");
+      else if (this.shot && event.key === "Enter" && event.target.tagName !== "BUTTON") this.decide("reconstruct");
       else if (event.key === "b" || event.key === "B") this.plates();
     },
   },

@@ -2,20 +2,37 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TypedDict, cast
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.results.report import Report
-from rig.acquisition.shot import CameraSyncDocument, SyncDocument
+from rig.acquisition.plates import PlatesVersion
+from rig.acquisition.shot import CameraSyncDocument
 from server.console.media import live_view
-from server.console.page import Action, Page, shared, show
-from server.console.pages.captures import SessionLine, sessions_list
+from server.console.page import Action, Chosen, Page, shared, show
+from server.console.pages.captures import (
+    CaptureLine,
+    SessionEditForm,
+    SessionForm,
+    SessionLine,
+    WorkForm,
+    capture_line,
+    discard,
+    edit_consent,
+    new_session,
+    reconstruct,
+    sessions_list,
+    sync_of,
+)
+from server.console.removal import removals
+from server.errors import Conflict, NotFound
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
-from server.tasks.simulate import SimulatedCertificate, SimulatedSync
+from server.tasks.simulate import SimulatedSync
 
 
 class Tile(TypedDict):
@@ -42,6 +59,20 @@ class LastCapture(TypedDict):
     source: str
 
 
+class PlatesLine(TypedDict):
+    id: str
+    taken: str
+    faults: list[str]
+
+
+class PlatesShown(TypedDict):
+    """The clean plates in use, those before them, and newer ones that were refused."""
+
+    taken: str
+    before: PlatesLine | None
+    refused: PlatesLine | None
+
+
 class RigShown(TypedDict):
     kind: str
     ready: bool
@@ -51,11 +82,29 @@ class RigShown(TypedDict):
     in_use: InUse | None
     sessions: list[SessionLine]
     last: LastCapture | None
+    plates: PlatesShown | None
+    ask_consent: bool
+
+
+class RigPageShown(RigShown):
+    """``shot``: the capture that was taken on this page and waits for the operator's decision."""
+
+    shot: CaptureLine | None
 
 
 class RigPage(Page, component="rig.js"):
-    def look(self) -> RigShown:
-        return shared.get("rig", 0.4, lambda: rig_state(self.service))
+    def look(self) -> RigPageShown:
+        state: RigShown = shared.get("rig", 0.4, lambda: rig_state(self.service))
+        return {**state, "shot": shot_taken(self.service, self.choice.get("shot"))}
+
+
+def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
+    """The capture to judge; None where there is none, or it was removed meanwhile."""
+    if identity is None or identity in removals:
+        return None
+    with suppress(NotFound):
+        return capture_line(service.store.capture(identity), None)
+    return None
 
 
 def rig_state(service: Service) -> RigShown:
@@ -83,13 +132,23 @@ def rig_state(service: Service) -> RigShown:
         "in_use": calibration_in_use(service),
         "sessions": sessions_list(service),
         "last": None if last is None else {"id": last.id, "created": last.created, "source": last.source},
+        "plates": plates_shown(service.rig.plates()),
+        "ask_consent": service.settings.ask_consent,
     }
 
 
-def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
-    """Status and skew of each camera in a capture's certificate, of a real rig or of the simulated studio."""
-    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
-    return certificate.get("cameras", {})
+def plates_shown(kept: list[PlatesVersion]) -> PlatesShown | None:
+    """None where there are none, or the rig takes them with every shot."""
+    in_use = next((version for version in kept if version.in_use), None)
+    if in_use is None:
+        return None
+    before = next((version for version in kept if not version.in_use and not version.refused), None)
+    refused = kept[0] if kept[0].refused and not kept[0].in_use else None
+    return {"taken": in_use.taken, "before": _plates_line(before), "refused": _plates_line(refused)}
+
+
+def _plates_line(version: PlatesVersion | None) -> PlatesLine | None:
+    return None if version is None else {"id": version.id, "taken": version.taken, "faults": [*version.refused]}
 
 
 def calibration_in_use(service: Service) -> InUse | None:
@@ -131,17 +190,67 @@ def read_report(service: Service, job_id: str) -> Report | None:
 
 def capture(page: Page, event: Mapping[str, str | None]) -> str:
     record = page.service.captures.take(About.of(event))
-    return f"Captured {len(record.cameras)} pictures. They are on the page Captures."
+    page.choice["shot"] = record.id
+    shared.forget("rig")
+    worth = "" if record.verdict is None else f" Verdict: {record.verdict}."
+    return f"Captured {len(record.cameras)} pictures.{worth}"
 
 
-def plates(page: Page, event: object) -> str:
+def keep(page: Page, event: object) -> None:
+    page.choice["shot"] = None
+
+
+def retake(page: Page, event: Chosen) -> None:
+    """Lets go of a shot that is not worth keeping; the page then counts down to the next one."""
+    discard(page, event)
+    page.choice["shot"] = None
+
+
+def reconstruct_shot(page: Page, event: WorkForm) -> str:
+    told = reconstruct(page, event)
+    page.choice["shot"] = None
+    return told
+
+
+def plates(page: Page, event: object) -> str | None:
     page.service.store.reserve(0, page.service.settings.free_bytes)
-    taken = page.service.rig.take_background()
+    try:
+        taken = page.service.rig.take_background()
+    except Conflict:  # the page asks what is to become of them
+        return None
+    finally:
+        shared.forget("rig")
     note = f" Note: {taken.note}." if taken.note else ""
     return f"{taken.plates} clean plates of {len(taken.cameras)} cameras.{note}"
 
 
-RigPage.actions = {"capture": Action("capture", capture), "plates": Action("capture", plates)}
+def use_plates(page: Page, event: Chosen) -> str:
+    page.service.rig.use_plates(event["id"])
+    shared.forget("rig")
+    return "These clean plates are in use now. The ones before are kept."
+
+
+def begin_session(page: Page, event: SessionForm) -> str:
+    told = new_session(page, event)
+    shared.forget("rig")
+    return told
+
+
+def note_consent(page: Page, event: SessionEditForm) -> None:
+    edit_consent(page, event)
+    shared.forget("rig")
+
+
+RigPage.actions = {
+    "capture": Action("capture", capture),
+    "plates": Action("capture", plates),
+    "use_plates": Action("capture", use_plates),
+    "keep": Action("read", keep),
+    "new_session": Action("capture", begin_session),
+    "edit_session": Action("capture", note_consent),
+    "retake": Action("capture", retake),
+    "reconstruct": Action("submit", reconstruct_shot),
+}
 
 
 @ui.page("/")

@@ -34,6 +34,12 @@ export function stageWords(stage) { return STAGES[stage] || stage; }
 // The session that the operator works in, kept for the pages of this browser tab.
 export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
 export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }
+// Two sessions of one name are told apart by when they began.
+export function sessionName(session, all) {
+  if (!session) return "";
+  const twice = all.some((other) => other.id !== session.id && other.label === session.label);
+  return session.label ? session.label + (twice ? `, begun ${clock(session.created)}` : "") : clock(session.created);
+}
 
 // Sends one file as the form part "file"; resolves with {status, document} and never rejects.
 export function send(address, file, fields, progress) {

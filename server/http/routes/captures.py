@@ -8,12 +8,15 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from rig.errors import InputError
+from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
-from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures
-from server.services.captures import About
+from server.http.rig_schemas import CaptureChecks, HoldingsOut
+from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
+from server.services.captures import TEXT_MOST, About
 from server.services.jobs import Work
 from server.services.keys import Caller
 from server.storage.records import CaptureRecord
+from server.wire.fetch import fetch_archive
 from server.wire.multipart import ARCHIVE, described_form, receive_capture
 from server.wire.problems import Responses, documented
 from server.wire.send_file import send_file
@@ -46,6 +49,20 @@ async def upload_capture(service: ServiceOf, caller: Taker, request: Request, re
     return _created(record, response)
 
 
+@router.post("/captures/imports", status_code=201, responses=documented(400, 404, 413, 415, 507))
+async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, response: Response) -> CaptureOut:
+    """Takes a capture folder as an archive that lies elsewhere, at a server that the operator allowed
+    (``EIGENHEAD_IMPORT_ORIGINS``; 403 where there is none); 422 names every fault in it."""
+    if not service.settings.import_origins:
+        detail = "This service imports from nowhere: its operator names servers in EIGENHEAD_IMPORT_ORIGINS. Upload it."
+        raise Forbidden("imports-off", detail)
+    about = About(wanted.session, wanted.label, wanted.expression)
+    with service.store.incoming() as folder:
+        archive = await fetch_archive(service, wanted.url, folder)
+        record = await service.threads.check(service.captures.accept, archive, folder, about)
+    return _created(record, response)
+
+
 @router.get("/captures", responses=documented(400))
 def list_captures(
     service: ServiceOf,
@@ -63,6 +80,12 @@ def list_captures(
 def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureOut:
     """A capture: its cameras, its files with their sha256, and the rig's certificate of the shot."""
     return CaptureOut.model_validate(service.store.capture(capture_id))
+
+
+@router.get("/captures/{capture_id}/checks", responses=documented(404))
+def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureChecks:
+    """What the verdict follows from: exposure, sharpness, the camera's place and the subject's outline by camera."""
+    return CaptureChecks.model_validate({"cameras": service.store.checks(capture_id)})
 
 
 @router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))
@@ -109,10 +132,25 @@ def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeat
     return NewFeatures(points=service.captures.features(capture_id))
 
 
+@router.get("/captures/{capture_id}/holdings", responses=documented(404))
+def get_holdings(service: ServiceOf, caller: Reader, capture_id: str) -> HoldingsOut:
+    """What a removal of the capture takes, and what stays."""
+    return HoldingsOut.model_validate(service.captures.holdings(capture_id))
+
+
 @router.delete("/captures/{capture_id}", status_code=204, responses=documented(404, 409))
-def delete_capture(service: ServiceOf, caller: Taker, capture_id: str) -> None:
-    """Removes a capture with its images; its jobs and their results stay. 409 while a job needs it."""
-    service.captures.remove(capture_id)
+def delete_capture(
+    service: ServiceOf,
+    caller: Taker,
+    capture_id: str,
+    erase: Annotated[bool, Query(description="its jobs and heads, too, for good")] = False,
+) -> None:
+    """Removes a capture with its images; its jobs and their results, which show the face, stay. 409 while a job needs
+    it. With ``erase`` nothing stays: jobs are cancelled and go with their results."""
+    if erase:
+        service.captures.erase(capture_id)
+    else:
+        service.captures.remove(capture_id)
 
 
 @router.post(
@@ -120,7 +158,7 @@ def delete_capture(service: ServiceOf, caller: Taker, capture_id: str) -> None:
     status_code=202,
     tags=["jobs"],
     responses=documented(400, 404, 409, 413, 415, 507),
-    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model"), settings="JSON object"),
+    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), settings="JSON object"),
 )
 async def reconstruct_upload(
     service: ServiceOf,
@@ -131,7 +169,8 @@ async def reconstruct_upload(
     """Upload and job in one call."""
     record, fields = await receive_capture(service, request)
     try:
-        wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")))
+        name = (fields.get("name") or "")[:TEXT_MOST]
+        wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")), name)
         key = request.headers.get("idempotency-key")
         submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=key)
         job = await service.threads.disk(submit)

@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 import anyio
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from fastapi.responses import FileResponse, StreamingResponse
+from fastapi.responses import FileResponse, PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.http.auth import ServiceOf, require
@@ -15,6 +15,7 @@ from server.http.schemas import JobList, JobOut, NewJob, NewSessionJobs, Restart
 from server.services.jobs import FINISHED, Work
 from server.services.keys import Caller
 from server.services.records import Job
+from server.storage.records import JobWebhook
 from server.wire.problems import Responses, documented
 from server.wire.send_file import media_type, send_archive, send_file
 
@@ -31,7 +32,7 @@ def submit_job(
     """Queues a reconstruction. The same Idempotency-Key with the same request returns the first job."""
     job = service.jobs.submit(
         wanted.capture_id,
-        Work(wanted.model, wanted.settings),
+        Work(wanted.model, wanted.settings, wanted.name, _webhook(wanted)),
         key=caller.key,
         idempotency_key=idempotency_key,
         queue=wanted.queue,
@@ -119,6 +120,17 @@ def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
     service.jobs.delete(job_id)
 
 
+@router.get(
+    "/jobs/{job_id}/log",
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}, **documented(404)},
+    response_class=PlainTextResponse,
+)
+def get_job_log(service: ServiceOf, caller: Reader, job_id: str) -> str:
+    """What its workers said of this job: stages, warnings, how it ended. 404 before it begins and once it was
+    cancelled."""
+    return service.jobs.log(job_id)
+
+
 ARCHIVE: Responses = {
     200: {"content": {"application/zip": {}}},
     304: {"description": "Not Modified"},
@@ -156,6 +168,10 @@ def get_result(service: ServiceOf, caller: Reader, request: Request, job_id: str
     """head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so on; ``GET .../result`` lists
     what there is."""
     return send_file(request, service.jobs.result_file(job_id, name))
+
+
+def _webhook(wanted: NewJob) -> JobWebhook | None:
+    return None if wanted.webhook is None else {"url": wanted.webhook.url, "secret": wanted.webhook.secret}
 
 
 def _accepted(job: Job, response: Response) -> JobOut:

@@ -1,17 +1,34 @@
-"""The rig: its state, a live view, clean plates, the calibration in use."""
+"""The rig: its state, a live view, settings of cameras and lamps, clean plates, the calibration in use."""
 
+from collections.abc import AsyncIterator
+from contextlib import suppress
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Response
+import anyio
+from fastapi import APIRouter, Depends, Query, Response
+from fastapi.responses import StreamingResponse
 
+from server.errors import Unavailable
 from server.http.auth import ServiceOf, require
-from server.http.schemas import BackgroundOut, RigOut, UseCalibration
+from server.http.rig_schemas import PlatesList, PlatesOut, UsePlates
+from server.http.schemas import (
+    BackgroundOut,
+    CameraSettingsEdit,
+    CameraSettingsOut,
+    Lights,
+    RigOut,
+    UseCalibration,
+)
 from server.services.keys import Caller
+from server.services.service import Service
 from server.wire.problems import documented
 
 router = APIRouter(prefix="/v1/rig", tags=["rig"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
+PARTS = "multipart/x-mixed-replace; boundary=frame"
+PICTURE_EVERY_S = 0.25
+UNKEPT = {"Cache-Control": "no-store"}
 
 
 @router.get("", responses=documented())
@@ -27,14 +44,82 @@ def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
 )
 def rig_preview(service: ServiceOf, caller: Reader, name: str) -> Response:
     """What the camera sees now."""
-    return Response(service.rig.preview(name), media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+    return Response(service.rig.preview(name), media_type="image/jpeg", headers=UNKEPT)
 
 
-@router.post("/background", responses=documented(507))
+@router.get(
+    "/cameras/{name}/preview.mjpg",
+    response_class=StreamingResponse,
+    responses={200: {"content": {PARTS: {"schema": {"type": "string", "format": "binary"}}}}, **documented(404)},
+)
+async def rig_preview_stream(
+    service: ServiceOf,
+    caller: Reader,
+    name: str,
+    seconds: Annotated[float, Query(gt=0, le=3600, description="after which it ends")] = 600.0,
+) -> Response:
+    """What the camera sees, four times a second, as motion JPEG: for a page's ``<img>`` or a video player."""
+    first = await service.threads.disk(service.rig.preview, name)  # a 404 or 503 comes before the first picture
+    return StreamingResponse(_pictures(service, name, first, seconds), media_type=PARTS, headers=UNKEPT)
+
+
+async def _pictures(service: Service, name: str, picture: bytes, seconds: float) -> AsyncIterator[bytes]:
+    until = anyio.current_time() + seconds
+    while True:
+        began = anyio.current_time()
+        yield b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(picture), picture)
+        with suppress(Unavailable):  # a camera that is away for a moment: the last picture stands
+            picture = await service.threads.disk(service.rig.preview, name)
+        await anyio.sleep(max(0.0, began + PICTURE_EVERY_S - anyio.current_time()))
+        if anyio.current_time() >= until:
+            return
+
+
+@router.get("/cameras/{name}/settings", responses=documented(404))
+def camera_settings(service: ServiceOf, caller: Reader, name: str) -> CameraSettingsOut:
+    """Exposure, gain and white balance that were asked of a camera, and what it did not take."""
+    return CameraSettingsOut.model_validate(service.rig.camera_settings(name))
+
+
+@router.patch("/cameras/{name}/settings", responses=documented(400, 404, 409, 413, 415, 507))
+def set_camera(service: ServiceOf, caller: Taker, name: str, wanted: CameraSettingsEdit) -> CameraSettingsOut:
+    """Other settings of a camera, kept over restarts; take new clean plates after it. 409 in the simulated studio."""
+    changed = service.rig.set_camera(name, wanted.model_dump(exclude_unset=True))
+    return CameraSettingsOut.model_validate(changed)
+
+
+@router.get("/lights", responses=documented())
+def rig_lights(service: ServiceOf, caller: Reader) -> Lights:
+    """The lamps that are on during a shot."""
+    return Lights(outputs=list(service.rig.lights()))
+
+
+@router.put("/lights", responses=documented(400, 409, 413, 415, 507))
+def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
+    """Other lamps from now on, kept over restarts; take new clean plates after it. 409 in the simulated studio."""
+    return Lights(outputs=list(service.rig.set_lights(tuple(sorted(set(wanted.outputs))))))
+
+
+@router.post("/background", responses=documented(409, 507))
 def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
-    """Takes new clean plates of the empty studio; the old ones stay if that fails (503)."""
+    """Takes new clean plates of the empty studio. The old ones stay if that fails (503), or if the new ones show
+    somebody whom the old ones do not (409): those are kept, and PUT puts them to use all the same."""
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())
+
+
+@router.get("/background", responses=documented())
+def list_plates(service: ServiceOf, caller: Reader) -> PlatesList:
+    """The clean plates that are kept, newest first: those in use, earlier ones, and those that were refused."""
+    return PlatesList(versions=[PlatesOut.model_validate(kept) for kept in service.rig.plates()])
+
+
+@router.put("/background", responses=documented(400, 404, 413, 415, 507))
+def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesList:
+    """Puts clean plates that are kept to use: earlier ones, which takes the newest back, or refused ones all the
+    same."""
+    service.rig.use_plates(wanted.version)
+    return list_plates(service, caller)
 
 
 @router.put("/calibration", responses=documented(400, 404, 409, 413, 415, 507))

@@ -46,7 +46,9 @@ def drop_file(page: Page, selector: str, path: Path) -> None:
         page.dispatch_event(selector, event, {"dataTransfer": held})
 
 
-def test_two_pages_agree_and_a_removal_is_taken_back(browser: Browser, service: RunningService, tmp_path: Path) -> None:
+def test_two_pages_agree_and_a_removal_is_taken_back_or_for_good(
+    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+) -> None:
     uploaded_capture(service, tmp_path, 1)
     one, two = visit(browser, service.url), visit(browser, service.url)
     here, there = one.go("/captures"), two.go("/captures")
@@ -55,12 +57,15 @@ def test_two_pages_agree_and_a_removal_is_taken_back(browser: Browser, service: 
     for page in (here, there):
         expect(page.locator(".row-button")).to_have_count(2, timeout=5000)
     here.locator("#remove").click()
+    expect(here.locator("#removal")).to_contain_text("takes the 3 pictures")
+    here.locator("#remove-pictures").click()
     for page in (here, there):
         expect(page.locator(".row-button")).to_have_count(1, timeout=5000)
     there.get_by_role("button", name="Undo").click()
     for page in (here, there):
         expect(page.locator(".row-button")).to_have_count(2, timeout=5000)
     here.locator("#remove").click()
+    here.locator("#remove-pictures").click()
     deadline = time.monotonic() + 30
     while len(httpx.get(service.url + "/v1/captures").json()["captures"]) == 2:
         assert time.monotonic() < deadline
@@ -72,6 +77,14 @@ def test_two_pages_agree_and_a_removal_is_taken_back(browser: Browser, service: 
     expect(jobs.locator("[data-job]")).to_have_count(0, timeout=5000)
     here.get_by_role("button", name="Undo").click()  # on another page
     expect(jobs.locator("[data-state=succeeded]")).to_have_count(1, timeout=5000)
+    here.locator("#remove").click()
+    expect(here.locator("#removal")).to_contain_text("1 head (")
+    expect(here.locator("#removal")).to_contain_text("photographs of the face in the overlays would stay")
+    keep_screenshots(here, screenshots, "captures-removal")
+    here.locator("#erase-capture").click()
+    for page in (here, jobs):
+        expect(page.locator(".row-button")).to_have_count(0, timeout=10_000)
+    assert httpx.get(service.url + "/v1/jobs").json()["jobs"] == []
     one.check_clean()
     two.check_clean()
 
@@ -100,6 +113,9 @@ def test_a_session_is_begun_filled_and_erased(
     rig = v.go("/")
     expect(rig.locator("#session option:checked")).to_have_text("Anna")  # what is shot now belongs to it
     page = v.go("/captures")
+    page.locator("#rename").fill("Anna B.")
+    page.keyboard.press("Tab")
+    expect(page.locator("#session option:checked")).to_have_text("Anna B. (1)")
     page.locator("#method").select_option("simplex")
     page.locator("#reconstruct-all").click()
     expect(page.get_by_text("Queued 1 job.")).to_be_visible(timeout=30_000)

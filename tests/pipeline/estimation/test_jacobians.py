@@ -24,9 +24,10 @@ from calibration.adjustment.state import (
     observations,
 )
 from calibration.silhouette_refinement.tangency_term import PackedTangencies, TangencyTerm
-from pipeline.estimation.terms import Residuals
+from pipeline.estimation.terms import NormalEquations, Residuals
 from pipeline.fitting.feature_term import FeatureTerm
 from pipeline.fitting.head_problem import apply_step
+from pipeline.fitting.prior_term import PriorTerm
 from pipeline.fitting.problem import (
     PER_CAMERA,
     POSE,
@@ -238,3 +239,28 @@ def test_jacobians_are_central_differences(make: Callable[[], Case]) -> None:
         slope = (subject.residuals(step) - subject.residuals(-step)) / (2.0 * by)
         scale = max(np.abs(subject.jacobian[:, column]).max(), 1e-9)
         np.testing.assert_allclose(subject.jacobian[:, column] / scale, slope / scale, atol=subject.tolerance)
+
+
+def test_the_priors_normal_equations_are_differences_of_its_cost() -> None:
+    """A prior has no Jacobian, but its cost is a quadratic: half its central differences are the gradient, and those of
+    the gradient the matrix, to rounding."""
+    problem, stage, state = head()
+    rng = np.random.default_rng(8)
+    known = rng.normal(size=(len(problem.views.names), PER_CAMERA, PER_CAMERA))
+    problem = replace(problem, camera_information=known @ known.transpose(0, 2, 1))
+    term, count, by = PriorTerm(problem, stage), len(head_steps(problem, stage)), 1e-2
+
+    def after(place: int, step_by: float) -> tuple[float, NormalEquations]:
+        step = np.zeros(count)
+        step[place] = step_by
+        at, equations = term.at(apply_step(state, step, stage)), NormalEquations.empty(count)
+        at.add_to(equations)
+        return at.cost, equations
+
+    _, here = after(0, 0.0)
+    for place in range(count):
+        (cost_up, up), (cost_down, down) = after(place, by), after(place, -by)
+        np.testing.assert_allclose(here.gradient[place], (cost_up - cost_down) / (4 * by), rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(
+            here.matrix[:, place], (up.gradient - down.gradient) / (2 * by), rtol=1e-6, atol=1e-8
+        )

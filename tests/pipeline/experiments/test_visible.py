@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from pipeline.dense.surface.fusion import BustSurface
-from pipeline.experiments.visible import STYLES, head_to_bust, seen_of, splats
+from pipeline.experiments.detail import Known
+from pipeline.experiments.visible import LEAST_PLACES, STYLES, head_to_bust, region_errors, seen_of, splats
+from rig.capture import Capture
 from rig.mesh import Mesh, face_normals
+from rig.rig import Rig
 from rig.studio.scene.hairstyles import HAIRSTYLES
 from rig.studio.scene.visible import VisiblePoints
 from tests.support.scenes import ellipsoid
@@ -32,6 +35,25 @@ def test_only_what_a_photograph_measures_counts_as_seen() -> None:
 def test_the_head_is_compared_with_seen_skin() -> None:
     head, bust = planted()
     assert np.median(head_to_bust(head, bust)) == pytest.approx(OFF_MM, abs=0.05)
+
+
+def test_errors_of_a_region_are_of_its_seen_skin_alone() -> None:
+    """A truth 0.4 mm off the head in front and 2 mm behind, where nobody looks."""
+    head = ellipsoid(4)
+    front = head.vertices[:, 2] > 0.0
+    true = Mesh(head.vertices + np.where(front, 0.4, 2.0)[:, None] * head.normals(), head.faces)
+    count = int(front.sum())
+    points = VisiblePoints(
+        true.vertices[front].astype(np.float32), head.normals()[front].astype(np.float32),
+        np.zeros(count, np.uint8), np.full(count, 2, np.uint8),
+    )  # fmt: skip
+    known = Known("planted", Capture({}), Rig(()), true, front, points)
+    left = head.vertices[:, 0] > 0.0
+    found = region_errors(known, head, {"eyes": left, "ears": ~left, "neck": left, "nose": np.zeros(len(left), bool)})
+    assert set(found) == {f"head_{r}_seen_{q}_mm" for r in ("eyes", "ears") for q in ("median", "mean", "p95")}
+    assert found["head_eyes_seen_median_mm"] == pytest.approx(0.4, abs=0.03)
+    assert found["head_ears_seen_p95_mm"] < 0.6
+    assert count > LEAST_PLACES
 
 
 def test_a_splat_faces_the_way_of_its_point() -> None:

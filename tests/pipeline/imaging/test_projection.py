@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.compiled import njit
-from pipeline.imaging.projection import packed_camera, packed_lens
+from pipeline.imaging.projection import packed_camera, packed_lens, project_points
 from pipeline.imaging.projection_kernels import LENS, NOWHERE, distorted, pinhole, placed, project, projection_slopes
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import look_at, vector_from_rotation
@@ -87,3 +87,13 @@ def test_what_no_image_holds_is_nowhere() -> None:
     np.testing.assert_array_equal(gone, [True, False, True])
     np.testing.assert_array_equal((_pixels(points, packed_camera(ours)) == NOWHERE).all(axis=1), gone)
     assert distorted(1.01 * radius, 0.0, packed_lens(ours)) == (NOWHERE, NOWHERE)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_many_points_are_projected_as_by_the_camera(lens: Distortion) -> None:
+    behind = POSE.inverse().apply(np.array([[10.0, 5.0, -300.0]]))
+    beside = POSE.inverse().apply(np.array([[5000.0, 0.0, 300.0]]))  # past the turning radius of a lens that has one
+    points = np.concatenate([POINTS, behind, beside])
+    expected = camera(lens).project(points)
+    assert np.isnan(expected[-2]).all()
+    np.testing.assert_allclose(project_points(camera(lens), points), expected, atol=1e-9)

@@ -13,7 +13,7 @@ from pipeline.fitting.fit import Fit
 from pipeline.imaging.cpu_raster import depth_map
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.results.measurements import Landmark, Measurement
-from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, overlay
+from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, PART_COLOURS, TINT, overlay
 from pipeline.results.reconstruction import CameraFigures, Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
@@ -196,6 +196,20 @@ def test_contours_are_painted_where_they_are() -> None:
         assert sorted(window[np.argsort(near)[:2]]) == [int(x), int(x) + 1]
     assert (row[20] == 128).all()
     assert (row[170] == 128).all()
+
+
+def test_parts_tint_by_their_probability_and_the_unknown_keeps_its_colour() -> None:
+    image = np.full((240, 320, 3), 128, np.uint8)
+    parts = np.zeros((240, 320, 3), np.float32)
+    parts[120:160, 200:220, 0], parts[120:160, 220:240, 1] = 1.0, 0.5  # surely skin; hair or unknown
+    far = np.full((240, 320), 1e3, np.float32)
+    drawn = overlay(image, far, np.zeros((240, 320), bool), parts=parts).astype(float)
+    skin, hair = (np.array(PART_COLOURS[name], float) for name in ("skin", "hair"))
+    np.testing.assert_allclose(drawn[140, 210], 128 + TINT * (skin - 128), atol=0.51)
+    np.testing.assert_allclose(drawn[140, 230], 128 + 0.5 * TINT * (hair - 128), atol=0.51)
+    assert (drawn[200:, :] == 128).all()
+    named = overlay(image, far, np.zeros((240, 320), bool))
+    assert (drawn[:130, :100] != named[:130, :100]).any()  # the legend says which colour is which part
 
 
 def test_the_shared_checker_finds_no_breach_of_the_contract(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

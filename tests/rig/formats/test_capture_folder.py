@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rig.formats.capture_folder import capture_root, read_capture, write_capture
 from rig.formats.features_json import features_from_bytes
 from rig.formats.images import read_image, write_image
 from rig.geometry import look_at
+from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from tests.support.shared_data import shared
 
@@ -149,7 +151,10 @@ def feature(views: Any) -> Callable[[Path], None]:
     [
         (remove("images/b.png"), "images/b.png is missing"),
         (remove("background/a.png"), "background/a.png is missing: a clean plate, or masks/a.png, is needed"),
-        (damage("images/b.png", b"no picture"), "images/b.png is damaged or no PNG, JPEG, TIFF or WebP image"),
+        (
+            damage("images/b.png", b"no picture"),
+            "images/b.png is damaged or no PNG, JPEG, TIFF, WebP, RAW or HEIC picture",
+        ),
         (damage("images/b.png", png(picture())[:-40]), "images/b.png is damaged: its pixels cannot be decoded"),
         (damage("images/b.png", png(picture()[:20])), "images/b.png is 64 x 20 pixels, but its camera is 64 x 48"),
         (damage("images/b.jpg", png(picture())), "images/ holds b.jpg and b.png: which one is meant?"),
@@ -219,3 +224,23 @@ def test_the_shared_capture_is_read() -> None:
     assert len(rig) == len(capture.images) == 11
     assert not any(camera.intrinsics.distortion.is_zero for camera in rig)
     assert len(capture.features) == 7
+
+
+def test_pictures_and_points_of_a_fisheye_come_undistorted(tmp_path: Path) -> None:
+    lens = RecordedLens("kannala-brandt", (-0.8, 0.0, 0.0, 0.0))  # of no real lens: to be seen in 64 pixels
+    rig = Rig(tuple(replace(camera, recorded=lens) for camera in small_rig()))
+    matrix, wanted = rig["a"].intrinsics.matrix(), np.array([[52.0, 12.0]])
+    at = lens.distorted(wanted, matrix)[0]
+    assert np.linalg.norm(at - wanted[0]) > 0.5
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    ramp = np.stack([3 * columns, 4 * rows, 0 * rows], axis=2).astype(np.uint8)  # each pixel tells its place
+    filed = replace(small_capture(), features={"pronasale": {"a": at, "b": at}})
+    write_capture(tmp_path, replace(filed, images=dict.fromkeys("abc", ramp)), rig)
+    capture, back = read_capture(tmp_path)
+    assert back["a"].recorded == lens
+    assert back["a"].intrinsics.distortion.is_zero
+    pixels = np.stack([columns, rows], axis=2)[4:-4, 4:-4].reshape(-1, 2).astype(float)
+    told = capture.images["a"][4:-4, 4:-4, :2].reshape(-1, 2) / (3.0, 4.0)
+    np.testing.assert_allclose(told, lens.distorted(pixels, matrix), atol=0.25)  # half a level, and the way of reading
+    np.testing.assert_allclose(capture.features["pronasale"]["a"], wanted[0], atol=1e-6)
+    assert capture.masks["c"].dtype == bool

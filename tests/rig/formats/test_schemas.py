@@ -17,6 +17,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import document_from_rig, rig_from_document
 from rig.formats.features_json import features_from_document
 from rig.geometry import RigidTransform
+from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 
 SCHEMAS = Path(__file__).resolve().parents[3] / "docs" / "schemas"
@@ -31,7 +32,8 @@ def judge(name: str) -> Any:
 
 POSE = RigidTransform(np.eye(3), np.array([0.0, 0.0, 1200.0]))
 LENS = Intrinsics(1024, 768, 1500.0, 1500.0, 511.5, 383.5)
-RIG = Rig(tuple(Camera(f"cam{i:02}", LENS, POSE, np.eye(6) * 1e-6) for i in range(3)))
+RECORDED = (None, RecordedLens("kannala-brandt", (0.1, 0.0, 0.0, 0.0)), RecordedLens("rational", (0.1,) * 8))
+RIG = Rig(tuple(Camera(f"cam{i:02}", LENS, POSE, np.eye(6) * 1e-6, RECORDED[i]) for i in range(3)))
 CAMERAS = json.loads(json.dumps(document_from_rig(RIG)))
 FEATURES = {
     "format": "eigenhead-features/1",
@@ -55,7 +57,9 @@ values = st.one_of(
     st.none(),
     st.booleans(),
     numbers,
-    st.sampled_from(["", "1", "mm", "m", "cam09", ".hidden", "a/b", "ä", "a" * 64, "a" * 65, "fisheye", "1e3"]),
+    st.sampled_from(
+        ["", "1", "mm", "m", "cam09", ".hidden", "a/b", "ä", "a" * 64, "a" * 65, "fisheye", "rational", "1e3"]
+    ),
     st.lists(st.one_of(numbers, st.booleans(), st.sampled_from(["1"])), max_size=7),
     st.sampled_from(
         [{}, {"fx": 1}, [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 0], [0, 1]], {"k1": 0.1}, {"cam00": [1, 2]}]

@@ -1,11 +1,14 @@
 """``eigenhead doctor``: what it finds, and that it makes nothing."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
 from server.cli import doctor
+from server.services.jobs import WORKFLOW, migrate
 from server.services.keys import Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database
@@ -84,3 +87,25 @@ def test_captures_without_their_database_are_told(examine: Callable[..., dict], 
     assert "2 captures, 1 jobs" in found["data"]["detail"]
     assert not found["database"]["ok"]
     assert "captures and jobs are" in found["database"]["detail"]
+
+
+def test_a_result_that_is_gone_is_told(examine: Callable[..., dict], tmp_path: Path) -> None:
+    """Jobs as the engine keeps them, written by its own tables; the folder of one was removed."""
+    settings = ServiceSettings(data=tmp_path)
+    assert examine(data=tmp_path)["results"] == {"ok": True, "detail": "none yet"}
+    migrate(settings)
+    kept, gone = "a" * 28, "b" * 28
+    engine = open_database(settings)
+    with engine.begin() as connection:
+        for job, status in ((kept, "SUCCESS"), (gone, "SUCCESS"), ("c" * 28, "ERROR")):
+            row = {"workflow_uuid": job, "status": status, "name": WORKFLOW}
+            names = ", ".join(row)
+            connection.execute(sa.text(f"INSERT INTO workflow_status ({names}) VALUES (:{', :'.join(row)})"), row)
+    engine.dispose()
+    for job in (kept, gone):
+        (tmp_path / "jobs" / job / "result").mkdir(parents=True)
+    assert examine(data=tmp_path)["results"] == {"ok": True, "detail": "of 2 jobs, all there"}
+    shutil.rmtree(tmp_path / "jobs" / gone)
+    found = examine(data=tmp_path)["results"]
+    assert not found["ok"]
+    assert f"of 2 jobs 1 are gone ({gone})" in found["detail"]

@@ -59,6 +59,18 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         assert {camera["state"] for camera in state["cameras"]} == {"open"}
         assert _decoded(client.get("/v1/rig/cameras/cam03/preview.jpg").content).shape == (240, 320, 3)
 
+        assert (capture["verdict"], capture["faults"]) == ("good", [])
+        checks = client.get(f"/v1/captures/{capture['id']}/checks").json()["cameras"]
+        assert all(check["blur_px"] < 2.5 and len(check["subject"]["outline"]) > 10 for check in checks.values())
+        studio.inject(DeviceFault("bumped", "cam03"))
+        moved = client.post("/v1/captures", json={}).json()
+        studio.clear()
+        assert moved["verdict"] == "usable"
+        assert [(fault["code"], fault["camera"]) for fault in moved["faults"]] == [("moved", "cam03")]
+        assert "calibrate again" in moved["faults"][0]["remedy"]
+        assert client.get("/v1/captures").json()["captures"][0]["verdict"] == "usable"
+        client.delete(f"/v1/captures/{moved['id']}")
+
         studio.inject(DeviceFault("hung", "cam02"))
         failed = client.post("/v1/captures", json={})
         assert failed.status_code == 503
@@ -73,9 +85,49 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
         plates = client.post("/v1/rig/background").json()
         assert (plates["cameras"], plates["plates"]) == (list(NAMES), 5)
         studio.seat(True)
+        in_use, before = client.get("/v1/rig/background").json()["versions"]
+        assert (in_use["in_use"], before["in_use"], before["refused"]) == (True, False, [])
+        refused = client.post("/v1/rig/background")  # with the sitter in them
+        assert (refused.status_code, refused.json()["type"].endswith("plates-occupied")) == (409, True)
+        assert len(refused.json()["errors"]) == len(NAMES)
+        kept = client.get("/v1/rig/background").json()["versions"]
+        assert [version["id"] for version in kept if version["in_use"]] == [in_use["id"]]
+        assert client.post("/v1/captures", json={}).json()["verdict"] == "good", "the old plates are still in use"
+        used = client.put("/v1/rig/background", json={"version": kept[0]["id"]}).json()["versions"]
+        assert (used[0]["in_use"], len(used[0]["refused"])) == (True, len(NAMES))
+        assert client.post("/v1/captures", json={}).json()["verdict"] == "poor", "nobody differs from themselves"
+        assert client.put("/v1/rig/background", json={"version": in_use["id"]}).status_code == 200
+        assert client.put("/v1/rig/background", json={"version": "../../secret"}).status_code == 404
         assert client.post("/v1/captures", json={}).status_code == 201
         assert client.post("/v1/captures", json={"seed": 1}).status_code == 422
-        assert len(client.get("/v1/captures").json()["captures"]) == 2
+        assert len(client.get("/v1/captures").json()["captures"]) == 4
+
+
+def test_lamps_settings_and_a_moving_preview_over_http(studio: StudioDevices, tmp_path: Path) -> None:
+    with (
+        running_service(tmp_path / "data", worker=False, rig=str(studio.folder / "rig.toml")) as service,
+        httpx.Client(base_url=service.url, timeout=60) as client,
+    ):
+        studio.seat(False)  # five takes in turn, each with noise of its own
+        assert client.get("/v1/rig/lights").json() == {"outputs": [0, 1]}
+        with client.stream("GET", "/v1/rig/cameras/cam03/preview.mjpg", params={"seconds": 1.6}) as stream:
+            assert stream.headers["content-type"] == "multipart/x-mixed-replace; boundary=frame"
+            data = stream.read()
+        parts = [part for part in data.split(b"--frame\r\nContent-Type: image/jpeg\r\n") if part]
+        pictures = [part.partition(b"\r\n\r\n")[2][: int(part.split()[1])] for part in parts]
+        assert len(pictures) >= 3
+        assert {_decoded(picture).shape for picture in pictures} == {(240, 320, 3)}
+        assert len(set(pictures)) >= 2, "the sensor's noise makes each another picture"
+        assert client.get("/v1/rig/cameras/cam99/preview.mjpg").status_code == 404
+        assert client.put("/v1/rig/lights", json={"outputs": []}).json() == {"outputs": []}
+        dark = _decoded(client.get("/v1/rig/cameras/cam03/preview.jpg").content)
+        assert dark.mean() < 0.5 * _decoded(pictures[0]).mean()
+        assert client.put("/v1/rig/lights", json={"outputs": [4]}).status_code == 422
+        changed = client.patch("/v1/rig/cameras/cam03/settings", json={"exposure_ms": 8})
+        assert changed.json()["exposure_ms"] == 8.0
+        assert "exposure_ms" in changed.json()["unmet"][0]
+        assert client.get("/v1/rig/cameras/cam03/settings").json() == changed.json()
+        assert client.patch("/v1/rig/cameras/cam03/settings", json={"exposure_ms": -1}).status_code == 422
 
 
 @pytest.mark.timeout(600)

@@ -1,5 +1,6 @@
 """What goes and what stays: by age, by number, by space; nothing that a job needs."""
 
+import shutil
 import time
 from pathlib import Path
 
@@ -56,3 +57,26 @@ def test_only_the_newest_results_stay(tmp_path: Path, capture_file: bytes) -> No
             assert not (service.data / "jobs" / job).exists()
         for job in jobs[2:]:
             assert client.get(f"/v1/jobs/{job}/result/head.ply").status_code == 200
+
+
+def test_a_result_that_somebody_removed_is_told_before_it_is_fetched(tmp_path: Path, capture_file: bytes) -> None:
+    """In the job, in the list, by readiness; a restart makes it again."""
+    with (
+        running_service(tmp_path / "data", sweep_s="0.3") as service,
+        httpx.Client(base_url=service.url, timeout=30) as client,
+    ):
+        capture = upload(service, capture_file)
+        job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+        files = await_state(client, job, ("succeeded",))["files"]
+        assert client.get(f"/v1/jobs/{job}").json()["notice"] is None
+        shutil.rmtree(service.data / "jobs" / job)
+        assert "restart the job" in client.get("/v1/jobs").json()["jobs"][0]["notice"]
+        refused = client.get(f"/v1/jobs/{job}/result/head.ply")
+        assert (refused.status_code, refused.json()["type"]) == (409, "urn:eigenhead:problem:result-missing")
+        assert client.get(f"/v1/jobs/{job}/result").status_code == 409
+        deadline = time.monotonic() + 20
+        while job not in client.get("/readyz").json()["checks"]["results"]["detail"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        again = client.post(f"/v1/jobs/{job}/restart").json()["id"]
+        assert await_state(client, again, ("succeeded",))["files"] == files

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from rig.acquisition.commands import take_plates
+from rig.acquisition.session import RigSession
+from rig.drivers.base import Driver
+from rig.drivers.registry import driver_for
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig, write_rig
 from rig.formats.capture_folder import read_capture
-from rig.formats.rig_toml import read_rig_config
+from rig.formats.rig_toml import CameraConfig, read_rig_config
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from rig.studio.scene.layout import default_layout
 from server.errors import Conflict, NotFound, Unavailable
@@ -91,6 +94,67 @@ def test_the_simulated_rig_takes_a_calibration_of_its_own_cameras(tmp_path: Path
     assert read_rig(tmp_path / "rig" / "cameras.json")["cam00"].intrinsics.width == 512
     with pytest.raises(NotFound, match="cam99"):
         rig.preview("cam99")
+
+
+def test_lamps_are_set_and_kept(studio: StudioDevices, rig: RealRig, tmp_path: Path) -> None:
+    def brightness() -> float:
+        return float(np.mean(rig.look()["cam00"]))
+
+    assert rig.lights() == (0, 1)
+    both = brightness()
+    assert rig.set_lights((1,)) == (1,)
+    assert brightness() > 0.8 * both, "the studio is lit by any lamp"
+    assert studio.box is not None
+    assert studio.box.logic.lights == 0b10
+    assert rig.set_lights(()) == ()
+    assert brightness() < 0.5 * both
+    again = RealRig(studio.folder / "rig.toml", tmp_path / "rig" / "cameras.json")
+    assert again.lights() == ()
+    with pytest.raises(InputError, match="7 is no output"):
+        rig.set_lights((7,))
+    rig.set_lights((0, 1))
+    assert brightness() > 0.8 * both
+
+
+def test_settings_reach_the_driver_and_are_kept(
+    studio: StudioDevices, rig: RealRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The studio's streams say what network cameras say, that HTTP cannot set them; what any driver is told, is seen
+    where drivers are made."""
+    told: dict[str, CameraConfig] = {}
+
+    def noting(camera: CameraConfig, folder: Path) -> Driver:
+        told[camera.name] = camera
+        return driver_for(camera, folder)
+
+    monkeypatch.setattr("server.services.rigs.RigSession", lambda config: RigSession(config, noting))
+    rig.look()
+    assert told["cam03"].exposure_ms is None
+    changed = rig.set_camera("cam03", {"exposure_ms": 8.0, "gain_db": 3.0})
+    assert (told["cam03"].exposure_ms, told["cam03"].gain_db, told["cam04"].exposure_ms) == (8.0, 3.0, None)
+    assert (changed.exposure_ms, changed.gain_db, changed.white_balance_k) == (8.0, 3.0, None)
+    assert [line.split()[0] for line in changed.unmet] == ["exposure_ms", "gain_db"]
+    again = RealRig(studio.folder / "rig.toml", tmp_path / "rig" / "cameras.json")
+    assert again.camera_settings("cam03").exposure_ms == 8.0
+    assert rig.set_camera("cam03", {"exposure_ms": None}).exposure_ms is None
+    assert (told["cam03"].exposure_ms, told["cam03"].gain_db) == (None, 3.0)
+    with pytest.raises(InputError, match="exposure_ms: -1"):
+        rig.set_camera("cam03", {"exposure_ms": -1.0})
+    with pytest.raises(NotFound, match="cam99"):
+        rig.set_camera("cam99", {})
+    (tmp_path / "rig" / "adjusted.json").write_text("{")
+    again = RealRig(studio.folder / "rig.toml", tmp_path / "rig" / "cameras.json")
+    assert again.camera_settings("cam03").gain_db is None
+
+
+def test_the_simulated_studio_has_no_settings(tmp_path: Path) -> None:
+    rig = open_rig(ServiceSettings(data=tmp_path))
+    assert (rig.lights(), rig.camera_settings("cam00").unmet) == ((), ())
+    for change in (lambda: rig.set_lights((0,)), lambda: rig.set_camera("cam00", {"gain_db": 1.0})):
+        with pytest.raises(Conflict, match="no settings"):
+            change()
+    with pytest.raises(NotFound, match="cam99"):
+        rig.set_camera("cam99", {})
 
 
 @pytest.mark.parametrize(

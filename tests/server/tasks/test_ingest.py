@@ -2,13 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from rig.capture import Capture
 from rig.errors import InputError
+from rig.formats.capture_folder import write_capture
 from server.storage.records import CaptureContent
 from server.tasks.ingest import check_capture
+from tests.rig.acquisition.test_session import flat_rig
 from tests.server.http.test_hostile import SPOILT
 from tests.support.services import small_capture
+from tests.support.textured_studio import NAMES, FlatStudio
 
 PIXELS_MOST = 100_000_000
 
@@ -35,6 +40,23 @@ def test_faults_of_cameras_files_and_features_are_told_at_once(tmp_path: Path) -
         checked(folder)
     for word in ("at one place", "images/foo.png has no camera", "'third_eye' is no landmark"):
         assert any(word in fault for fault in refusal.value.faults)
+
+
+def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
+    """One camera of eleven stands 8.5 px from where its clean plate was taken."""
+    empty, seated = FlatStudio(False), FlatStudio(True)
+    images = {name: seated(name, 0.0) for name in NAMES}
+    images["cam03"] = np.roll(images["cam03"], (8, 3), axis=(1, 0))
+    write_capture(tmp_path, Capture(images, {name: (empty(name, 0.0),) for name in NAMES}), flat_rig(NAMES))
+    found = checked(tmp_path)
+    assert [(fault.code, fault.camera) for fault in found.faults] == [("moved", "cam03")]
+    assert "calibrate again" in found.faults[0].remedy
+    assert found.checks["cam03"].get("background_moved_px") == pytest.approx(8.5, abs=0.3)
+    outlined = {name for name, view in found.checks.items() if (view.get("subject") or {}).get("outline")}
+    assert outlined >= set(NAMES) - {"cam03"}
+    measured = check_capture(tmp_path, PIXELS_MOST, lambda stage, share: None, measured=True)
+    assert measured.faults == ()
+    assert all(view.keys() == {"subject"} for view in measured.checks.values())
 
 
 def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:

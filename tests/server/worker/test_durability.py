@@ -20,7 +20,7 @@ import sqlalchemy as sa
 from rig.formats.archive import pack_folder
 from server.settings import ServiceSettings
 from tests.support.postgres import running_postgres
-from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture
+from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture, worker_pids
 
 JOBS, KILLS = 100, 30
 
@@ -32,20 +32,6 @@ def database(kind: str) -> Iterator[dict[str, Any]]:
         return
     with running_postgres() as url:
         yield {"database_url": url}
-
-
-def worker_pids(service: RunningService) -> list[int]:
-    """Worker processes of a service's data folder, told by their environment."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            command = (folder / "cmdline").read_bytes()
-            environment = (folder / "environ").read_bytes()
-        except OSError:
-            continue
-        if b"\0worker\0" in command and f"EIGENHEAD_DATA={service.data}\0".encode() in environment + b"\0":
-            found.append(int(folder.name))
-    return found
 
 
 def make_capture(service: RunningService, folder: Path) -> str:

@@ -1,0 +1,114 @@
+"""What is wrong with the pictures of a shot: light, focus, and what the cameras look at. Pure functions of pictures,
+clean plates and settings."""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from statistics import median
+
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.acquisition.image_checks import Registration, blur_px, exposure, register
+from rig.acquisition.plates import Plates
+from rig.acquisition.shot import Fault, PictureCheck
+from rig.formats.rig_toml import ShotConfig
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+OtherView = Callable[[str, Registration], str | None]
+
+LEVEL_WITHOUT_PLATES = 64.0  # a studio picture's mean, where there is no plate to compare with
+BLACK_LEVEL = 0.02  # of the plate's brightness: nothing can be seen in it
+# Measured on two rendered captures of eleven cameras: own background 0.35 to 0.75 (lamps off: 0.12 to 0.5), another
+# camera's up to 0.07. Between the two bounds the plates of the other cameras are asked.
+FOUND_LEAST, FOUND_SURELY = 0.1, 0.25
+MOVED_DARK_PX = 3.0  # the same with the lamps off: up to 2.6 px without any movement
+
+
+def plate_level(plate: ImageRgb | None) -> float:
+    """Mean value that a picture before this clean plate should have."""
+    return LEVEL_WITHOUT_PLATES if plate is None else max(float(plate[::4, ::4].mean()), 1.0)
+
+
+def examine_picture(image: ImageRgb, plate: ImageRgb | None) -> PictureCheck:
+    """Measures one picture."""
+    light = exposure(image)
+    black = light.mean < BLACK_LEVEL * plate_level(plate)
+    return PictureCheck(light, blur_px(image), None if plate is None or black else register(image, plate))
+
+
+def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, PictureCheck]:
+    """Measures every picture, in parallel: OpenCV lets go of the interpreter."""
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda name: examine_picture(images[name], plates.first.get(name)), images)
+        return dict(zip(images, found, strict=True))
+
+
+def judge(
+    images: Mapping[str, ImageRgb], checks: Mapping[str, PictureCheck], plates: Plates, shot: ShotConfig
+) -> list[Fault]:
+    """The faults that can be seen in the pictures of a shot."""
+    levels = {name: plate_level(plates.first.get(name)) for name in checks}
+    return judge_checks(checks, levels, shot, lambda name, own: _whose_view(name, images[name], own, plates))
+
+
+def judge_checks(
+    checks: Mapping[str, PictureCheck],
+    levels: Mapping[str, float],
+    shot: ShotConfig,
+    whose_view: OtherView = lambda name, own: None,
+) -> list[Fault]:
+    """The faults that measured pictures have.
+
+    Args:
+        levels: mean value that each camera's picture should have; the light of those that are absent is not judged.
+        whose_view: the camera whose clean plate fits better than a camera's own one does.
+    """
+    faults, lit = _light_faults(checks, levels, shot)
+    for name, check in checks.items():
+        if check.exposure.clipped_share > shot.clipped_most:
+            share = check.exposure.clipped_share * 100
+            faults.append(Fault("overexposed", name, f"{share:.1f} % of the picture is burnt out"))
+        if lit[name] and check.blur_px is not None and check.blur_px > shot.blur_most_px:
+            width = f"edges are {check.blur_px:.1f} px wide, {shot.blur_most_px:g} px allowed"
+            faults.append(Fault("blurred", name, width))
+        if check.registration is not None:
+            faults.extend(_view_faults(name, check.registration, lit[name], shot, whose_view))
+    return faults
+
+
+def _light_faults(
+    checks: Mapping[str, PictureCheck], levels: Mapping[str, float], shot: ShotConfig
+) -> tuple[list[Fault], dict[str, bool]]:
+    """Faults of light, and which cameras have enough of it."""
+    ratios = {name: check.exposure.mean / levels[name] for name, check in checks.items() if name in levels}
+    common = median(ratios.values()) if len(ratios) >= 3 else 1.0
+    faults: list[Fault] = []
+    if common < shot.dark_below:
+        faults.append(Fault("lights-off", None, f"the pictures have {common * 100:.0f} % of their usual brightness"))
+    for name, ratio in ratios.items():
+        if ratio < shot.dark_below * min(1.0, common):
+            of = "the other cameras' share" if common < shot.dark_below else "its usual brightness"
+            faults.append(Fault("dark", name, f"{ratio / min(1.0, common) * 100:.0f} % of {of}"))
+    return faults, {name: ratios.get(name, 1.0) >= shot.dark_below for name in checks}
+
+
+def _view_faults(name: str, found: Registration, lit: bool, shot: ShotConfig, whose_view: OtherView) -> list[Fault]:
+    if not found.conclusive:
+        return []
+    if found.found < (FOUND_SURELY if lit else FOUND_LEAST):
+        other = whose_view(name, found)
+        if other is not None:
+            return [Fault("swapped", name, f"it shows the view of {other}")]
+        if found.found < FOUND_LEAST:
+            return [Fault("view", name, "its background is not that of its clean plates")]
+    most_px = shot.moved_most_px if lit else max(shot.moved_most_px, MOVED_DARK_PX)
+    if found.moved_px > most_px:
+        return [Fault("moved", name, f"its background lies {found.moved_px:.1f} px from its clean plates")]
+    return []
+
+
+def _whose_view(name: str, image: ImageRgb, own: Registration, plates: Plates) -> str | None:
+    """The camera whose clean plate fits the picture far better than the own one does."""
+    others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
+    best = max(others, key=lambda other: others[other], default=None)
+    return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * own.found) else None

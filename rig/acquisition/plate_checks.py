@@ -1,0 +1,52 @@
+"""Are new clean plates clean? Judged before they replace others: by what moves while they are taken, by their light,
+and against the plates in use. Pure functions of pictures."""
+
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.acquisition.image_checks import disturbed, noise_of
+from rig.acquisition.judgement import examine, judge
+from rig.acquisition.plates import NO_PLATES, Plates
+from rig.acquisition.shot import Fault, ShotFailed
+from rig.acquisition.subject_place import find_subject
+from rig.formats.rig_toml import ShotConfig
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+
+SEEN_SHARE = 0.5  # of the cameras: a person in the seat is seen by all; what one camera sees is its own wall or a bump
+
+
+class PlatesRefused(ShotFailed):
+    """New plates that show somebody; they are kept as ``version``, and the old ones stay in use."""
+
+    def __init__(self, faults: Sequence[Fault], version: str) -> None:
+        super().__init__(faults)
+        self.version = version
+
+
+def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str], shot: ShotConfig) -> list[Fault]:
+    """What the pictures of an empty studio alone show. ``live``: cameras whose pictures are of today, not recorded."""
+    faults = []
+    for name, images in taken.items():
+        if name in live and any(np.array_equal(images[0], other) for other in images[1:2]):
+            faults.append(Fault("frozen", name, "two clean plates are equal to the last bit"))
+        if disturbed(images, noise_of(images) or 0.0):
+            faults.append(Fault("disturbed", name, "something moved between them"))
+    first = {name: images[0] for name, images in taken.items()}
+    light = judge(first, examine(first, NO_PLATES), NO_PLATES, shot)
+    return faults + [fault for fault in light if fault.is_error]
+
+
+def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
+    """Cameras whose new plate differs from the one in use as a person in the seat would make it; none where fewer than
+    ``SEEN_SHARE`` of them do."""
+    compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
+    seen = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
+    faults = [
+        Fault("occupied", name, f"{place.share * 100:.0f} % of its picture differ in one piece from the plates in use")
+        for name, place in seen.items()
+        if place is not None
+    ]
+    return faults if len(faults) >= SEEN_SHARE * len(compared) else []

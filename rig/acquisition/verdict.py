@@ -1,0 +1,126 @@
+"""Is a capture worth reconstructing? Said while the subject still sits there, of shots and uploads alike.
+
+Measures one camera at a time, so that a large rig is judged in the memory of one camera.
+"""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal, TypedDict
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from rig.acquisition.judgement import examine_picture, judge_checks, plate_level
+from rig.acquisition.shot import CheckDocument, Fault, PictureCheck
+from rig.acquisition.subject_place import SubjectPlace, find_subject, subject_of_mask
+from rig.formats.rig_toml import ShotConfig
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+Verdict = Literal["good", "usable", "poor"]
+
+PLACE_FAULTS = frozenset({"empty", "cut-off"})
+DISPLACED = frozenset({"moved", "view", "swapped", "dark"})
+CAMERAS_LEAST = 3  # with fewer there is no reconstruction
+SOUND_SHARE = 0.75  # eight of eleven still surround a head; with fewer a side of it is seen by one camera or none
+
+
+class SubjectDocument(TypedDict):
+    """``outline``: corners in pixels of the picture."""
+
+    share: float
+    cut_off: list[str]
+    outline: list[list[float]]
+
+
+class ViewDocument(TypedDict, total=False):
+    """What was measured of one camera's picture; what was not measured is absent."""
+
+    mean: float
+    clipped_share: float
+    blur_px: float | None
+    background_found: float | None
+    background_moved_px: float | None
+    subject: SubjectDocument | None
+
+
+@dataclass(frozen=True, slots=True)
+class ViewCheck:
+    """One camera: its picture's measures (None where the shot has them), the mean value that it should have (None
+    without a clean plate), and the subject in it (``looked``: there was a clean plate or a mask to find it by)."""
+
+    picture: PictureCheck | None
+    level: float | None
+    place: SubjectPlace | None
+    looked: bool
+
+    def document(self) -> ViewDocument:
+        """For JSON."""
+        measured: ViewDocument = {} if self.picture is None else {**_known(self.picture.document())}
+        if self.looked:
+            measured["subject"] = None if self.place is None else _place_document(self.place)
+        return measured
+
+
+def check_view(
+    image: ImageRgb, plate: ImageRgb | None, mask: Bool[np.ndarray, "h w"] | None, *, place_only: bool = False
+) -> ViewCheck:
+    """Measures one camera's picture. ``place_only``: the shot that it is of has measured the rest."""
+    if mask is not None and mask.shape == image.shape[:2]:
+        place = subject_of_mask(mask)
+    else:
+        place = None if plate is None else find_subject(image, plate)
+    picture = None if place_only else examine_picture(image, plate)
+    return ViewCheck(
+        picture, None if plate is None else plate_level(plate), place, not (mask is None and plate is None)
+    )
+
+
+def view_faults(views: Mapping[str, ViewCheck], limits: ShotConfig) -> list[Fault]:
+    """Everything that is wrong with the pictures of a capture."""
+    pictures = {name: view.picture for name, view in views.items() if view.picture is not None}
+    levels = {name: view.level for name, view in views.items() if view.level is not None}
+    return without_consequences([*judge_checks(pictures, levels, limits), *_place_faults(views)])
+
+
+def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
+    """Leaves out what another fault of the same camera explains: before another background nobody is found."""
+    known = [*faults]
+    displaced = {fault.camera for fault in known if fault.code in DISPLACED} - {None}
+    return [fault for fault in known if not (fault.code in PLACE_FAULTS and fault.camera in displaced)]
+
+
+def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
+    """``good`` without a fault; ``poor`` where the rig itself is at fault, or too few cameras are without one."""
+    named = {fault.camera for fault in faults}
+    if not named:
+        return "good"
+    sound = len(set(cameras) - named)
+    return "poor" if None in named or sound < max(CAMERAS_LEAST, SOUND_SHARE * len(cameras)) else "usable"
+
+
+def _place_faults(views: Mapping[str, ViewCheck]) -> list[Fault]:
+    looked = {name: view.place for name, view in views.items() if view.looked}
+    if looked and not any(looked.values()):
+        return [Fault("empty", None, "no picture differs from its clean plate as a head would")]
+    faults = []
+    for name, place in looked.items():
+        if place is None:
+            faults.append(Fault("empty", name, "its picture does not differ from its clean plate as a head would"))
+        elif place.cut_off:
+            faults.append(Fault("cut-off", name, f"the head reaches the picture's edge ({', '.join(place.cut_off)})"))
+    return faults
+
+
+def _place_document(place: SubjectPlace) -> SubjectDocument:
+    outline = [[round(x, 1), round(y, 1)] for x, y in place.outline]
+    return {"share": round(place.share, 4), "cut_off": [*place.cut_off], "outline": outline}
+
+
+def _known(check: CheckDocument) -> ViewDocument:
+    return {
+        "mean": check["mean"],
+        "clipped_share": check["clipped_share"],
+        "blur_px": check["blur_px"],
+        "background_found": check["background_found"],
+        "background_moved_px": check["background_moved_px"],
+    }

@@ -1,0 +1,109 @@
+"""OpenCV's YAML of several cameras, as EasyMocap lays it out (https://chingswy.github.io/easymocap-public-doc).
+
+``names``, ``K_<name>`` and ``dist_<name>`` in ``intri.yml``, ``Rot_<name>`` (or ``R_<name>``, a rotation vector) and
+``T_<name>`` in ``extri.yml``, camera_from_world in metres. ``W_<name>`` and ``H_<name>`` are the size; without them the
+pictures tell it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.errors import InputError
+from rig.formats.foreign import MATRIX_PLACES, judged_rig, lens_entry, number_array, parsed, sized
+from rig.geometry import rotation_from_vector
+from rig.recorded_lens import COEFFICIENTS
+from rig.rig import Rig
+
+FILES = ("intri.yml", "extri.yml")
+
+
+def read_yaml(path: Path) -> Rig:
+    """The rig in ``intri.yml`` and the ``extri.yml`` beside it. Raises InputError naming every fault."""
+    lenses = parsed(path.with_name(FILES[0]), _matrices)
+    poses = parsed(path.with_name(FILES[1]), _matrices)
+    names = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
+    faults: list[str] = []
+    entries = []
+    for name in names:
+        matrix = number_array(lenses[f"K_{name}"], (3, 3), f"K_{name}", faults)
+        lens = number_array(lenses.get(f"dist_{name}", np.zeros(5)), None, f"dist_{name}", faults).ravel()
+        keys = COEFFICIENTS["rational"]
+        if lens[len(keys) :].any():
+            faults.append(f"dist_{name} has more than the {len(keys)} coefficients {' '.join(keys)}")
+        if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
+            faults.append(f"K_{name} has skew, which is not supported")
+        turned = poses.get(f"Rot_{name}")
+        if turned is None and (vector := poses.get(f"R_{name}")) is not None and vector.size == 3:
+            turned = rotation_from_vector(vector.ravel())
+        rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
+        translation = number_array(poses.get(f"T_{name}", np.zeros(0)).ravel(), (3,), f"T_{name}", faults)
+        sides = [lenses.get(f"{side}_{name}") for side in "WH"]
+        size = sized(path.parent, name, faults) if None in sides else tuple(int(side.ravel()[0]) for side in sides)  # type: ignore[union-attr]
+        entries.append(
+            {
+                "name": name,
+                "width": size[0],
+                "height": size[1],
+                "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
+                "distortion": lens_entry(dict(zip(keys, lens.tolist(), strict=False))),
+                "camera_from_world": {"rotation": rotation.tolist(), "translation": (1000.0 * translation).tolist()},
+            }
+        )
+    return judged_rig(entries, path.name, faults)
+
+
+def write_yaml(rig: Rig, folder: Path) -> None:
+    """Writes ``intri.yml`` and ``extri.yml`` into a folder. Raises InputError for a fisheye, which they do not tell."""
+    fisheyes = [c.name for c in rig if c.recorded is not None and c.recorded.model == "kannala-brandt"]
+    if fisheyes:
+        raise InputError("opencv-yaml", [f"does not tell a fisheye from others, as {', '.join(fisheyes)} are"])
+
+    def lenses(file: cv2.FileStorage) -> None:
+        for camera in rig:
+            k, lens = camera.intrinsics, camera.recorded
+            file.write(f"K_{camera.name}", k.matrix())
+            file.write(f"dist_{camera.name}", np.array([k.distortion.opencv() if lens is None else lens.coefficients]))
+            file.write(f"W_{camera.name}", k.width)
+            file.write(f"H_{camera.name}", k.height)
+
+    def poses(file: cv2.FileStorage) -> None:
+        for camera in rig:
+            pose = camera.camera_from_world
+            file.write(f"R_{camera.name}", cv2.Rodrigues(pose.rotation)[0])
+            file.write(f"Rot_{camera.name}", pose.rotation)
+            file.write(f"T_{camera.name}", pose.translation[:, None] / 1000.0)
+
+    for name, fill in zip(FILES, (lenses, poses), strict=True):
+        write_atomically(folder / name, _written(rig, fill))
+
+
+def _written(rig: Rig, fill: Callable[[cv2.FileStorage], None]) -> bytes:
+    file = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    file.startWriteStruct("names", cv2.FILE_NODE_SEQ)
+    for camera in rig:
+        file.write("", camera.name)
+    file.endWriteStruct()
+    fill(file)
+    return file.releaseAndGetString().encode()
+
+
+def _matrices(data: bytes) -> dict[str, np.ndarray]:
+    """Every matrix and number of a file by its key. Raises ValueError."""
+    try:
+        file = cv2.FileStorage(data.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = file.root()
+        found = {}
+        for key in root.keys():  # noqa: SIM118 a FileNode is no mapping
+            node = root.getNode(key)
+            if node.isMap():
+                found[key] = np.asarray(node.mat(), float)
+            elif node.isReal() or node.isInt():
+                found[key] = np.array([node.real()])
+        return found
+    except (cv2.error, SystemError, TypeError) as error:
+        said = " ".join(str(error).split())[:120]
+        raise ValueError(f"is no YAML of OpenCV's: {said}") from None

@@ -1,0 +1,125 @@
+"""``transforms.json``: nerfstudio's and instant-ngp's cameras, and what Blender's exporters for them write.
+
+``transform_matrix`` is world_from_camera with OpenGL's axes (x right, y up, z backwards;
+https://docs.nerf.studio/quickstart/data_conventions.html); the centre of the top-left pixel is (0.5, 0.5), as in
+COLMAP, whose numbers it takes over. Intrinsics stand at the top, or in a frame; Blender's files give ``camera_angle_x``
+and leave the size to the pictures. Lengths are metres where they could be (cameras within 30 of each other), else
+millimetres; ``applied_scale`` is taken back.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
+from rig.errors import InputError
+from rig.formats.foreign import METRES_MOST, camera_names, judged_rig, lens_entry, number_array, parsed, sized
+from rig.rig import Rig
+
+OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from OpenGL's
+MODELS = {"PINHOLE": False, "SIMPLE_PINHOLE": False, "OPENCV": False, "OPENCV_FISHEYE": True}
+LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def read_transforms(path: Path) -> Rig:
+    """The rig in a ``transforms.json``: a camera a frame. Raises InputError naming every fault."""
+    document = parsed(path, json.loads)
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(path.name, ["is no object with a list 'frames' of objects"])
+    faults: list[str] = []
+    names = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
+    matrices = [
+        number_array(frame.get("transform_matrix"), (4, 4), f"{name}.transform_matrix", faults)
+        for name, frame in zip(names, frames, strict=True)
+    ]
+    applied = document.get("applied_scale", 1.0)
+    scale = 1.0 / applied if isinstance(applied, int | float) and applied > 0 else 1.0
+    reach = scale * max((np.abs(matrix[:3, 3]).max() for matrix in matrices), default=0.0)
+    millimetres = scale * (1000.0 if reach < METRES_MOST else 1.0)
+    entries = [
+        _entry(path.parent, name, document | frame, matrix, millimetres, faults)
+        for name, frame, matrix in zip(names, frames, matrices, strict=True)
+    ]
+    return judged_rig(entries, path.name, faults)
+
+
+def write_transforms(rig: Rig, path: Path) -> None:
+    """Writes a ``transforms.json`` in metres, pictures called ``images/<camera>.png``."""
+    frames = []
+    for camera in rig:
+        matrix = np.eye(4)
+        pose = camera.camera_from_world.inverse()
+        matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
+        frames.append({"file_path": f"images/{camera.name}.png", **_lens(camera), "transform_matrix": matrix.tolist()})
+    write_atomically(path, json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1).encode())
+
+
+def _lens(camera: Camera) -> dict[str, object]:
+    k, d, lens = camera.intrinsics, camera.intrinsics.distortion, camera.recorded
+    entry: dict[str, object] = {"w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy}
+    entry |= {"cx": k.cx + 0.5, "cy": k.cy + 0.5}
+    if lens is None:
+        return entry | {"k1": d.k1, "k2": d.k2, "k3": d.k3, "p1": d.p1, "p2": d.p2}
+    if lens.model == "rational":
+        raise InputError("nerfstudio", [f"has no lens like that of {camera.name}; write colmap or eigenhead"])
+    return entry | {"camera_model": "OPENCV_FISHEYE", **dict(zip(LENS[:4], lens.coefficients, strict=True))}
+
+
+def _entry(
+    folder: Path, name: str, values: dict[str, Any], matrix: np.ndarray, millimetres: float, faults: list[str]
+) -> dict[str, object]:
+    model = values.get("camera_model", "OPENCV")
+    if model not in MODELS:
+        faults.append(f"{name}.camera_model is {model!r:.40}; read are {', '.join(MODELS)}")
+    size = values.get("w"), values.get("h")
+    if None in size:
+        size = sized(folder, name, faults)
+    width, height = (_number(value, f"{name}.{key}", faults) for value, key in zip(size, ("w", "h"), strict=True))
+    fx = _focal(values, "x", width, None, name, faults)
+    fy = _focal(values, "y", height, fx, name, faults)
+    cx = _number(values.get("cx", 0.5 * width), f"{name}.cx", faults)
+    cy = _number(values.get("cy", 0.5 * height), f"{name}.cy", faults)
+    lens = {key: _number(values.get(key, 0.0), f"{name}.{key}", faults) for key in LENS}
+    fisheye = MODELS.get(model if isinstance(model, str) else "", False)
+    if not fisheye and lens["k4"]:
+        faults.append(f"{name}.k4 is not 0 and the camera no OPENCV_FISHEYE: calibrate without k4")
+        lens["k4"] = 0.0
+    pose = (matrix[:3, :3] @ OPENGL).T
+    return {
+        "name": name,
+        "width": width,
+        "height": height,
+        "intrinsics": {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5},
+        "distortion": lens_entry(lens, fisheye=fisheye),
+        "camera_from_world": {
+            "rotation": pose.tolist(),
+            "translation": (-pose @ (millimetres * matrix[:3, 3])).tolist(),
+        },
+    }
+
+
+def _focal(
+    values: dict[str, Any], axis: str, pixels: float, default: float | None, name: str, faults: list[str]
+) -> float:
+    if (focal := values.get(f"fl_{axis}")) is not None:
+        return _number(focal, f"{name}.fl_{axis}", faults)
+    angle = values.get(f"camera_angle_{axis}")
+    if angle is None:
+        if default is None:
+            faults.append(f"{name} has neither fl_{axis} nor camera_angle_{axis}")
+        return math.nan if default is None else default
+    angle = _number(angle, f"{name}.camera_angle_{axis}", faults)
+    return 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
+
+
+def _number(value: object, where: str, faults: list[str]) -> float:
+    # NaN fails the comparison, and so does a whole number too large for a float
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12:
+        return value
+    faults.append(f"{where} is {value!r:.40}, wanted a finite number")
+    return math.nan

@@ -1,0 +1,55 @@
+"""Documents on the wire of what the rig's pictures are worth."""
+
+from pydantic import Field
+
+from server.http.schemas import Answer, Moment, Received
+
+
+class SubjectOut(Answer):
+    share: float = Field(description="of the picture's area")
+    cut_off: list[str] = Field(description="edges of the picture that cut the head: top, left, right")
+    outline: list[list[float]] = Field(description="corners, in pixels of the picture")
+
+
+class ViewChecksOut(Answer):
+    """What was measured of one camera's picture."""
+
+    mean: float | None = Field(None, description="mean value, 0 to 255")
+    clipped_share: float | None = Field(None, description="of pixels at 255 in every channel")
+    blur_px: float | None = Field(None, description="standard deviation of the edge spread")
+    background_found: float | None = Field(None, description="share of the clean plate's patches that were found")
+    background_moved_px: float | None = None
+    subject: SubjectOut | None = None
+
+
+class CaptureChecks(Answer):
+    cameras: dict[str, ViewChecksOut]
+
+
+class HoldingsOut(Answer):
+    """What there is of a capture: a removal takes the pictures, an erasure all of it."""
+
+    pictures: int
+    bytes: int = Field(description="of images, clean plates and caches")
+    heads: list[str] = Field(description="jobs whose results stay after a removal, photographs in their overlays too")
+    head_bytes: int
+    jobs: list[str] = Field(description="the other jobs")
+    active: list[str] = Field(description="jobs that are queued or running: a removal is refused, an erasure ends them")
+
+
+class PlatesOut(Answer):
+    """Clean plates that are kept."""
+
+    id: str
+    taken: Moment
+    cameras: list[str]
+    refused: list[str] = Field(description="why they were not put to use")
+    in_use: bool
+
+
+class PlatesList(Answer):
+    versions: list[PlatesOut]
+
+
+class UsePlates(Received):
+    version: str = Field(max_length=64, description="an id of GET /v1/rig/background")

@@ -1,0 +1,86 @@
+"""Servers elsewhere that this service calls because a caller asked for it: which, and at which address.
+
+Who names an address must not turn the service against the network it stands in (server-side request forgery). Only
+origins that the operator listed are called; ``https://*`` stands for every public one. A name is looked up once, each
+of its addresses is judged, and the connection goes to the judged address, so that a name that means another machine a
+moment later changes nothing. Whoever follows a redirection judges where it leads in the same way.
+"""
+
+import ipaddress
+import socket
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import httpx
+
+from server.errors import Unusable
+
+ANY_PUBLIC = "https://*"
+PORTS = {"http": 80, "https": 443}
+NAT64 = ipaddress.ip_network("64:ff9b::/96")  # RFC 6052: IPv4 in its last 32 bits
+
+Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A judged address: the URL to connect to, and what says in the request whom it is meant for."""
+
+    url: httpx.URL
+    headers: dict[str, str]
+    extensions: dict[str, str]  # the name that the certificate must have
+
+
+def target(url: str, origins: Collection[str]) -> Target:
+    """Where a request for ``url`` goes, if it may. Blocks on the name service. Raises Unusable ("url-refused")."""
+    try:
+        wanted = httpx.URL(url)
+    except (httpx.InvalidURL, ValueError, TypeError) as error:
+        raise _refused("is no URL") from error
+    if wanted.scheme not in PORTS or not wanted.host:
+        raise _refused("is no https:// or http:// address")
+    if wanted.userinfo:
+        raise _refused("has a user name in it; leave it out")
+    named = origin_of(wanted) in {origin_of(httpx.URL(origin)) for origin in origins if origin != ANY_PUBLIC}
+    if not named and not (ANY_PUBLIC in origins and wanted.scheme == "https" and wanted.port in (None, 443)):
+        raise _refused(f"leads to {origin_of(wanted)}, which the operator of this service did not allow")
+    host = wanted.raw_host.decode("ascii")
+    addresses = _addresses(host, wanted.port or PORTS[wanted.scheme])
+    if not named and not all(is_public(address) for address in addresses):
+        raise _refused(f"leads to {origin_of(wanted)}, which is no public address")
+    return Target(
+        wanted.copy_with(host=str(addresses[0]), fragment=None),
+        {"Host": wanted.netloc.decode("ascii")},
+        {"sni_hostname": host} if wanted.scheme == "https" else {},
+    )
+
+
+def origin_of(url: httpx.URL) -> str:
+    """scheme://host, and the port where it is not the scheme's own."""
+    port = "" if url.port in (None, PORTS.get(url.scheme)) else f":{url.port}"
+    host = url.raw_host.decode("ascii").lower()
+    return f"{url.scheme}://{f'[{host}]' if ':' in host else host}{port}"
+
+
+def is_public(address: Address) -> bool:
+    """Whether a machine of the open internet has this address, also where it is an IPv4 one in IPv6's clothes."""
+    if isinstance(address, ipaddress.IPv6Address):
+        inner = [address.ipv4_mapped, address.sixtofour, *(address.teredo or ())]
+        inner.append(ipaddress.IPv4Address(int(address) & 0xFFFFFFFF) if address in NAT64 else None)
+        if not all(is_public(one) for one in inner if one is not None):
+            return False
+        if any(one is not None for one in inner):
+            return True
+    return address.is_global and not address.is_multicast and not address.is_reserved
+
+
+def _addresses(host: str, port: int) -> list[Address]:
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except OSError as error:
+        raise _refused(f"names {host}, which nobody knows ({error.strerror})") from error
+    return [ipaddress.ip_address(str(place[0]).partition("%")[0]) for *_, place in found]
+
+
+def _refused(why: str) -> Unusable:
+    return Unusable("url-refused", f"The address {why}.", [f"url: {why}"])

@@ -1,0 +1,64 @@
+"""Erasing for good: pictures, heads, caches, and what the job database holds of them; and what a removal would take."""
+
+import time
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from server.errors import Unavailable
+from server.services.jobs import FINISHED, Jobs
+from server.storage.store import Store, folder_bytes
+
+CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
+
+
+@dataclass(frozen=True, slots=True)
+class Holdings:
+    """What there is of a capture. A removal takes the pictures (``bytes``: their files and caches); ``heads``, results
+    with photographs in their overlays, and the other ``jobs`` stay until it is erased."""
+
+    pictures: int
+    bytes: int
+    heads: tuple[str, ...]
+    head_bytes: int
+    jobs: tuple[str, ...]
+    active: tuple[str, ...]
+
+
+def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
+    """Raises NotFound."""
+    record = store.capture(capture)
+    of_capture = jobs.find(capture=capture, limit=100_000)
+    heads = tuple(job.id for job in of_capture if job.state == "succeeded")
+    return Holdings(
+        pictures=len(record.cameras),
+        bytes=folder_bytes(store.folder("captures", capture)) + folder_bytes(store.cache_of(capture)),
+        heads=heads,
+        head_bytes=sum(file["bytes"] for job in of_capture for file in job.files.values()),
+        jobs=tuple(job.id for job in of_capture if job.state != "succeeded"),
+        active=tuple(job.id for job in of_capture if job.state not in FINISHED),
+    )
+
+
+def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: Collection[str] = ()) -> None:
+    """Cancels the jobs of the captures (and ``others``), then removes results, images, caches and what the job database
+    holds. Asked again, it goes on where it was cut short. Raises Unavailable while a worker still writes."""
+    of_captures = {job.id for capture in captures for job in jobs.find(capture=capture, limit=100_000)} | {*others}
+    active = [job for job in of_captures if jobs.state(job) not in FINISHED]
+    for job in of_captures:
+        jobs.cancel(job)
+    _await_workers(store, active)
+    for job in of_captures:
+        jobs.delete(job)
+        if store.folder("jobs", job).exists():
+            raise Unavailable("still-writing", "A worker still writes; ask for the erasure again.")
+    for capture in captures:
+        store.remove_capture(capture)
+
+
+def _await_workers(store: Store, jobs: Collection[str]) -> None:
+    """Until no worker writes to the jobs any more, each of which then lacks its attempt's folder: it would put back
+    what is erased here. One that was killed will not write either, but leaves its folder."""
+    deadline = time.monotonic() + CANCEL_S
+    folders = [store.folder("jobs", job) for job in jobs]
+    while any([*folder.glob("attempt-*")] for folder in folders) and time.monotonic() < deadline:
+        time.sleep(0.05)

@@ -1,0 +1,76 @@
+"""Fetching an archive from a server elsewhere, for a caller who names its address: judged (server.origins), bounded in
+bytes and seconds, straight to the data folder."""
+
+from pathlib import Path
+
+import anyio
+import httpx
+
+from server.errors import Unusable
+from server.origins import target
+from server.services.service import Service
+from server.services.uploads import too_large
+from server.wire.multipart import BLOCK_BYTES
+
+REDIRECTS_MOST = 5
+CONNECT_S = 10.0
+SILENT_S = 30.0  # between two pieces of the answer
+
+
+async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
+    """Writes what lies at ``url`` into ``folder``; returns its path.
+
+    Raises Unusable for an address that may not be called ("url-refused") and for a server that does not give the
+    archive ("import-failed"), TooLarge, DiskFull.
+    """
+    patience = httpx.Timeout(SILENT_S, connect=CONNECT_S)
+    try:
+        with anyio.fail_after(service.settings.import_s):
+            async with httpx.AsyncClient(trust_env=False, timeout=patience) as client:  # a proxy would judge nothing
+                return await _follow(service, client, url, folder / "upload")
+    except TimeoutError as error:
+        raise _failed(f"did not give the archive within {service.settings.import_s:g} s") from error
+    except httpx.HTTPError as error:
+        raise _failed(f"broke off ({type(error).__name__}: {error})") from error
+
+
+async def _follow(service: Service, client: httpx.AsyncClient, url: str, path: Path) -> Path:
+    for _ in range(REDIRECTS_MOST + 1):
+        aim = await service.threads.disk(target, url, service.settings.import_origins)
+        headers = aim.headers | {"Accept-Encoding": "identity"}  # nothing is unpacked on the way
+        async with client.stream("GET", aim.url, headers=headers, extensions=aim.extensions) as answer:
+            if answer.has_redirect_location:
+                url = str(httpx.URL(url).join(answer.headers["location"]))
+                continue
+            if answer.status_code != 200:
+                raise _failed(f"answered {answer.status_code} {answer.reason_phrase}")
+            await _receive(service, answer, path)
+            return path
+    raise _failed(f"redirected more than {REDIRECTS_MOST} times")
+
+
+async def _receive(service: Service, answer: httpx.Response, path: Path) -> None:
+    """The body as it comes, in blocks. Raises TooLarge, and DiskFull before a block that the disk has no room for."""
+    settings, store, disk = service.settings, service.store, service.threads.disk
+    announced = answer.headers.get("content-length", "")
+    length = int(announced) if announced.isascii() and announced.isdigit() else 0
+    if length > settings.body_bytes:
+        raise too_large(settings)
+    await disk(store.reserve, 2 * length, settings.free_bytes)  # packed and unpacked
+    received = 0
+    stream = await disk(path.open, "xb")
+    try:
+        async for block in answer.aiter_raw(BLOCK_BYTES):
+            received += len(block)
+            if received > settings.body_bytes:
+                raise too_large(settings)
+            await disk(store.reserve, len(block), settings.free_bytes)
+            await disk(stream.write, block)
+    finally:
+        await disk(stream.close)
+    if length and received != length:
+        raise _failed(f"broke off after {received:,} of {length:,} bytes")
+
+
+def _failed(why: str) -> Unusable:
+    return Unusable("import-failed", f"The server at that address {why}. Try again, or upload the archive.", [why])

@@ -1,0 +1,126 @@
+"""Pictures as cameras make them: RAW, HEIC, 16 bits and foreign colours all come as 8-bit sRGB, rows as recorded."""
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, ImageCms
+
+from rig.errors import InputError
+from rig.formats.images import decode_image_file, open_picture, picture_size, read_image
+
+HEIC = Path(__file__).with_name("three_bands.heic")  # 64 x 48: red, green and blue bands from left to right
+
+
+def dng(bayer: np.ndarray) -> bytes:
+    """A DNG of one strip of 16-bit values, red first (Adobe's specification 1.4, chapter 4)."""
+    height, width = bayer.shape
+    matrix = np.round(np.linalg.inv([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]), 4)
+    rationals = b"".join(struct.pack("<ii", round(value * 10_000), 10_000) for value in matrix.ravel())
+    neutral = struct.pack("<6I", 1, 1, 1, 1, 1, 1)
+    tags = [
+        (254, 4, 1, struct.pack("<I", 0)),
+        (256, 4, 1, struct.pack("<I", width)),
+        (257, 4, 1, struct.pack("<I", height)),
+        (258, 3, 1, struct.pack("<H", 16)),
+        (259, 3, 1, struct.pack("<H", 1)),
+        (262, 3, 1, struct.pack("<H", 32803)),
+        (271, 2, 5, b"Made\0"),
+        (272, 2, 5, b"Test\0"),
+        (273, 4, 1, b"here"),
+        (274, 3, 1, struct.pack("<H", 6)),  # turned to look at: not to be obeyed
+        (277, 3, 1, struct.pack("<H", 1)),
+        (278, 4, 1, struct.pack("<I", height)),
+        (279, 4, 1, struct.pack("<I", 2 * width * height)),
+        (33421, 3, 2, struct.pack("<HH", 2, 2)),
+        (33422, 1, 4, bytes([0, 1, 1, 2])),
+        (50706, 1, 4, bytes([1, 4, 0, 0])),
+        (50708, 2, 10, b"Test made\0"),
+        (50717, 4, 1, struct.pack("<I", 65535)),
+        (50721, 10, 9, rationals),
+        (50728, 5, 3, neutral),
+        (50778, 3, 1, struct.pack("<H", 21)),
+    ]
+    at = 8 + 2 + 12 * len(tags) + 4
+    entries, tail = b"", b""
+    for tag, kind, count, value in tags:
+        if value == b"here":
+            value = struct.pack("<I", at + sum(len(v) + len(v) % 2 for *_, v in tags if len(v) > 4))
+        if len(value) > 4:
+            place, tail = at + len(tail), tail + value + b"\0" * (len(value) % 2)
+            value = struct.pack("<I", place)
+        entries += struct.pack("<HHI", tag, kind, count) + value.ljust(4, b"\0")
+    head = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + struct.pack("<I", 0)
+    return head + tail + bayer.astype("<u2").tobytes()
+
+
+def test_a_dng_is_developed_in_its_own_rows(tmp_path: Path) -> None:
+    bayer = np.full((120, 160), 2000, np.uint16)
+    bayer[:, 80:][0::2, 0::2] = 40_000  # the right half is red
+    (tmp_path / "a.dng").write_bytes(dng(bayer))
+    assert picture_size(tmp_path / "a.dng") == (160, 120)
+    pixels = read_image(tmp_path / "a.dng")
+    assert pixels.shape == (120, 160, 3)
+    left, right = pixels[40:80, 20:60].mean(axis=(0, 1)), pixels[40:80, 100:140].mean(axis=(0, 1))
+    assert right[0] > 150
+    assert right[0] > 3 * right[1]
+    assert left.max() < 70
+    assert open_picture(tmp_path / "a.dng").size == (160, 120)
+
+
+def test_a_heic_is_read(tmp_path: Path) -> None:
+    assert picture_size(HEIC) == (64, 48)
+    pixels = read_image(HEIC).astype(int)
+    bands = [pixels[:, at : at + 10].mean(axis=(0, 1)) for at in (5, 27, 49)]
+    assert [int(band.argmax()) for band in bands] == [0, 1, 2]
+    grey, digest, fault = decode_image_file(HEIC, "a.heic", grey=True)
+    assert grey is not None
+    assert grey.shape == (48, 64)
+    assert (len(digest), fault) == (64, "")
+
+
+def test_sixteen_bits_become_eight(tmp_path: Path) -> None:
+    ramp = np.repeat(np.linspace(0, 65535, 64).astype(np.uint16)[None, :, None], 48, axis=0).repeat(3, axis=2)
+    cv2.imwrite(str(tmp_path / "a.tif"), ramp)
+    seen = read_image(tmp_path / "a.tif")
+    assert seen.dtype == np.uint8
+    assert np.abs(seen[0, :, 0].astype(int) - ramp[0, :, 0] / 257.0).max() <= 1.0
+
+
+def test_another_profile_s_colours_become_srgb(tmp_path: Path) -> None:
+    swapped = np.zeros((8, 8, 3), np.uint8)
+    swapped[:] = (200, 100, 50)
+    lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(swapped).save(tmp_path / "srgb.png", icc_profile=lab)
+    np.testing.assert_array_equal(read_image(tmp_path / "srgb.png"), swapped)
+    Image.fromarray(swapped).save(tmp_path / "odd.png", icc_profile=b"no profile at all")
+    np.testing.assert_array_equal(read_image(tmp_path / "odd.png"), swapped)
+    wide = lab.replace(b"s\0R\0G\0B", b"w\0i\0d\0e").replace(b"sRGB", b"wide")  # named otherwise, primaries swapped
+    names = [wide.index(name, 128) for name in (b"rXYZ", b"bXYZ")]
+    red, blue = (wide[at + 4 : at + 8] for at in names)
+    parts = bytearray(wide)
+    parts[names[0] + 4 : names[0] + 8], parts[names[1] + 4 : names[1] + 8] = blue, red
+    Image.fromarray(swapped).save(tmp_path / "wide.png", icc_profile=bytes(parts))
+    np.testing.assert_allclose(read_image(tmp_path / "wide.png")[0, 0], (50, 100, 200), atol=3)
+
+
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF")  # what Pillow says of the broken TIFF
+@pytest.mark.parametrize("name", ["a.dng", "a.cr3", "a.heic", "a.png", "a.tif"])
+@pytest.mark.parametrize("content", [b"", b"nothing of the kind", b"II*\0\xff\xff\xff\x7f"])
+def test_damage_is_a_fault(name: str, content: bytes, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    pixels, _, fault = decode_image_file(tmp_path / name, f"images/{name}", grey=False)
+    assert pixels is None
+    assert fault.startswith(f"images/{name} is damaged")
+    with pytest.raises(InputError, match="is damaged"):
+        picture_size(tmp_path / name)
+
+
+@pytest.mark.parametrize(("name", "whole"), [("a.heic", HEIC.read_bytes()), ("a.dng", dng(np.zeros((64, 64))))])
+def test_half_a_file_is_a_fault(name: str, whole: bytes, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(whole[: len(whole) // 2])
+    pixels, _, fault = decode_image_file(tmp_path / name, name, grey=False)
+    assert pixels is None
+    assert "is damaged" in fault

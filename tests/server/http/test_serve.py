@@ -1,0 +1,31 @@
+"""``eigenhead serve`` in a terminal: Ctrl-C reaches the whole process group, the worker and its child too."""
+
+import os
+import pty
+import time
+from pathlib import Path
+
+import httpx
+
+from tests.support.services import await_state, running_service, uploaded_capture, worker_pids
+
+
+def test_ctrl_c_stops_service_and_worker_once_and_the_job_goes_on_later(tmp_path: Path) -> None:
+    keyboard, terminal = pty.openpty()
+    with running_service(tmp_path / "data", terminal=terminal, tiny_s="4", silent_s="5") as service:
+        assert service.process is not None
+        with httpx.Client(base_url=service.url, timeout=30) as client:
+            job = client.post("/v1/jobs", json={"capture_id": uploaded_capture(service, tmp_path)}).json()["id"]
+            await_state(client, job, ("running",))
+            time.sleep(0.5)  # the worker's child has the work
+            os.write(keyboard, b"\x03")
+            assert service.process.wait(20) == 130
+        told = service.log.read_text()
+        assert told.count("worker ready") == told.count("worker stopped") == 1
+        assert not [line for line in told.splitlines() if "died" in line or "Traceback" in line or "failed" in line]
+        assert worker_pids(service) == []
+        service.start()
+        with httpx.Client(base_url=service.url, timeout=30) as client:
+            assert await_state(client, job, ("succeeded", "failed", "cancelled"))["state"] == "succeeded"
+    os.close(keyboard)
+    os.close(terminal)

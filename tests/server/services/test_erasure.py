@@ -1,0 +1,70 @@
+"""What a removal leaves, what an erasure takes, and that consent comes first."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.support.services import RunningService, await_state, packed_capture, running_service
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
+    with running_service(tmp_path_factory.mktemp("erasure") / "data", ask_consent="true") as running:
+        yield running
+
+
+@pytest.fixture
+def client(service: RunningService) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.url, timeout=30) as client:
+        yield client
+
+
+def upload(client: httpx.Client, folder: Path, seed: int, **fields: str) -> httpx.Response:
+    return client.post("/v1/captures/uploads", files={"file": packed_capture(folder, seed).read_bytes()}, data=fields)
+
+
+def consented(client: httpx.Client) -> str:
+    return client.post("/v1/sessions", json={"label": "Anna", "consent": "signed 2026-11-22"}).json()["id"]
+
+
+def test_consent_comes_before_the_first_picture(client: httpx.Client, tmp_path: Path) -> None:
+    silent = client.post("/v1/sessions", json={"label": "Bert"}).json()["id"]
+    for fields in ({}, {"session": silent}):
+        refused = upload(client, tmp_path, 1, **fields)
+        assert (refused.status_code, refused.json()["type"].endswith("consent-missing")) == (409, True)
+        shot = client.post("/v1/captures", json=fields)
+        assert (shot.status_code, shot.json()["type"]) == (409, refused.json()["type"])
+    client.patch(f"/v1/sessions/{silent}", json={"consent": "signed"})
+    assert upload(client, tmp_path, 1, session=silent).status_code == 201
+
+
+def test_a_removal_says_what_stays_and_an_erasure_leaves_nothing(
+    client: httpx.Client, service: RunningService, tmp_path: Path
+) -> None:
+    session = consented(client)
+    removed = upload(client, tmp_path, 2, session=session).json()["id"]
+    erased = upload(client, tmp_path, 3, session=session).json()["id"]
+    client.patch(f"/v1/captures/{erased}", json={"session": None})  # with or without a session
+    jobs: dict[str, str] = {}
+    for capture in (removed, erased):
+        jobs[capture] = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+        await_state(client, jobs[capture], ("succeeded",))
+        held = client.get(f"/v1/captures/{capture}/holdings").json()
+        assert (held["pictures"], held["heads"], held["jobs"], held["active"]) == (3, [jobs[capture]], [], [])
+        assert held["bytes"] > 0
+        assert held["head_bytes"] > 0
+    running = client.post("/v1/jobs", json={"capture_id": erased, "settings": {"front": "long"}}).json()["id"]
+    assert client.get(f"/v1/captures/{erased}/holdings").json()["active"] == [running]
+
+    assert client.delete(f"/v1/captures/{removed}").status_code == 204
+    assert client.get(f"/v1/jobs/{jobs[removed]}/result/head.ply").status_code == 200, "the head stays"
+    assert client.delete(f"/v1/captures/{erased}").status_code == 409, "a job needs it"
+    assert client.delete(f"/v1/captures/{erased}", params={"erase": True}).status_code == 204
+    for job in (jobs[erased], running):
+        assert client.get(f"/v1/jobs/{job}").status_code == 404
+        assert not (service.data / "jobs" / job).exists()
+    assert client.get(f"/v1/captures/{erased}").status_code == 404
+    assert not list(service.data.rglob(f"*{erased}*"))
+    assert client.delete(f"/v1/captures/{erased}", params={"erase": True}).status_code == 404
