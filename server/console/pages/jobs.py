@@ -88,11 +88,12 @@ class RestartForm(Chosen, SettingsForm):
 
 @dataclass(frozen=True, slots=True)
 class ListedJob:
-    """A job with the label and time of its capture."""
+    """A job with the label, time and session of its capture."""
 
     job: Job
     capture: str
     captured: str | None
+    session: str | None = None
 
 
 class JobsPage(Page, component="jobs.js"):
@@ -119,7 +120,7 @@ def jobs_list(service: Service) -> list[ListedJob]:
         if capture is None:
             found.append(ListedJob(job, "removed capture", None))
         else:
-            found.append(ListedJob(job, capture.label, capture.created))
+            found.append(ListedJob(job, capture.label, capture.created, capture.session))
     return found
 
 
