@@ -53,3 +53,9 @@ class PlatesList(Answer):
 
 class UsePlates(Received):
     version: str = Field(max_length=64, description="an id of GET /v1/rig/background")
+
+
+class BackgroundOut(Answer):
+    cameras: list[str]
+    plates: int
+    note: str
