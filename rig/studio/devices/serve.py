@@ -176,9 +176,8 @@ class StudioDevices:
             *([] if self._calibration is None else [f"calibration = {json.dumps(self._calibration)}"]),
             f"\n[trigger]\nport = {json.dumps(str(self.port_link))}",
             "\n[lights]\noutputs = [0, 1]\nsettle_s = 0.3",
-            # The film of the empty studio repeats after as many takes as there are plates: they are taken in a row.
-            # Frames of a loopback are stamped by programs that wait for a processor, not by hardware
-            f"\n[shot]\nplates = {self._takes}\nplates_over_s = 0.01\nskew_most_ms = 60",
+            # frames of a loopback are stamped by programs that wait for a processor, not by hardware
+            f"\n[shot]\nplates = {self._takes}\nplates_over_s = 0\nskew_most_ms = 60",
         ]
         for channel, name in enumerate(self.names):
             identity = json.dumps(self.streams.url(name))
