@@ -236,11 +236,12 @@ def _trigger_faults(trigger: TriggerConfig) -> list[str]:
 
 
 def _shot_faults(shot: ShotConfig) -> list[str]:
-    least = {"warm_up_frames": 1, "plates": 1}
+    least = {"warm_up_frames": 1, "plates": 1, "plates_over_s": 0}
+    values = {field.name: getattr(shot, field.name) for field in dataclasses.fields(shot)}
     return [
-        f"{field.name}: {getattr(shot, field.name)} is too small; at least {least.get(field.name, 0)}"
-        for field in dataclasses.fields(shot)
-        if getattr(shot, field.name) < least.get(field.name, 1e-9)
+        f"{name}: {value} is too small; {f'at least {least[name]}' if name in least else 'more than 0'}"
+        for name, value in values.items()
+        if (value < least[name] if name in least else value <= 0)
     ]
 
 

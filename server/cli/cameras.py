@@ -5,9 +5,17 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, Overwrite, answer, one_of, prepare_file, progress_bar, wrong_usage
+from server.cli.answers import Json, Overwrite, answer, one_of, prepare_file, progress_bar, warn, wrong_usage
 
 app = typer.Typer(rich_markup_mode=None)
+
+
+def _sources() -> tuple[str, ...]:
+    return ("board", "scene")
+
+
+def _lenses() -> tuple[str, ...]:
+    return ("one", "each")
 
 
 @app.command(epilog="Example: eigenhead board --kind charuco --squares 9x6 --square-mm 25 --out board.pdf")
@@ -38,23 +46,59 @@ def board(
     answer(written, json_out, list(written.values()))
 
 
-@app.command(epilog="Example: eigenhead calibrate shots --board board.toml --out cameras.json")
+@app.command(
+    epilog="Example: eigenhead calibrate shots --board board.toml --out cameras.json   "
+    "eigenhead calibrate photos --from scene --scale scale.json --out cameras.json"
+)
 def calibrate(
-    images: Annotated[Path, typer.Argument(help="IMAGES/<camera>/<shot>.<ext>; same shot name, same moment.")],
-    board: Annotated[Path, typer.Option(help="The board.toml.", exists=True, dir_okay=False)],
+    images: Annotated[
+        Path,
+        typer.Argument(
+            help="IMAGES/<camera>/<shot>.<ext>; same shot name, same moment. From a scene also IMAGES/<camera>.<ext>."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
+    board: Annotated[Path | None, typer.Option(help="The board.toml.", exists=True, dir_okay=False)] = None,
+    source: Annotated[
+        str, typer.Option("--from", help="board, or scene: photographs of anything.", callback=one_of(_sources))
+    ] = "board",
+    scale: Annotated[
+        Path | None, typer.Option(help="From a scene: a known length, scale.json.", exists=True, dir_okay=False)
+    ] = None,
+    lenses: Annotated[
+        str | None,
+        typer.Option(help="From a scene: one (all of one camera) or each; guessed.", callback=one_of(_lenses)),
+    ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
     json_out: Json = False,
 ) -> None:
-    """Calibrate a rig from pictures of a board."""
+    """Calibrate a rig from pictures of a board, or of a scene."""
+    if source == "scene":
+        for option, value in (("--board", board), ("--previous", previous)):
+            if value is not None:
+                raise typer.BadParameter("is for a board; a scene takes none", param_hint=option)
+        prepare_file(out)
+        _calibrate_scene(images, out, scale, front, lenses, json_out)
+        return
+    for option, value in (("--scale", scale), ("--lenses", lenses)):
+        if value is not None:
+            raise typer.BadParameter("is for --from scene", param_hint=option)
+    if board is None:
+        raise typer.BadParameter("say which board, or --from scene", param_hint="--board")
+    prepare_file(out)
+    _calibrate_board(images, board, out, front, previous, json_out)
+
+
+def _calibrate_board(
+    images: Path, board: Path, out: Path, front: str | None, previous: Path | None, json_out: bool
+) -> None:
     from calibration.board.board import read_board
     from calibration.calibrate import calibrate as run
     from calibration.report import write_report
     from calibration.result import CalibrationRefused, write_calibration
     from rig.formats.cameras_json import read_rig
 
-    prepare_file(out)
     known = None if previous is None else read_rig(previous)
     page = out.with_suffix(".html")
     try:
@@ -70,6 +114,30 @@ def calibrate(
     cameras = [f"{name}  {figure['rms_px']:.3f} px" for name, figure in figures["cameras"].items()]
     total = f"{figures['rms_px']:.3f} px over {figures['used_share']:.1%} of the corners"
     answer(found.document(), json_out, [str(out), str(page), *cameras, total, *found.warnings])
+
+
+def _calibrate_scene(
+    photographs: Path, out: Path, scale: Path | None, front: str | None, lenses: str | None, json_out: bool
+) -> None:
+    from calibration.scene.report import write_scene_report
+    from calibration.scene.scene import calibrate_scene
+    from rig.formats.cameras_json import write_rig
+
+    page = out.with_suffix(".html")
+    one_lens = None if lenses is None else lenses == "one"
+    with progress_bar() as report:
+        found = calibrate_scene(photographs, scale=scale, front=front, one_lens=one_lens, report=report)
+    write_rig(found.rig, out)
+    write_scene_report(found, page)
+    figures = found.figures()
+    cameras = [
+        f"{name}  {figure['rms_px']:.3f} px, {figure['points']} points, known to {figure['pose_sigma_px']:.2f} px"
+        for name, figure in figures["cameras"].items()
+    ]
+    total = f"{figures['rms_px']:.3f} px over {figures['points']} points; front camera {found.front}"
+    for warning in found.warnings:
+        warn(warning)
+    answer(found.document(), json_out, [str(out), str(page), *cameras, total, f"scale: {found.scale.told}"])
 
 
 @app.command(epilog="Example: eigenhead refine shots/anna shots/ben shots/cleo shots/dora --out cameras.json")

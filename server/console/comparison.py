@@ -17,11 +17,6 @@ ROUNDS = 12  # of nearest points, where two heads do not share their vertices
 TRIMMED = 0.8  # share of the nearest pairs that a round uses: necks end at different heights
 
 
-def quality(result: Path) -> Float[np.ndarray, " v"]:
-    """The posterior standard deviation (mm) of every vertex of a result's head.ply."""
-    return ply_property(result / "head.ply", "quality")
-
-
 def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
     """One number a vertex from a binary little-endian PLY whose first element are the vertices. Raises NotFound
     where the file has no such property."""

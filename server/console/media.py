@@ -2,10 +2,11 @@
 attributes of results. Each asks who the browser's session is, as the API asks for a key."""
 
 import asyncio
+import json
 import threading
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from fastapi import Depends, Request, Response
@@ -13,10 +14,11 @@ from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from nicegui import app as pages
 
 from rig.errors import EigenheadError
-from rig.formats.images import open_picture
+from rig.formats.images import open_picture, read_image, write_image
 from server.console import comparison
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
+from server.console.look_through import camera_views, rig_of, straightened
 from server.console.page import as_problem
 from server.console.silhouettes import draw
 from server.errors import Conflict, NotFound
@@ -28,6 +30,7 @@ from server.wire.send_file import send_file
 
 THUMBNAIL_WIDTH = 480
 THUMBNAIL_QUALITY = 82
+STRAIGHTENED_QUALITY = 88
 FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 _live: dict[int, LiveView] = {}
@@ -128,10 +131,36 @@ def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Respo
     return send_file(request, who[0].jobs.result_file(job_id, f"overlays/{name}"))
 
 
-@pages.get("/console/jobs/{job_id}/quality.f32")
-def quality(who: Reader, job_id: str) -> Response:
-    """Posterior standard deviation of every vertex (mm, float32)."""
-    return _floats(comparison.quality(_result_folder(who[0], job_id)))
+@pages.get("/console/jobs/{job_id}/{surface}.{name}.f32")
+def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Literal["quality", "part"]) -> Response:
+    """A number a vertex (float32) of head.ply or bust.ply: posterior standard deviation (mm), or part."""
+    path = _result_folder(who[0], job_id) / f"{surface}.ply"
+    if not path.is_file():
+        raise NotFound("surface of the result", surface)
+    return _floats(comparison.ply_property(path, name))
+
+
+@pages.get("/console/jobs/{job_id}/cameras")
+def cameras(who: Reader, job_id: str) -> Response:
+    """The cameras that took the pictures, in the head's frame; none where the capture was removed."""
+    service = who[0]
+    capture, _ = _capture_files(service, job_id)
+    report = json.loads((_result_folder(service, job_id) / "report.json").read_text())
+    found = camera_views(rig_of(capture), report) if capture.is_dir() else []
+    return JSONResponse(found, headers={"Cache-Control": "no-store"})
+
+
+@pages.get("/console/jobs/{job_id}/photographs/{camera}.jpg")
+def photograph(who: Reader, job_id: str, camera: str) -> Response:
+    """A photograph of the capture as a lens without distortion would have taken it."""
+    service = who[0]
+    capture, record = _capture_files(service, job_id)
+    name = _image_name(record, camera)
+    kept = service.store.cache_of(record.id) / "straightened" / f"{Path(name).stem}.jpg"
+    if not kept.is_file():
+        picture = straightened(read_image(capture / name), rig_of(capture)[camera])
+        write_image(kept, picture, quality=STRAIGHTENED_QUALITY)
+    return FileResponse(kept, headers=FOREVER)
 
 
 @pages.get("/console/jobs/{job_id}/distance.f32")
@@ -183,6 +212,12 @@ def _image_name(record: CaptureRecord, camera: str) -> str:
         if Path(name).parent.name == "images" and Path(name).stem == camera:
             return name
     raise NotFound("camera", camera)
+
+
+def _capture_files(service: Service, job_id: str) -> tuple[Path, CaptureRecord]:
+    """Raises NotFound for a job without a capture that is still there."""
+    capture = service.jobs.get(job_id).capture_id or ""
+    return service.store.folder("captures", capture) / "files", service.store.capture(capture)
 
 
 def _result_folder(service: Service, job_id: str) -> Path:

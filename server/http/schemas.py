@@ -388,9 +388,3 @@ class Lights(Received):
     outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
         max_length=4, description="light outputs of the trigger box that are on during a shot"
     )
-
-
-class BackgroundOut(Answer):
-    cameras: list[str]
-    plates: int
-    note: str

@@ -177,7 +177,7 @@ class StudioDevices:
             f"\n[trigger]\nport = {json.dumps(str(self.port_link))}",
             "\n[lights]\noutputs = [0, 1]\nsettle_s = 0.3",
             # frames of a loopback are stamped by programs that wait for a processor, not by hardware
-            f"\n[shot]\nplates = {self._takes}\nplates_over_s = 0.5\nskew_most_ms = 60",
+            f"\n[shot]\nplates = {self._takes}\nplates_over_s = 0\nskew_most_ms = 60",
         ]
         for channel, name in enumerate(self.names):
             identity = json.dumps(self.streams.url(name))

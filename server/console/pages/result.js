@@ -1,12 +1,16 @@
 // The head in three.js: a mesh in metres, x to the subject's left, y up, the face towards +z.
 import { GLTFLoader, OrbitControls, THREE } from "nicegui-scene";
+import { fitted, lookThrough } from "/console/static/look_through.js";
 import { clock, fixed, size, span, typing } from "/console/static/words.js";
 
 // viridis sampled at nine places (dark is small), as linear steps between them; it stays readable without colour vision
 const RAMP = [[0.267, 0.005, 0.329], [0.283, 0.141, 0.458], [0.254, 0.265, 0.53], [0.207, 0.372, 0.553], [0.164, 0.471, 0.558],
   [0.128, 0.567, 0.551], [0.267, 0.679, 0.48], [0.478, 0.821, 0.318], [0.993, 0.906, 0.144]];
 const LIGHTS = { studio: [[0.6, 0.8, 1.2, 1.6], [-1.2, 0.3, 0.7, 0.7], [0.2, 0.9, -1.2, 0.8]], side: [[1.5, 0.3, 0.25, 2.6], [-1, 0, 0.4, 0.15], [0, 1, -1, 0.3]], flat: [[0, 0.2, 1, 1.0], [0, 0, -1, 0.6], [0, 1, 0, 0.3]] };
-const COLOURINGS = [["texture", "Texture", "T"], ["grey", "Grey", "G"], ["confidence", "Confidence", "C"]];
+const COLOURINGS = [["texture", "Texture", "T"], ["clay", "Clay", "G"], ["uncertainty", "Uncertainty", "U"], ["parts", "Parts", "P"]];
+const SURFACES = [["head", "Head", "H"], ["bust", "Bust", "B"]];
+const PARTS = [["unseen", [0.45, 0.47, 0.5]], ["skin", [0.9, 0.65, 0.5]], ["hair", [0.35, 0.25, 0.6]], ["clothes", [0.2, 0.6, 0.55]]];
+const FAR = 4; // medians: what lies beyond is shown as the scale's end, so that shoulders do not stretch it
 const MM = 1000;
 
 function ramp(share) {
@@ -27,32 +31,40 @@ function nice(value) {
 export default {
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", digits: 1 }),
+  data: () => ({ surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", digits: 1 }),
   computed: {
     job() { return this.state.job; },
-    others() { return (this.state.results || []).filter((r) => r.id !== this.job?.id); },
+    surfaces() { return SURFACES.filter(([name]) => this.job?.files[`${name}.glb`]); },
+    colourings() { return COLOURINGS.filter(([name]) => name !== "parts" || this.surface === "bust"); },
+    others() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && (this.strangers || this.same(r))); },
+    elsewhere() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)).length; },
     rows() { return Object.entries(this.job?.measurements || {}); },
     distance() { return this.points.length === 2 ? MM * this.points[0].distanceTo(this.points[1]) : null; },
   },
   watch: {
-    "job.id"(id) { if (id) this.load(id); },
+    "job.id"(id) { if (id) { this.strangers = false; this.load(id); this.readCameras(id); } },
+    surface() { if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture"; this.load(this.job.id); },
+    through() { this.fit(); },
     colouring() { this.paint(); this.shine(); }, other() { this.compare(); },
-    wire(on) { this.material.wireframe = on; this.draw(); },
+    wire(on) { this.material.wireframe = this.flat.wireframe = on; this.draw(); },
     lights() { this.shine(); }, measuring(on) { if (!on) this.clearPoints(); },
   },
   template: `
     <section class="page" aria-label="Result">
-      <header><h1>Result</h1>
-        <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><option v-for="r in state.results" :key="r.id" :value="r.id">{{ r.capture || 'Capture ' + clock(r.captured) }} &middot; {{ clock(r.finished) }} &middot; {{ r.id.slice(-6) }}</option></select></label>
-        <template v-if="job"><span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="!other && colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
+      <header class="wraps"><h1>Result</h1>
+        <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><option v-for="r in state.results" :key="r.id" :value="r.id">{{ headName(r) }}</option></select></label>
+        <template v-if="job"><span v-if="surfaces.length > 1" class="group" role="group" aria-label="Surface"><button v-for="[name, title, k] in surfaces" :key="name" class="b" :aria-pressed="surface === name" @click="surface = name">{{ title }} <kbd>{{ k }}</kbd></button></span>
+        <span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="!other && colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
         <button class="b" :aria-pressed="wire" @click="wire = !wire">Wireframe <kbd>W</kbd></button>
         <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button></template></header>
-      <div class="columns" style="grid-template-columns: minmax(0, 1fr) 20rem">
+      <div class="columns beside">
         <div class="panel view3d" ref="view">
-          <canvas ref="canvas" v-show="job" tabindex="0" role="img" aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded" @keydown="turn" @pointerdown="press" @click="pick"></canvas>
+          <img v-if="picture" :src="picture.address" :alt="'Photograph of ' + through" :style="picture.style">
+          <canvas ref="canvas" v-show="job" :style="{ opacity: through ? 1 - fade : 1 }" tabindex="0" role="img" aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded" @keydown="turn" @pointerdown="press" @click="pick"></canvas>
           <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ state.asked ? 'This job has no head' : 'No heads yet' }}</h2><p>{{ state.asked ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.' }}</p><a class="b main-action" :href="state.asked ? '/jobs' : '/captures'">{{ state.asked ? 'Go to jobs' : 'Go to captures' }}</a></div>
-          <div v-if="scale" class="scale" role="img" :aria-label="scale.title + ', 0 to ' + fixed(scale.most, digits) + ' mm'"><i :style="{ background: gradient }"></i><div><span>{{ fixed(scale.most, digits) }} mm</span><span>{{ fixed(scale.most / 2, digits) }}</span><span>0</span></div></div>
+          <div v-if="scale" class="scale" role="img" :aria-label="scale.title + ', 0 to ' + fixed(scale.most, digits) + ' mm'"><i :style="{ background: gradient }"></i><div><span>{{ scale.beyond ? '≥ ' : '' }}{{ fixed(scale.most, digits) }} mm</span><span>{{ fixed(scale.most / 2, digits) }}</span><span>0</span></div></div>
           <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">median {{ fixed(scale.median, 2) }} mm, 95 % below {{ fixed(scale.p95, 2) }} mm</span></p>
+          <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts"><li v-for="[name, colour] in parts" :key="name"><i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ name }}</li></ul>
           <p v-if="measuring" class="small" style="position: absolute; left: .9rem; bottom: .8rem" role="status">{{ points.length === 0 ? 'Click the first point' : points.length === 1 ? 'Click the second point' : '' }}<strong v-if="distance" class="mono">{{ distance.toFixed(1) }} mm, straight</strong></p>
           <p v-if="loading || fault" :class="['small', { fault }]" style="position: absolute; right: .9rem; bottom: .8rem" role="status">{{ fault || 'Loading ...' }}</p>
           <span v-for="(pin, i) in pins" :key="i" class="pin small mono" :style="{ left: pin.x + 'px', top: pin.y + 'px', visibility: pin.shown ? 'visible' : 'hidden' }">{{ i ? 'B' : 'A' }}</span>
@@ -60,34 +72,37 @@ export default {
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="About the head">
           <template v-if="job">
             <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ w.message }}</li></ul>
-            <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ r.capture || 'Capture ' + clock(r.captured) }} &middot; {{ clock(r.finished) }} &middot; {{ r.id.slice(-6) }}</option></select></label>
+            <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? '' : 'ANOTHER PERSON? ' }}{{ headName(r) }}</option></select></label>
+              <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">offer {{ elsewhere }} {{ elsewhere === 1 ? 'head' : 'heads' }} of other subjects, too</label>
+              <label v-if="cameras.length" class="field">Look through<select v-model="through" id="through"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
+              <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
             <h3>Downloads</h3>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
             <h3>Measurements, mm</h3>
             <table class="small"><tbody><tr v-for="[name, m] in rows" :key="name"><td>{{ name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td></tr></tbody></table>
             <h3>Fit</h3>
-            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">contour residual, {{ job.clear_views }} clear {{ job.clear_views === 1 ? 'view' : 'views' }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>method</td><td class="num">{{ job.method }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
+            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">contour residual, {{ job.clear_views }} clear {{ job.clear_views === 1 ? 'view' : 'views' }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ job.method }}</td></tr><tr><td>level of detail</td><td class="num">{{ job.level }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
           </template>
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, fixed, size, span, colourings: COLOURINGS, gradient: `linear-gradient(to top, ${RAMP.map((c) => `rgb(${c.map((v) => Math.round(255 * v))})`).join(", ")})` }); },
-  mounted() { this.build(); window.addEventListener("keydown", this.key); if (this.job) this.load(this.job.id); },
+  created() { Object.assign(this, { clock, fixed, size, span, parts: PARTS, gradient: `linear-gradient(to top, ${RAMP.map((c) => `rgb(${c.map((v) => Math.round(255 * v))})`).join(", ")})` }); },
+  mounted() { this.build(); window.addEventListener("keydown", this.key); if (this.job) { this.load(this.job.id); this.readCameras(this.job.id); } },
   unmounted() { window.removeEventListener("keydown", this.key); this.observer?.disconnect(); this.renderer?.dispose(); },
   methods: {
     acted() {},
     build() {
-      try { this.renderer = new THREE.WebGLRenderer({ canvas: this.$refs.canvas, antialias: true }); }
+      try { this.renderer = new THREE.WebGLRenderer({ canvas: this.$refs.canvas, antialias: true, alpha: true }); }
       catch (error) { this.fault = "This browser shows no 3D (WebGL is off). The downloads work."; return; }
       this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
       this.scene = new THREE.Scene();
-      this.scene.background = new THREE.Color("#101318");
       this.camera = new THREE.PerspectiveCamera(28, 1, 0.01, 10);
       this.controls = new OrbitControls(this.camera, this.$refs.canvas);
       this.controls.addEventListener("change", this.draw);
       this.material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85, metalness: 0, side: THREE.DoubleSide });
+      this.flat = new THREE.MeshBasicMaterial({ vertexColors: true, side: THREE.DoubleSide }); // data are not lit: shading would shift them off the legend
       this.rig3d = new THREE.Group(); this.scene.add(this.rig3d); this.marks = new THREE.Group(); this.scene.add(this.marks);
       this.shine();
       this.observer = new ResizeObserver(this.fit); this.observer.observe(this.$refs.view); this.fit();
@@ -102,15 +117,31 @@ export default {
     fit() {
       const { clientWidth: w, clientHeight: h } = this.$refs.view;
       if (!w || !h || !this.renderer) return;
-      this.renderer.setSize(w, h, false); this.camera.aspect = w / h; this.camera.updateProjectionMatrix(); this.draw();
+      this.renderer.setSize(w, h, false); this.camera.aspect = w / h; this.camera.updateProjectionMatrix();
+      const view = this.cameras.find((c) => c.name === this.through);
+      this.seen = view ? lookThrough(THREE, view, w, h) : this.camera;
+      const place = view && fitted(view, w, h);
+      this.picture = view ? { address: `/console/jobs/${this.job.id}/photographs/${encodeURIComponent(view.name)}.jpg`, style: `position: absolute; left: ${place.left}px; top: ${place.top}px; width: ${place.width}px; height: ${place.height}px` } : null;
+      this.controls.enabled = !view;
+      this.draw();
+    },
+    async readCameras(id) {
+      this.cameras = []; this.through = "";
+      const answer = await fetch(`/console/jobs/${id}/cameras`);
+      if (answer.ok && id === this.job?.id) this.cameras = await answer.json();
+    },
+    same(r) { return r.capture_id === this.job?.capture_id || (!!r.session && r.session === this.job?.session) || (!!r.subject && r.subject === this.job?.subject); },
+    headName(r) {
+      const how = [r.settings.method || "contour", r.settings.detail, r.model && r.model !== "default" && r.model].filter(Boolean).join(", ");
+      return [r.subject, r.capture || "capture " + clock(r.captured), how, "made " + clock(r.finished)].filter(Boolean).join(" · ");
     },
     draw() {
       if (!this.renderer || this.waiting) return;
-      this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.renderer.render(this.scene, this.camera); this.place(); });
+      this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.renderer.render(this.scene, this.seen || this.camera); this.place(); });
     },
     place() {
       const { clientWidth: w, clientHeight: h } = this.$refs.view || {};
-      this.pins = this.points.map((p) => { const q = p.clone().project(this.camera); return { x: (q.x + 1) / 2 * w, y: (1 - q.y) / 2 * h, shown: q.z < 1 }; });
+      this.pins = this.points.map((p) => { const q = p.clone().project(this.seen || this.camera); return { x: (q.x + 1) / 2 * w, y: (1 - q.y) / 2 * h, shown: q.z < 1 }; });
     },
     async numbers(name) {
       const answer = await fetch(`/console/jobs/${this.job.id}/${name}`);
@@ -119,10 +150,12 @@ export default {
     },
     async load(id) {
       if (!this.renderer) return;
-      this.loading = true; this.fault = ""; this.clearPoints();
+      if (!this.surfaces.some(([name]) => name === this.surface)) this.surface = this.surfaces[0]?.[0] || "head";
+      const surface = this.surface, first = this.shown !== id;
+      this.loading = true; this.fault = ""; this.loaded = ""; this.clearPoints();
       try {
-        const head = await new GLTFLoader().loadAsync(`/console/jobs/${id}/head.glb`);
-        if (id !== this.job?.id) return;
+        const head = await new GLTFLoader().loadAsync(`/console/jobs/${id}/${surface}.glb`);
+        if (id !== this.job?.id || surface !== this.surface) return;
         if (this.mesh) { this.scene.remove(this.mesh); this.mesh.geometry.dispose(); }
         let found = null;
         head.scene.traverse((o) => { if (o.isMesh) found = o; });
@@ -131,12 +164,15 @@ export default {
         this.scene.add(this.mesh);
         this.mesh.geometry.computeBoundingSphere();
         const { center, radius } = this.mesh.geometry.boundingSphere;
-        this.controls.target.copy(center);
-        this.camera.position.copy(center).add(new THREE.Vector3(radius * 1.1, radius * 0.25, radius * 4.1));
-        this.controls.minDistance = radius * 0.8; this.controls.maxDistance = radius * 12; this.controls.update();
-        this.other = ""; this.quality = null;
+        if (first) { // another surface of the same head is looked at from the same place
+          this.controls.target.copy(center);
+          this.camera.position.copy(center).add(new THREE.Vector3(radius * 1.1, radius * 0.25, radius * 4.1));
+          this.controls.minDistance = radius * 0.4; this.controls.maxDistance = radius * 12; this.controls.update();
+          this.shown = id;
+        }
+        this.other = ""; this.kept = {};
         await this.paint();
-        this.loaded = id;
+        this.loaded = `${id} ${surface}`;
       } catch (error) { this.fault = `The head cannot be shown: ${error.message}`; }
       this.loading = false;
     },
@@ -145,37 +181,54 @@ export default {
       if (!this.mesh || this.other) return;
       const geometry = this.mesh.geometry;
       this.scale = null;
-      if (this.colouring === "confidence") {
-        try { this.quality = this.quality || (await this.numbers("quality.f32")); this.spread(this.quality, "Standard deviation"); } catch (error) { this.fault = error.message; }
-      } else if (this.colouring === "grey") {
+      if (this.colouring === "uncertainty" || this.colouring === "parts") {
+        const name = this.colouring === "parts" ? "part" : "quality", surface = this.surface;
+        try {
+          this.kept[name] = this.kept[name] || (await this.numbers(`${surface}.${name}.f32`));
+          if (surface !== this.surface) return;
+          if (name === "quality") this.spread(this.kept.quality, "Standard deviation"); else this.paintParts(this.kept.part);
+        } catch (error) { this.fault = error.message; }
+      } else if (this.colouring === "clay") {
+        this.mesh.material = this.material;
         geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * geometry.attributes.position.count).fill(0.55), 3));
-      } else geometry.setAttribute("color", this.texture);
+      } else { this.mesh.material = this.material; geometry.setAttribute("color", this.texture); }
       this.draw();
+    },
+    paintParts(values) {
+      const colours = new Float32Array(3 * values.length), colour = new THREE.Color();
+      values.forEach((value, i) => colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      this.mesh.material = this.flat;
+      this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
     },
     async compare() {
       if (!this.mesh) return;
+      if (this.other && this.surface !== "head") { const wanted = this.other; this.surface = "head"; await this.$nextTick(); while (this.loading) await new Promise((done) => setTimeout(done, 50)); this.other = wanted; return; }
       if (!this.other) return this.paint();
       this.loading = true; this.fault = "";
       const wanted = this.other;
       try {
         const values = await this.numbers(`distance.f32?other=${wanted}`);
-        if (wanted === this.other) this.spread(values, wanted === "truth" ? "Distance to the truth" : "Distance to the other head");
+        if (wanted === this.other) this.spread(values, wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT");
       } catch (error) { this.fault = error.message; }
       this.loading = false; this.draw();
     },
     spread(values, title) {
-      const p95 = stop(values, 0.95), most = nice(p95), colours = new Float32Array(3 * values.length), colour = new THREE.Color();
+      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95), colours = new Float32Array(3 * values.length), colour = new THREE.Color();
       values.forEach((value, i) => colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       this.digits = most < 1 ? 2 : 1;
-      this.scale = { title, most, p95, median: stop(values, 0.5) };
+      this.scale = { title, most, p95, beyond: p95 > most, median: stop(values, 0.5) };
     },
     press(event) { this.pressed = [event.clientX, event.clientY]; },
     pick(event) {
       if (!this.measuring || !this.mesh || Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) > 4) return; // that was a turn
       const box = this.$refs.canvas.getBoundingClientRect();
       const at = new THREE.Vector2((event.clientX - box.left) / box.width * 2 - 1, 1 - (event.clientY - box.top) / box.height * 2);
-      const ray = new THREE.Raycaster(); ray.setFromCamera(at, this.camera);
+      const ray = new THREE.Raycaster(); if (this.through) {
+        ray.ray.origin.setFromMatrixPosition(this.seen.matrixWorld);
+        ray.ray.direction.set(at.x, at.y, 0.5).unproject(this.seen).sub(ray.ray.origin).normalize();
+      } else ray.setFromCamera(at, this.camera);
       const hit = ray.intersectObject(this.mesh)[0];
       if (!hit) return;
       if (this.points.length === 2) this.clearPoints();
@@ -199,8 +252,9 @@ export default {
     },
     key(event) {
       if (typing(event) || !this.job) return;
-      const key = event.key.toLowerCase(), named = COLOURINGS.find(([, , k]) => k.toLowerCase() === key);
+      const key = event.key.toLowerCase(), has = ([, , k]) => k.toLowerCase() === key, named = this.colourings.find(has), solid = this.surfaces.find(has);
       if (named) this.paintAs(named[0]);
+      else if (solid && this.surfaces.length > 1) this.surface = solid[0];
       else if (key === "w") this.wire = !this.wire;
       else if (key === "m") this.measuring = !this.measuring;
       else if (event.key === "Escape") this.measuring = false;

@@ -19,7 +19,8 @@ MOSTLY = 0.25  # of a contour, as on the page Jobs
 
 
 class ResultLine(TypedDict):
-    """A job with a result; ``capture`` and ``captured`` are its capture's label and time."""
+    """A job with a result; ``capture`` and ``captured`` are its capture's label and time, ``subject`` whose session the
+    capture belongs to."""
 
     id: str
     capture: str
@@ -29,6 +30,8 @@ class ResultLine(TypedDict):
     finished: str | None
     settings: Mapping[str, object]
     model: str | None
+    session: str | None
+    subject: str
 
 
 class Head(ResultLine):
@@ -41,6 +44,7 @@ class Head(ResultLine):
     clear_views: int
     contour_px: float | None
     method: str | None
+    level: str | None
     model_name: str | None
     truth: bool
     files: dict[str, int]
@@ -62,10 +66,12 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
 
 
 def finished(service: Service) -> list[ResultLine]:
-    return [result_line(listed) for listed in jobs_list(service) if listed.job.state == "succeeded"]
+    subjects = {record.id: record.label for record in service.store.sessions()}
+    done = [listed for listed in jobs_list(service) if listed.job.state == "succeeded"]
+    return [result_line(listed, subjects.get(listed.session or "", "")) for listed in done]
 
 
-def result_line(listed: ListedJob) -> ResultLine:
+def result_line(listed: ListedJob, subject: str) -> ResultLine:
     job = listed.job
     return {
         "id": job.id,
@@ -76,6 +82,8 @@ def result_line(listed: ListedJob) -> ResultLine:
         "finished": job.finished,
         "settings": job.settings,
         "model": job.model,
+        "session": listed.session,
+        "subject": subject,
     }
 
 
@@ -93,6 +101,7 @@ def head_of(service: Service, job: ResultLine) -> Head:
         "clear_views": len(residuals),
         "contour_px": sum(residuals) / len(residuals) if residuals else None,
         "method": None if report is None else report.get("method"),
+        "level": None if report is None else report.get("detail", {}).get("level"),
         "model_name": None if report is None else report["model"]["name"],
         "truth": truth.is_file(),
         "files": {name: file["bytes"] for name, file in files.items() if "/" not in name},

@@ -100,13 +100,13 @@ def check_viewer(page: Page, screenshots: Path, tmp_path: Path) -> None:
     """Colourings, wireframe, truth, measuring, download."""
     canvas = page.locator("canvas")
     seen = {}
-    for key in ("g", "c", "t", "w"):
+    for key in ("g", "u", "t", "w"):
         page.keyboard.press(key)
         page.wait_for_timeout(1500)
         seen[key] = canvas.screenshot()
-        if key == "c":
+        if key == "u":
             expect(page.locator(".view3d").get_by_text("Standard deviation")).to_be_visible()
-            page.screenshot(path=screenshots / "result-confidence.png")
+            page.screenshot(path=screenshots / "result-uncertainty.png")
     assert len(set(seen.values())) == 4, "each colouring looks different"
     page.keyboard.press("w")
     page.get_by_label("Compare with").select_option("truth")

@@ -1,0 +1,1 @@
+"""Cameras from photographs of a scene alone: no board, no clean plates."""

@@ -1,0 +1,135 @@
+"""What the points leave open of the cameras: the reduced camera system of the bundle adjustment, inverted.
+
+With U, V and W the blocks of the normal equations of cameras, of points and between them, eliminating the points leaves
+``S = U - W V^-1 W^T`` (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1). It is singular along
+the seven motions of the world (rotation, shift, scale); the covariance is given in the subject's gauge of
+``calibration.adjustment.gauge``, where those are no error of a camera. What of a lens was not
+estimated (few views: its principal point, taken to be the picture's middle; a lens each: its bend, too) has a spread
+that is carried through the solution ("consider" covariance: Tapley et al., Statistical Orbit Determination, 2004, 6.3).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+
+from calibration.adjustment.gauge import (
+    effective_pose,
+    gauge_projection,
+    image_sigma,
+    intrinsics_jacobian,
+    pose_jacobian,
+    subject_points,
+    world_motions,
+)
+from calibration.scene.structure import Structure
+
+LENS = 5  # unknowns of a lens: f, k1, k2, cx, cy
+LENS_FROM_NINE = np.zeros((9, LENS))
+"""fx fy cx cy k1 k2 p1 p2 k3 from f k1 k2 cx cy: one focal length is both."""
+LENS_FROM_NINE[[0, 1, 4, 5, 2, 3], [0, 0, 1, 2, 3, 4]] = 1.0
+CENTRE_SHARE = (
+    0.01  # of the width: how far principal points lie from the middle, standard deviation; 0.8 % in the studio
+)
+NOISE_LEAST_PX = 0.1  # of a keypoint: what cameras with few points would otherwise claim
+BEND = (0.05, 0.02)  # standard deviations of k1 and k2 about those of the one lens that stands for all
+OUTLIER_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """``blocks``: per camera 6 x 6 of left perturbations (rad, mm), which hold what the lens's uncertainty adds;
+    ``pose_sigma_px``: their size at the subject; ``focal_sigma_px`` per camera; ``noise_px`` of a keypoint, an axis."""
+
+    blocks: Float[np.ndarray, "c 6 6"]
+    pose_sigma_px: Float[np.ndarray, " c"]
+    focal_sigma_px: Float[np.ndarray, " c"]
+    noise_px: float
+
+
+def uncertainty(structure: Structure) -> Uncertainty:
+    """Covariances of the cameras of a solved structure in millimetres."""
+    rig = structure.rig
+    noise = max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(structure.residuals()))))
+    places = camera_places(structure)
+    size = int(places.max()) + 1
+    considered, first = np.unique(places[:, structure.estimated : LENS], return_index=True)
+    estimated = np.setdiff1d(np.arange(size), considered)
+    system = reduced_camera_system(structure, noise)
+    motions = np.zeros((size, 7))
+    motions[places[:, LENS:]] = world_motions(rig, scale=True).reshape(len(rig), 6, 7)
+    inverse = _inverse(system[np.ix_(estimated, estimated)], motions[estimated])
+    width = float(np.mean([camera.intrinsics.width for camera in rig]))
+    known = np.array([np.nan, *BEND, CENTRE_SHARE * width, CENTRE_SHARE * width])[structure.estimated :]
+    spread = known[first % max(1, len(known))]
+    follows = np.zeros((size, len(considered)))
+    follows[estimated] = -inverse @ system[np.ix_(estimated, considered)]
+    follows[considered] = np.eye(len(considered))
+    whole = (follows * spread**2) @ follows.T
+    whole[np.ix_(estimated, estimated)] += inverse
+    full = _per_camera(whole, places)
+    points = subject_points(rig)
+    into = np.stack([effective_pose(camera, points) for camera in rig])
+    poses = np.einsum("cik,ckdl,djl->cidj", into, full, into).reshape(6 * len(rig), 6 * len(rig))
+    projection = gauge_projection(rig, scale=True)
+    joint = (projection @ poses @ projection.T).reshape(len(rig), 6, len(rig), 6)
+    blocks = np.stack([0.5 * (joint[i, :, i] + joint[i, :, i].T) for i in range(len(rig))])
+    focal = np.sqrt(np.array([full[i, 0, i, 0] for i in range(len(rig))]))
+    return Uncertainty(blocks, image_sigma(rig, full), focal, noise)
+
+
+def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
+    """Where each camera's f k1 k2 cx cy and its pose stand among all unknowns."""
+    count = len(structure.rig)
+    lenses = np.zeros(count, int) if structure.one_lens else np.arange(count)
+    lens = LENS * lenses[:, None] + np.arange(LENS)
+    return np.hstack([lens, LENS * (lenses.max() + 1) + np.arange(6 * count).reshape(count, 6)])
+
+
+def reduced_camera_system(structure: Structure, noise_px: float) -> Float[np.ndarray, "p p"]:
+    """``S`` of the module's docstring, for keypoints of ``noise_px`` an axis, without those that are wrong."""
+    places = camera_places(structure)
+    size, count = int(places.max()) + 1, len(structure.points)
+    u, v = np.zeros((size, size)), np.zeros((count, 3, 3))
+    rows, columns, values = [], [], []
+    good = (np.abs(structure.residuals()) < OUTLIER_SIGMAS * noise_px).all(axis=1)
+    for index, camera in enumerate(structure.rig):
+        seen = structure.point_of[good & (structure.camera_of == index)]
+        points = structure.points[seen]
+        by_lens = intrinsics_jacobian(camera, points) @ LENS_FROM_NINE
+        by_camera = np.concatenate([by_lens, pose_jacobian(camera, points)], axis=2) / noise_px
+        by_point = camera.project_with_jacobian(points)[1] / noise_px
+        u[np.ix_(places[index], places[index])] += np.einsum("nki,nkj->ij", by_camera, by_camera)
+        np.add.at(v, seen, np.einsum("nki,nkj->nij", by_point, by_point))
+        shape = (len(seen), LENS + 6, 3)
+        values.append(np.einsum("nki,nkj->nij", by_camera, by_point).ravel())
+        rows.append(np.broadcast_to(places[index][None, :, None], shape).ravel())
+        columns.append(np.broadcast_to(3 * seen[:, None, None] + np.arange(3), shape).ravel())
+    held = np.linalg.matrix_rank(v) == 3  # a point that two good observations no longer hold says nothing
+    inverse = np.zeros_like(v)
+    inverse[held] = np.linalg.inv(v[held])
+    at = np.concatenate(rows), np.concatenate(columns)
+    w = scipy.sparse.coo_array((np.concatenate(values), at), shape=(size, 3 * count)).tocsr()
+    return u - np.asarray((w @ scipy.sparse.block_diag(list(inverse), format="csr") @ w.T).todense())
+
+
+def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]) -> Float[np.ndarray, "p p"]:
+    """Inverse of the reduced system where ``motions``, its null space, are held."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    held = np.linalg.qr(motions / scale[:, None])[0]
+    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + held @ held.T) - held @ held.T
+    return inverse * np.outer(scale, scale)
+
+
+def _per_camera(
+    covariance: Float[np.ndarray, "p p"], places: Int[np.ndarray, "c 11"]
+) -> Float[np.ndarray, "c 15 c 15"]:
+    """The same of each camera's nine lens values and pose."""
+    count = len(places)
+    expand = np.zeros((count, 15, len(covariance)))
+    for index in range(count):
+        expand[index][:9, places[index, :LENS]] = LENS_FROM_NINE
+        expand[index][9:, places[index, LENS:]] = np.eye(6)
+    flat = expand.reshape(15 * count, -1)
+    return (flat @ covariance @ flat.T).reshape(count, 15, count, 15)

@@ -1,0 +1,209 @@
+"""Which points of two photographs are one point of the scene: SIFT on the processor, by pycolmap.
+
+Shots of one rig share its cameras but not the scene: heads turn from shot to shot. So pictures are matched within a
+shot only, and then all shots' keypoints of a camera are put into one image of it, which makes "the cameras stand still"
+a matter of the data and needs no constraint in the solver. Everything runs in one thread from one seed: with more, the
+order of RANSAC's draws, and so the result, is that of the scheduler.
+"""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from calibration.scene.photographs import ONE_SHOT, Photographs
+from rig.errors import InputError
+from rig.formats.images import decode_image_file, write_image
+
+SEED = 0
+LENS_MODEL = "RADIAL"  # f cx cy k1 k2: what one picture, or a few of one lens, can carry
+FEATURES_MOST = 3500  # a picture
+PEAK_LEAST = 0.002  # contrast of a keypoint; COLMAP's own 0.0067 leaves 600 of 3,100 on a face, and its views apart
+SIDE_MOST_PX = 2400  # features are found in pictures no larger; they are placed to a tenth of a pixel anyhow
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """COLMAP databases of one image a camera, and what they hold: keypoints found in each camera, verified matches of
+    each pair of cameras, and how many keypoints in all have one. The first database has one lens for all images where
+    they are of one size, the last one a lens each unless ``one_lens``."""
+
+    databases: tuple[Path, ...]
+    one_lens: bool
+    sizes: dict[str, tuple[int, int]]
+    features: dict[str, int]
+    matched: dict[tuple[str, str], int]
+    matched_keypoints: int
+
+
+def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool | None, report: Report) -> Matches:
+    """Features of every photograph, matched within each shot and verified by two-view geometry.
+
+    ``scratch`` is a folder of the caller's that may be deleted once the structure is solved; ``one_lens``: all
+    photographs are of one camera at one setting; None: they are where each camera has one picture and all are of one
+    size. Raises InputError naming every picture that cannot be used."""
+    sizes = _write_grey(photographs, scratch / "pictures")
+    if one_lens is None:
+        one_lens = len(set(sizes.values())) == 1 and photographs.shots == (ONE_SHOT,)
+    elif one_lens and len(set(sizes.values())) > 1:
+        raise InputError("photographs", [f"are of {len(set(sizes.values()))} sizes, and one lens makes one size"])
+    with quiet():
+        _extract(photographs, scratch, report)
+        _match_shots(photographs, scratch, report)
+        report("matches", 0.8)
+        databases = tuple(
+            _merge(photographs, scratch, f"lens-{mode}", one_lens=mode == "one")
+            for mode in ("one", "each")
+            if (mode == "one" and len(set(sizes.values())) == 1) or (mode == "each" and not one_lens)
+        )
+    return _matches(databases, sizes, one_lens=one_lens)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """COLMAP without its log, of which one line in a thousand is for a user."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, int]]:
+    """Pictures as this project reads them, whatever COLMAP would make of their files; returns width and height."""
+
+    def one(job: tuple[str, str, Path]) -> tuple[tuple[int, int], str]:
+        camera, shot, path = job
+        where = f"{path.parent.name}/{path.name}"
+        pixels, _, fault = decode_image_file(path, where, grey=True)
+        if pixels is None:
+            return (0, 0), fault
+        target = folder / camera / f"{shot}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_image(target, pixels)
+        return (pixels.shape[1], pixels.shape[0]), ""
+
+    jobs = [(camera, shot, path) for camera, files in photographs.files.items() for shot, path in files.items()]
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        done = list(pool.map(one, jobs))
+    faults = [fault for _, fault in done if fault]
+    sizes: dict[str, tuple[int, int]] = {}
+    for (camera, shot, _), (size, fault) in zip(jobs, done, strict=True):
+        if not fault and sizes.setdefault(camera, size) != size:
+            wanted = " x ".join(map(str, sizes[camera]))
+            faults.append(f"{camera}/{shot} is {size[0]} x {size[1]} pixels, its camera's other shots {wanted}")
+    if faults:
+        raise InputError("photographs", faults)
+    return sizes
+
+
+def _extract(photographs: Photographs, scratch: Path, report: Report) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads, options.use_gpu, options.max_image_size = 1, False, SIDE_MOST_PX
+    options.sift.max_num_features, options.sift.peak_threshold = FEATURES_MOST, PEAK_LEAST
+    files = [f"{camera}/{shot}.png" for camera, own in photographs.files.items() for shot in own]
+    for number, file in enumerate(files):
+        report("features", number / len(files))
+        pycolmap.set_random_seed(SEED)
+        pycolmap.extract_features(
+            scratch / "shots.db",
+            scratch / "pictures",
+            [file],
+            pycolmap.CameraMode.PER_IMAGE,
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+        )
+
+
+def _match_shots(photographs: Photographs, scratch: Path, report: Report) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads, options.use_gpu, options.skip_geometric_verification = 1, False, True
+    for number, shot in enumerate(photographs.shots):
+        report("matches", 0.8 * number / len(photographs.shots))
+        seen = [f"{camera}/{shot}.png" for camera, own in photographs.files.items() if shot in own]
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = _pairs_file(scratch / "shot.pairs", combinations(seen, 2))
+        pycolmap.match_image_pairs(
+            scratch / "shots.db", options, pairing, pycolmap.TwoViewGeometryOptions(), pycolmap.Device.cpu
+        )
+
+
+def _pairs_file(path: Path, pairs: Iterator[tuple[str, str]]) -> Path:
+    path.write_text("".join(f"{one} {other}\n" for one, other in pairs), encoding="utf-8")
+    return path
+
+
+def _first(photographs: Photographs) -> list[str]:
+    """The picture under whose name a camera stands among images."""
+    return [f"{camera}/{next(iter(own))}.png" for camera, own in photographs.files.items()]
+
+
+def _merge(photographs: Photographs, scratch: Path, name: str, *, one_lens: bool) -> Path:
+    """All shots of a camera in one image: keypoints one after the other, matches numbered accordingly, and verified."""
+    import pycolmap
+
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = LENS_MODEL
+    mode = pycolmap.CameraMode.SINGLE if one_lens else pycolmap.CameraMode.PER_IMAGE
+    pycolmap.Database.open(path := scratch / f"{name}.db").close()  # it imports into a file that exists
+    pycolmap.import_images(path, scratch / "pictures", mode, _first(photographs), options)
+    shots, cameras = pycolmap.Database.open(scratch / "shots.db"), pycolmap.Database.open(path)
+    try:
+        source = {image.name: image.image_id for image in shots.read_all_images()}
+        target = {Path(image.name).parts[0]: image.image_id for image in cameras.read_all_images()}
+        first: dict[tuple[str, str], int] = {}
+        for camera, own in photographs.files.items():
+            keypoints = [shots.read_keypoints(source[f"{camera}/{shot}.png"])[:, :2] for shot in own]
+            starts = np.cumsum([0, *map(len, keypoints)])
+            first.update({(camera, shot): int(start) for shot, start in zip(own, starts, strict=False)})
+            cameras.write_keypoints(target[camera], np.concatenate(keypoints))
+        for one, other in combinations(photographs.files, 2):
+            found = []
+            for shot in photographs.files[one].keys() & photographs.files[other].keys():
+                pair = (source[f"{name}/{shot}.png"] for name in (one, other))
+                matches = shots.read_matches(*pair).astype(np.int64)
+                found.append(matches.reshape(-1, 2) + [first[one, shot], first[other, shot]])
+            joined = np.concatenate(found) if found else np.zeros((0, 2), np.int64)
+            cameras.write_matches(target[one], target[other], joined.astype(np.uint32))
+    finally:
+        shots.close()
+        cameras.close()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    pycolmap.set_random_seed(SEED)
+    pycolmap.verify_matches(
+        path, _pairs_file(scratch / "cameras.pairs", combinations(_first(photographs), 2)), verification
+    )
+    return path
+
+
+def _matches(databases: tuple[Path, ...], sizes: dict[str, tuple[int, int]], *, one_lens: bool) -> Matches:
+    import pycolmap
+
+    database = pycolmap.Database.open(databases[-1])
+    try:
+        names = {image.image_id: Path(image.name).parts[0] for image in database.read_all_images()}
+        features = {name: database.num_keypoints_for_image(image) for image, name in names.items()}
+        matched: dict[tuple[str, str], int] = {}
+        keypoints: set[tuple[int, int]] = set()
+        pairs, geometries = database.read_two_view_geometries()
+        for pair, geometry in zip(pairs, geometries, strict=True):
+            images = pycolmap.pair_id_to_image_pair(pair)
+            matched[names[images[0]], names[images[1]]] = len(geometry.inlier_matches)
+            for side, image in enumerate(images):
+                keypoints |= {(image, int(index)) for index in geometry.inlier_matches[:, side]}
+    finally:
+        database.close()
+    return Matches(databases, one_lens, sizes, features, matched, len(keypoints))

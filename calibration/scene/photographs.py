@@ -1,0 +1,62 @@
+"""Which photographs a folder holds, of which camera, and of which shot.
+
+``PHOTOS/<camera>.<ext>``, or ``PHOTOS/<camera>/<shot>.<ext>`` where the same name of a shot means the same moment; both
+also inside ``PHOTOS/images/``. A camera's name becomes that of its file in a capture, so it must be fit for one.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rig.errors import InputError
+from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
+from rig.formats.capture_folder import capture_root
+from rig.formats.images import IMAGE_SUFFIXES
+
+ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photographs:
+    """Files by camera, then by shot; both in the order of their names."""
+
+    files: Mapping[str, Mapping[str, Path]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.files)
+
+    @property
+    def shots(self) -> tuple[str, ...]:
+        return tuple(sorted({shot for files in self.files.values() for shot in files}))
+
+
+def find_photographs(folder: Path) -> Photographs:
+    """The photographs of ``folder``. Raises InputError naming every fault."""
+    if not folder.is_dir():
+        raise InputError(folder.name, ["is no folder; give the folder that holds the photographs"])
+    root = capture_root(folder)
+    root = root / "images" if (root / "images").is_dir() else root
+    flat = _pictures(root)
+    folders = {path.name: _pictures(path) for path in sorted(root.iterdir()) if path.is_dir()}
+    folders = {name: files for name, files in folders.items() if files}
+    if flat and folders:
+        told = "photographs beside folders of photographs: put one picture a camera, or one folder a camera"
+        raise InputError(folder.name, [told])
+    files = folders or {path.stem: [path] for path in flat}
+    faults = [f"camera {fault}: rename it" for name in files if (fault := name_fault(name))]
+    if len(files) < CAMERAS_LEAST:
+        faults.append(f"{len(files)} photographs; at least {CAMERAS_LEAST} from different places are needed, better 20")
+    for name, paths in (folders or {"the folder": flat}).items():
+        stems = [path.stem for path in paths]
+        twice = sorted({stem for stem in stems if stems.count(stem) > 1})
+        faults += [f"{name} holds {stem} {stems.count(stem)} times, with different endings" for stem in twice]
+    if faults:
+        raise InputError(folder.name, faults)
+    if folders:
+        return Photographs({name: {path.stem: path for path in paths} for name, paths in folders.items()})
+    return Photographs({path.stem: {ONE_SHOT: path} for path in flat})
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))

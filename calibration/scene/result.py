@@ -1,0 +1,112 @@
+"""What a calibration from the scene is: the rig with its covariances, its scale, and which views did not join."""
+
+from dataclasses import dataclass
+from typing import TypedDict
+
+import numpy as np
+
+from calibration.scene.covariance import Uncertainty
+from calibration.scene.scale import Scale
+from calibration.scene.structure import Structure
+from rig.formats.cameras_json import CamerasDocument, document_from_rig
+from rig.rig import Rig
+
+
+class SceneCameraFigures(TypedDict):
+    rms_px: float
+    features: int
+    points: int
+    pose_sigma_px: float
+    focal_px: float
+    focal_sigma_px: float
+
+
+class SceneFigures(TypedDict):
+    """The numbers of ``calibrate --from scene --json``."""
+
+    rms_px: float
+    used_share: float
+    noise_px: float
+    points: int
+    observations: int
+    cameras: dict[str, SceneCameraFigures]
+
+
+class ScaleDocument(TypedDict):
+    source: str
+    assumed: bool
+    told: str
+    share_sigma: float
+
+
+class SceneDocument(TypedDict):
+    """``calibration.json`` of a scene."""
+
+    figures: SceneFigures
+    front: str
+    lenses: str
+    scale: ScaleDocument
+    left_out: dict[str, str]
+    warnings: list[str]
+    rig: CamerasDocument
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneCalibration:
+    """``rig``: with covariances, mm, world frame; ``structure``: the same cameras with their points; ``left_out``:
+    views that did not join, and why; ``features``: keypoints found in each view; ``matched``: how many of them in all
+    are found in another view too."""
+
+    rig: Rig
+    structure: Structure
+    uncertainty: Uncertainty
+    scale: Scale
+    front: str
+    left_out: dict[str, str]
+    features: dict[str, int]
+    matched: int
+    warnings: tuple[str, ...]
+
+    def figures(self) -> SceneFigures:
+        """The numbers of ``calibrate --from scene --json``."""
+        misses = self.structure.residuals()
+        cameras: dict[str, SceneCameraFigures] = {}
+        for index, camera in enumerate(self.rig):
+            own = self.structure.camera_of == index
+            cameras[camera.name] = {
+                "rms_px": _rms(misses[own]),
+                "features": self.features[camera.name],
+                "points": int(own.sum()),
+                "pose_sigma_px": float(self.uncertainty.pose_sigma_px[index]),
+                "focal_px": camera.intrinsics.fx,
+                "focal_sigma_px": float(self.uncertainty.focal_sigma_px[index]),
+            }
+        return {
+            "rms_px": _rms(misses),
+            "used_share": len(misses) / max(1, self.matched),
+            "noise_px": self.uncertainty.noise_px,
+            "points": len(self.structure.points),
+            "observations": len(misses),
+            "cameras": cameras,
+        }
+
+    def document(self) -> SceneDocument:
+        """Everything but points and residuals, as JSON."""
+        return {
+            "figures": self.figures(),
+            "front": self.front,
+            "lenses": "one" if self.structure.one_lens else "each",
+            "scale": {
+                "source": self.scale.source,
+                "assumed": self.scale.assumed,
+                "told": self.scale.told,
+                "share_sigma": self.scale.share,
+            },
+            "left_out": dict(self.left_out),
+            "warnings": list(self.warnings),
+            "rig": document_from_rig(self.rig),
+        }
+
+
+def _rms(misses: np.ndarray) -> float:
+    return float(np.sqrt((misses**2).sum(axis=1).mean())) if len(misses) else 0.0

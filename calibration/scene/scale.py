@@ -1,0 +1,169 @@
+"""How many millimetres the scene's unit is: from a known length in it, or else from the size that heads have.
+
+Enters: a structure in any unit. Leaves: the factor, with its standard deviation as a share and where it comes from. The
+known lengths are those of ``scale.json``. Without one, the points about the place that the cameras look at are taken
+to be a head, as far from their middle as the model's mean head is from its own: hair, a neck and the table pull at it,
+so it is good to a fifth only, and is said to be an assumption wherever it is shown.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from calibration.scene.photographs import Photographs
+from calibration.scene.structure import Structure
+from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangulate
+from rig.errors import InputError
+from rig.formats.images import decode_image_file
+from rig.formats.scale_json import CameraDistance, KnownLength, PointDistance, TagSize, dictionaries
+from rig.rig import Rig
+
+PICKED_PX = 1.0  # of a point picked by hand, an axis
+TAG_PX = 0.3  # of a tag's corner, refined below a pixel
+HEAD_SHARE = 0.2  # standard deviation of what the size of a head tells
+ASSUMED = "head-size"
+HALF_PIXEL = 0.5
+"""AprilTag's edge lines count from a pixel's corner. They leave sides unbiased; OpenCV's own corners, refined below a
+pixel, lie 0.15 px inside each way: 1 % of a tag of 35 px."""
+TAG_MISS_PX = 3.0  # beyond it a corner of another tag was taken for it, or the tag was moved
+POINTS_LEAST = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """``factor``: mm in the structure's unit; ``share``: its relative standard deviation; ``source``: points, tag,
+    cameras or head-size; ``told``: the same for a reader."""
+
+    factor: float
+    share: float
+    source: str
+    told: str
+
+    @property
+    def assumed(self) -> bool:
+        """Whether nothing was measured."""
+        return self.source == ASSUMED
+
+
+def find_scale(
+    structure: Structure, known: KnownLength | None, photographs: Photographs, head: Float[np.ndarray, "v 3"]
+) -> Scale:
+    """The scale from ``known``, or from ``head``, the vertices (mm) of a model's mean head, where that is None.
+
+    Raises InputError where the photographs that joined do not show the known length."""
+    if isinstance(known, PointDistance):
+        return scale_from_points(structure.rig, known)
+    if isinstance(known, CameraDistance):
+        return scale_from_cameras(structure.rig, known)
+    if isinstance(known, TagSize):
+        return scale_from_tags(structure.rig, known, find_tags(photographs, known))
+    return scale_from_head(structure, head)
+
+
+def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
+    """From the centres of two cameras; a lens's entrance pupil is known to some millimetres from outside."""
+    lost = [name for name in known.cameras if name not in rig]
+    if lost:
+        raise InputError("scale.json", [f"cameras: {name} did not join the others; name two that did" for name in lost])
+    one, other = (rig[name].centre_world for name in known.cameras)
+    factor = known.distance_mm / float(np.linalg.norm(one - other))
+    told = f"the {known.distance_mm:g} mm between {known.cameras[0]} and {known.cameras[1]}"
+    return Scale(factor, 2.0 / known.distance_mm, "cameras", told)
+
+
+def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
+    """From two points that were picked in two views or more each."""
+    ends, faults = [], []
+    for name, views in (("first", known.first), ("second", known.second)):
+        joined = {camera: pixel for camera, pixel in views.items() if camera in rig}
+        try:
+            ends.append(triangulate(joined, rig, noise_px=PICKED_PX))
+        except NoPoint as error:
+            lost = ", ".join(sorted(set(views) - set(joined)))
+            faults.append(f"points: the {name} ({error})" + (f"; {lost} did not join the others" if lost else ""))
+    if faults:
+        raise InputError("scale.json", faults)
+    return _between(ends, known.distance_mm, "points", f"the {known.distance_mm:g} mm between two picked points")
+
+
+def _between(ends: list[TriangulatedPoint], length_mm: float, source: str, told: str) -> Scale:
+    across = ends[1].position_world - ends[0].position_world
+    length = float(np.linalg.norm(across))
+    along = across / length
+    share = float(np.sqrt(along @ (ends[0].covariance + ends[1].covariance) @ along)) / length
+    return Scale(length_mm / length, share, source, told)
+
+
+Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
+
+
+def find_tags(photographs: Photographs, known: TagSize) -> Tags:
+    """Corners (px) of the tags of a dictionary, by shot and number, then by camera."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+    dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[known.dictionary])
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+    tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
+    for camera, own in photographs.files.items():
+        for shot, path in own.items():
+            pixels, _, _ = decode_image_file(path, path.name, grey=True)
+            assert pixels is not None  # matching has read it
+            corners, ids, _ = detector.detectMarkers(pixels)
+            numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
+            for number, corner in zip(numbers, corners, strict=True):
+                if numbers.count(number) == 1:  # a number that is there twice cannot be told apart
+                    tags.setdefault((shot, number), {})[camera] = corner.reshape(4, 2) - HALF_PIXEL
+    return tags
+
+
+def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
+    """From the sides of all tags that two views or more show, the median over tags."""
+    found = []
+    for number, views in tags.items():
+        joined = {camera: corners for camera, corners in views.items() if camera in rig}
+        try:
+            corners = [triangulate({c: px[k] for c, px in joined.items()}, rig, noise_px=TAG_PX) for k in range(4)]
+        except NoPoint:
+            continue
+        worst = max(float(np.abs(miss).max()) for corner in corners for miss in corner.residuals_px.values())
+        if worst < TAG_MISS_PX:
+            sides = [_between([corners[k], corners[(k + 1) % 4]], known.size_mm, "tag", "") for k in range(4)]
+            found.append((np.mean([side.factor for side in sides]), np.mean([side.share for side in sides]), number[1]))
+    if not found:
+        seen = sorted({camera for views in tags.values() for camera in views})
+        told = f"tags of it were found in {', '.join(seen)}" if seen else "no tag of it was found in any photograph"
+        advice = "lay a larger one where several cameras see it whole, with a white rim, or check the dictionary"
+        raise InputError("scale.json", [f"tag: none is seen by two cameras that joined ({told}); {advice}"])
+    factor = float(np.median([factor for factor, _, _ in found]))
+    numbers = sorted({number for *_, number in found})
+    told = f"{len(numbers)} tag{'s' * (len(numbers) > 1)} of {known.size_mm:g} mm ({', '.join(map(str, numbers))})"
+    return Scale(factor, float(np.median([share for _, share, _ in found])), "tag", told)
+
+
+def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
+    """From the median distance of points from their middle, as in ``head`` (mm)."""
+    points = _looked_at(structure)
+    ratio = _spread(head) / _spread(points)
+    told = "an ASSUMPTION: the points in the middle are a head of the model's mean size; give scale.json to know it"
+    return Scale(ratio, HEAD_SHARE, ASSUMED, told)
+
+
+def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:
+    """Points inside the largest sphere about the common point that all but a few cameras have whole in the picture."""
+    centre, radii = structure.rig.centre_world(), []
+    for camera in structure.rig:
+        k = camera.intrinsics
+        half = min(k.width / k.fx, k.height / k.fy) / 2
+        radii.append(float(np.linalg.norm(camera.centre_world - centre)) * np.sin(np.arctan(half)))
+    away = np.linalg.norm(structure.points - centre, axis=1)
+    radius = float(np.quantile(radii, 0.2))
+    while (near := away < radius).sum() < min(POINTS_LEAST, len(away)):
+        radius *= 1.2
+    return structure.points[near]
+
+
+def _spread(points: Float[np.ndarray, "p 3"]) -> float:
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))

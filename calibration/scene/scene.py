@@ -1,0 +1,117 @@
+"""From photographs of a scene to a calibrated rig: matches, structure from motion, scale, world frame, covariances.
+
+Enters: one photograph a camera, or a folder of shots a camera, of a scene that has enough on it to be matched: a head
+with skin and hair in view of cameras 10 to 25 degrees apart, a table with things on it, a room. Leaves: the rig.
+"""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calibration.result import CalibrationRefused
+from calibration.scene.covariance import uncertainty
+from calibration.scene.matching import Matches, match_photographs
+from calibration.scene.photographs import find_photographs
+from calibration.scene.result import SceneCalibration
+from calibration.scene.scale import HEAD_SHARE, Scale, find_scale
+from calibration.scene.structure import Structure, solve_structure, why_not
+from calibration.scene.upright import in_guessed_frame
+from pipeline.eigenheads.model import load_model
+from rig.errors import InputError
+from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
+from rig.formats.scale_json import read_scale
+from rig.rig import Rig
+
+Report = Callable[[str, float], None]
+
+JOINED_LEAST = 0.5  # share of the views; where fewer join, there are two scenes or none
+LOOSE_PX = 1.0  # at the subject; a camera that is known no better than this is said so
+
+
+def calibrate_scene(
+    folder: Path,
+    *,
+    scale: Path | None = None,
+    front: str | None = None,
+    one_lens: bool | None = None,
+    report: Report = lambda stage, fraction: None,
+) -> SceneCalibration:
+    """Calibrates the cameras of ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``.
+
+    ``scale``: a ``scale.json``; ``front``: the camera that the subject faces, guessed without it; ``one_lens``: whether
+    all photographs are of one camera at one setting, which is taken from the folder's kind without it (one picture a
+    camera and all of one size: one lens). The same photographs give the same rig on the same machine.
+
+    Raises InputError naming every fault of the photographs and of ``scale.json``, and CalibrationRefused with the views
+    that did not join, why, and what to add."""
+    photographs = find_photographs(folder)
+    names = photographs.names
+    if front is not None and front not in names:
+        raise InputError("front camera", [f"{front!r} is none of the photographs' ({', '.join(names)})"])
+    known = None if scale is None else read_scale(scale, names)
+    with tempfile.TemporaryDirectory() as scratch:
+        matches = match_photographs(photographs, Path(scratch), one_lens=one_lens, report=report)
+        structure = solve_structure(matches, Path(scratch), report=report)
+    structure, left_out = judged(structure, matches)
+    report("scale", 0.0)
+    head = np.zeros((0, 3)) if known is not None else load_model().cage(np.zeros(0))
+    found = find_scale(structure, known, photographs, head)
+    return placed(structure, found, matches, left_out, front)
+
+
+def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, str]]:
+    """The structure with why views are left out of it. Raises CalibrationRefused where too few joined."""
+    names = list(matches.sizes)
+    joined = structure.rig.names if structure is not None else ()
+    left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
+    if structure is None or len(joined) < max(CAMERAS_LEAST, JOINED_LEAST * len(names)):
+        told = f"only {len(joined)} of {len(names)} views join" if joined else f"none of the {len(names)} views join"
+        raise CalibrationRefused([told, *left_out.values()])
+    return structure, left_out
+
+
+def placed(
+    structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, str], front: str | None
+) -> SceneCalibration:
+    """The calibration in millimetres and in the world frame, with its covariances."""
+    if front in left_out:
+        raise CalibrationRefused([f"the front camera {left_out[str(front)]}"])
+    here = transformed(structure, structure.rig, scale.factor)
+    here = transformed(here, in_guessed_frame(here.rig, front), 1.0)
+    spread = uncertainty(here)
+    cameras = (replace(camera, covariance=block) for camera, block in zip(here.rig, spread.blocks, strict=True))
+    warnings = [f"left out: {why}" for why in left_out.values()]
+    if scale.assumed:
+        warnings.append(f"the scale is {scale.told}; it is good to {HEAD_SHARE:.0%}")
+    warnings += [
+        f"{name} is known to {px:.1f} px at the subject only: add views beside it"
+        for name, px in zip(here.rig.names, spread.pose_sigma_px, strict=True)
+        if px > LOOSE_PX
+    ]
+    if len(here.rig) > CAMERAS_MOST:
+        warnings.append(f"{len(here.rig)} cameras joined; a capture may have {CAMERAS_MOST} at most")
+    return SceneCalibration(
+        Rig(tuple(cameras)),
+        here,
+        spread,
+        scale,
+        front or here.rig.front_camera(),
+        left_out,
+        matches.features,
+        matches.matched_keypoints,
+        tuple(warnings),
+    )
+
+
+def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
+    """The structure times ``factor``, in the frame in which its cameras are those of ``moved``."""
+    before, after = structure.rig.cameras[0].camera_from_world, moved.cameras[0].camera_from_world
+    new_from_old = after.inverse() @ before
+    cameras = tuple(
+        replace(c, camera_from_world=replace(c.camera_from_world, translation=c.camera_from_world.translation * factor))
+        for c in moved
+    )
+    return replace(structure, rig=Rig(cameras), points=new_from_old.apply(structure.points) * factor)

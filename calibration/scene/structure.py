@@ -1,0 +1,168 @@
+"""Cameras and points from matches: COLMAP's incremental structure from motion, one after another from the best pair.
+
+Source: J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016, in pycolmap. The unit of length is
+free and so is the frame; both are given afterwards. COLMAP puts pixel (0.5, 0.5) at the centre of the top-left pixel,
+this project (0, 0): principal points and keypoints are shifted on the way out.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from calibration.scene.matching import SEED, Matches, Report, quiet
+from rig.camera import Camera, Distortion, Intrinsics
+from rig.geometry import RigidTransform
+from rig.rig import Rig
+
+if TYPE_CHECKING:
+    import pycolmap
+
+HALF_PIXEL = 0.5
+FEATURES_LEAST = 100  # of a view; sharp pictures of a head have a thousand
+CENTRE_VIEWS = 10  # of one lens, from which its principal point is estimated; fewer leave it to the picture's middle
+INITIAL_LEAST, SEEN_LEAST = 50, 15  # matches of the first pair, points of a view that joins; half of COLMAP's own
+TRACK_LEAST = 3  # a point in two views only tells nothing about the third; and cannot be told from a wrong match
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Structure:
+    """``rig``: the cameras that joined, in the scene's own frame and unit; ``points``: in the same; ``camera_of``,
+    ``point_of`` and ``pixels``: each observation. ``one_lens``: all cameras have the same intrinsics."""
+
+    rig: Rig
+    points: Float[np.ndarray, "p 3"]
+    camera_of: Int[np.ndarray, " n"]
+    point_of: Int[np.ndarray, " n"]
+    pixels: Float[np.ndarray, "n 2"]
+    one_lens: bool
+
+    @property
+    def estimated(self) -> int:
+        """How many of a lens's f, k1, k2, cx, cy, in this order, were estimated."""
+        if not self.one_lens:
+            return 1
+        return 5 if len(self.rig) >= CENTRE_VIEWS else 3
+
+    def residuals(self) -> Float[np.ndarray, "n 2"]:
+        """Projected less observed, px."""
+        projected = np.empty_like(self.pixels)
+        for index, camera in enumerate(self.rig):
+            own = self.camera_of == index
+            projected[own] = camera.project(self.points[self.point_of[own]])
+        return projected - self.pixels
+
+
+def solve_structure(matches: Matches, scratch: Path, *, report: Report) -> Structure | None:
+    """The largest set of cameras that join, with their points; None where no pair of views starts one.
+
+    Lenses of their own are started from the one that explains all views best, and keep its distortion: a view of a
+    head cannot tell its focal length from its distance, nor its 300 points a lens's bend from their own noise."""
+    import pycolmap
+
+    best, lens = None, None
+    with quiet():
+        for number, database in enumerate(matches.databases):
+            report("structure", number / len(matches.databases))
+            _start_lenses(database, lens)
+            pycolmap.set_random_seed(SEED)
+            models = scratch / f"models-{number}"
+            models.mkdir()
+            found = pycolmap.incremental_mapping(database, scratch / "pictures", models, _pipeline_options())
+            best = max(found.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+            if best is not None:
+                one = len(best.cameras) == 1
+                _adjust(best, one_lens=one, principal_point=one and best.num_reg_images() >= CENTRE_VIEWS)
+                lens = next(iter(best.cameras.values())).params
+    return None if best is None else _structure(best, one_lens=matches.one_lens)
+
+
+def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
+    """The lens from which every camera of a database starts, its principal point aside; None: COLMAP's guess."""
+    import pycolmap
+
+    if lens is None:
+        return
+    database = pycolmap.Database.open(path)
+    try:
+        for camera in database.read_all_cameras():
+            camera.params = np.array([lens[0], *camera.params[1:3], *lens[3:]])
+            database.update_camera(camera)
+    finally:
+        database.close()
+
+
+def _pipeline_options() -> "pycolmap.IncrementalPipelineOptions":
+    """Lenses stay undistorted while views join: three views bend k1 and k2 to their matches, and no fourth fits."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.extract_colors = False
+    options.min_model_size = 3
+    options.max_num_models = 4  # the largest is taken; later ones are made of what the first left
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.init_min_num_inliers = INITIAL_LEAST
+    options.mapper.abs_pose_min_num_inliers = SEEN_LEAST
+    return options
+
+
+def _adjust(model: "pycolmap.Reconstruction", *, one_lens: bool, principal_point: bool) -> None:
+    """The last bundle adjustment, with a loss that forgives: a wrong match may be within COLMAP's four pixels."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point, options.refine_extra_params = principal_point, one_lens
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _structure(model: "pycolmap.Reconstruction", *, one_lens: bool) -> Structure:
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    cameras = tuple(_camera(Path(image.name).parts[0], image, model.cameras[image.camera_id]) for image in images)
+    place = {image.image_id: index for index, image in enumerate(images)}
+    ids = sorted(key for key, point in model.points3D.items() if point.track.length() >= TRACK_LEAST)
+    camera_of, point_of, pixels = [], [], []
+    for index, key in enumerate(ids):
+        for element in model.points3D[key].track.elements:
+            camera_of.append(place[element.image_id])
+            point_of.append(index)
+            pixels.append(model.images[element.image_id].points2D[element.point2D_idx].xy - HALF_PIXEL)
+    points = np.array([model.points3D[key].xyz for key in ids]).reshape(-1, 3)
+    seen = np.array(pixels, dtype=float).reshape(-1, 2)
+    return Structure(Rig(cameras), points, np.array(camera_of, int), np.array(point_of, int), seen, one_lens)
+
+
+def _camera(name: str, image: Any, lens: Any) -> Camera:
+    focal, cx, cy, k1, k2 = lens.params
+    intrinsics = Intrinsics(lens.width, lens.height, focal, focal, cx - HALF_PIXEL, cy - HALF_PIXEL, Distortion(k1, k2))
+    pose = image.cam_from_world()
+    return Camera(name, intrinsics, RigidTransform(pose.rotation.matrix(), np.asarray(pose.translation)))
+
+
+def why_not(name: str, matches: Matches, joined: Collection[str]) -> str:
+    """Why a view did not join the others, and what to add."""
+    features = matches.features[name]
+    if features < FEATURES_LEAST:
+        return f"{name}: only {features} distinct points in it: dark, blurred or bare; light and focus it"
+    others = {b if a == name else a: n for (a, b), n in matches.matched.items() if name in (a, b) and n}
+    if not others:
+        return (
+            f"{name}: none of its {features} points is found in another view; add views between it and its neighbours"
+        )
+    best = max(others, key=lambda other: others[other])
+    where = best if best in joined or not joined else f"{best}, which did not join either"
+    return (
+        f"{name}: at most {others[best]} points in common with another view ({where}), and too few with those that "
+        "joined; add one or two views between them, 10 to 15 degrees apart"
+    )

@@ -1,0 +1,79 @@
+"""Looking at a head through a camera of the rig: where the camera stands in the head's frame, and its photograph as a
+lens without distortion would have taken it, so that a browser's pinhole camera puts the mesh onto it."""
+
+from pathlib import Path
+from typing import TypedDict
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.results.report import Report
+from rig.camera import Camera
+from rig.errors import InputError
+from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.geometry import RigidTransform
+from rig.rig import Rig
+
+ImageRgb = UInt8[np.ndarray, "h w 3"]
+WIDTH_MOST = 1600
+MM = 1000.0
+
+
+class CameraView(TypedDict):
+    """A pinhole camera (pixels); ``camera_from_head``: rows of a 4 x 4 matrix, metres, head frame of head.glb."""
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_from_head: list[list[float]]
+
+
+def camera_views(rig: Rig, report: Report) -> list[CameraView]:
+    """Every camera of the capture. ``report`` places the head: x_world = R x_head + s t, at its true size."""
+    place = report["world_from_head"]
+    shift = np.array(place["translation"]) * place["scale"]
+    world_from_head = RigidTransform(np.array(place["rotation"]), shift)
+    return [_view(camera, camera.camera_from_world @ world_from_head) for camera in rig]
+
+
+def rig_of(capture: Path) -> Rig:
+    """The rig of a capture's files. Raises InputError."""
+    found = find_rig_file(capture)
+    if found is None:
+        raise InputError("capture", ["holds no cameras.json"])
+    return read_rig_file(found)
+
+
+def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
+    """The photograph without the lens's distortion, at most ``WIDTH_MOST`` wide."""
+    lens = camera.intrinsics
+    if camera.recorded is not None:
+        image = camera.recorded.undistort(image, lens.matrix(), smooth=True)
+    factor = min(1.0, WIDTH_MOST / lens.width)
+    size = (round(lens.width * factor), round(lens.height * factor))
+    wanted = np.diag([factor, factor, 1.0]) @ lens.matrix()
+    wanted[:2, 2] += (factor - 1) / 2  # the centre of the first pixel stays 0
+    columns, rows = cv2.initUndistortRectifyMap(
+        lens.matrix(), lens.distortion.opencv(), np.eye(3), wanted, size, cv2.CV_32FC1
+    )
+    return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_AREA), np.uint8)
+
+
+def _view(camera: Camera, camera_from_head: RigidTransform) -> CameraView:
+    lens, matrix = camera.intrinsics, np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = camera_from_head.rotation, camera_from_head.translation / MM
+    return {
+        "name": camera.name,
+        "width": lens.width,
+        "height": lens.height,
+        "fx": lens.fx,
+        "fy": lens.fy,
+        "cx": lens.cx,
+        "cy": lens.cy,
+        "camera_from_head": matrix.tolist(),
+    }

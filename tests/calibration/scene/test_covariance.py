@@ -1,0 +1,73 @@
+"""The reduced camera system against dense normal equations by finite differences, and against repeated trials."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.adjustment.gauge import moved
+from calibration.scene.covariance import LENS, camera_places, reduced_camera_system, uncertainty
+from calibration.scene.structure import Structure
+from rig.camera import Camera, Distortion
+from rig.rig import Rig
+from tests.support.textured_wedge import wedge_rig
+
+NOISE_PX = 0.3
+
+
+def structure(one_lens: bool, points: int = 30) -> Structure:
+    """Points on the wedge as its cameras see them, with noise."""
+    rig, rng = wedge_rig(), np.random.default_rng(3)
+    world = np.column_stack([rng.uniform(-70, 70, points), rng.uniform(-60, 60, points), np.zeros(points)])
+    world[:, 2] = -0.6 * np.abs(world[:, 0])
+    pixels = np.concatenate([camera.project(world) for camera in rig])
+    pixels += rng.normal(0, NOISE_PX, pixels.shape)
+    return Structure(
+        rig, world, np.repeat(np.arange(len(rig)), points), np.tile(np.arange(points), len(rig)), pixels, one_lens
+    )
+
+
+def stepped(camera: Camera, lens: np.ndarray, pose: np.ndarray) -> Camera:
+    """The camera after steps of f k1 k2 cx cy and of its pose."""
+    k = camera.intrinsics
+    f, k1, k2, cx, cy = lens
+    bent = Distortion(k.distortion.k1 + k1, k.distortion.k2 + k2)
+    changed = replace(k, fx=k.fx + f, fy=k.fy + f, cx=k.cx + cx, cy=k.cy + cy, distortion=bent)
+    return moved(replace(camera, intrinsics=changed), pose)
+
+
+@pytest.mark.parametrize("one_lens", [True, False])
+def test_it_is_the_schur_complement_of_dense_normal_equations(one_lens: bool) -> None:
+    given = structure(one_lens, points=8)
+    places = camera_places(given)
+    size, count = int(places.max()) + 1, len(given.points)
+
+    def residuals(step: np.ndarray) -> np.ndarray:
+        cameras = tuple(stepped(c, step[p[:LENS]], step[p[LENS:]]) for c, p in zip(given.rig, places, strict=True))
+        world = given.points + step[size:].reshape(-1, 3)
+        return replace(given, rig=Rig(cameras), points=world).residuals().ravel()
+
+    h = 1e-6
+    columns = [(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(size + 3 * count)]
+    jacobian = np.stack(columns, axis=1)
+    normal = jacobian.T @ jacobian / 10.0**2
+    dense = normal[:size, :size] - normal[:size, size:] @ np.linalg.solve(normal[size:, size:], normal[size:, :size])
+    ours = reduced_camera_system(given, 10.0)
+    scale = np.sqrt(np.diag(normal)[:size])
+    np.testing.assert_allclose(ours / np.outer(scale, scale), dense / np.outer(scale, scale), atol=1e-6)
+
+
+def test_a_motion_of_the_world_costs_nothing() -> None:
+    given = structure(one_lens=True)
+    system = reduced_camera_system(given, NOISE_PX)
+    scaled = system / np.sqrt(np.outer(np.diag(system), np.diag(system)))
+    assert (np.linalg.eigvalsh(scaled)[:7] < 1e-9).all()
+    assert np.linalg.eigvalsh(scaled)[7] > 1e-9
+
+
+def test_the_blocks_are_covariances_in_the_subjects_gauge() -> None:
+    found = uncertainty(structure(one_lens=True))
+    assert found.noise_px == pytest.approx(NOISE_PX, rel=0.15)  # of 360 residuals: 4 % for normal ones, MAD 6 %
+    for block in found.blocks:
+        assert np.linalg.eigvalsh(block).min() > 0
+    assert (found.pose_sigma_px > 0.05).all()

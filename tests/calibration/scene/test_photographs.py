@@ -1,0 +1,51 @@
+"""Which photographs a folder holds: the layouts, and what is wrong with others."""
+
+from pathlib import Path
+
+import pytest
+
+from calibration.scene.photographs import find_photographs
+from rig.errors import InputError
+
+
+def fill(folder: Path, *files: str) -> Path:
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_bytes(b"")
+    return folder
+
+
+@pytest.mark.parametrize("inside", ["", "images/"])
+def test_one_picture_a_camera(tmp_path: Path, inside: str) -> None:
+    fill(tmp_path, *(f"{inside}{name}" for name in ("b.jpg", "a.PNG", "c.tif", ".hidden.png", "notes.txt")))
+    found = find_photographs(tmp_path)
+    assert found.names == ("a", "b", "c")
+    assert len(found.shots) == 1
+
+
+def test_a_folder_a_camera(tmp_path: Path) -> None:
+    found = find_photographs(fill(tmp_path, "b/1.jpg", "a/2.jpg", "a/1.jpg", "c/1.jpg", "notes/x.txt"))
+    assert found.names == ("a", "b", "c")
+    assert list(found.files["a"]) == ["1", "2"]
+    assert found.shots == ("1", "2")
+
+
+@pytest.mark.parametrize(
+    ("files", "told"),
+    [
+        (("a.jpg", "b.jpg"), "2 photographs; at least 3"),
+        (("a.jpg", "b/1.jpg", "c/1.jpg"), "photographs beside folders"),
+        (("a.jpg", "a.png", "b.jpg", "c.jpg"), "holds a 2 times"),
+        (("a/1.jpg", "a/1.png", "b/1.jpg", "c/1.jpg"), "a holds 1 2 times"),
+        (("my head.jpg", "b.jpg", "c.jpg"), "'my head' may hold only"),
+        ((), "0 photographs"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, files: tuple[str, ...], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        find_photographs(fill(tmp_path / "photos", "readme.txt", *files))
+
+
+def test_what_is_no_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is no folder"):
+        find_photographs(tmp_path / "nowhere")

@@ -1,0 +1,25 @@
+"""Real photographs, and the studio's, without a board: against poses that others published, and against the truth."""
+
+import numpy as np
+import pytest
+
+from calibration.adjustment.gauge import image_distance
+from tests.benchmarks.scene_calibration import buddha, studio
+
+
+@pytest.mark.slow
+def test_the_buddhas_cameras_are_the_published_ones() -> None:
+    """Every second photograph at half its size; the published poses come from all of them at twice ours."""
+    found, agrees = buddha(every=2, size=0.5)
+    assert len(found.rig) >= 0.9 * 34
+    assert agrees.mean_px < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_thirty_views_of_the_studio_join() -> None:
+    """Lenses that differ by 3 % stand as one: a pixel at the subject is what silhouettes then refine."""
+    found, truth = studio(seed=1, views=30)
+    assert len(found.rig) >= 27
+    assert np.median(image_distance(found.rig, truth.subset(found.rig.names), scale=True)) < 1.0
+    assert found.scale.assumed

@@ -1,0 +1,86 @@
+"""The whole calibration of a scene: true, in millimetres, repeatable, and refused with names."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.adjustment.gauge import align_world
+from calibration.result import CalibrationRefused
+from calibration.scene.scene import calibrate_scene, judged
+from rig.errors import InputError
+from rig.formats.images import write_image
+from tests.support.textured_wedge import HEIGHT, WIDTH, solved, wedge_rig, write_photographs
+
+
+def test_the_rig_is_in_millimetres_and_in_the_world_frame() -> None:
+    found, truth = solved(), wedge_rig()
+    aligned = align_world(found.rig, truth)  # no scale: what is left is the tag's
+    for camera in truth:
+        there = camera.centre_world
+        assert np.linalg.norm(aligned[camera.name].centre_world - there) < 0.02 * np.linalg.norm(there)
+    front = found.rig["cam02"].centre_world
+    assert front[0] == pytest.approx(0.0, abs=1e-6)
+    assert front[2] > 300.0
+    assert found.rig["cam00"].centre_world[0] < front[0] < found.rig["cam04"].centre_world[0]
+    assert all(camera.covariance is not None for camera in found.rig)
+    assert (found.front, found.left_out, found.warnings) == ("cam02", {}, ())
+
+
+def test_it_is_repeatable(tmp_path: Path) -> None:
+    photos = write_photographs(tmp_path, wedge_rig())
+    one, other = (calibrate_scene(photos).document() for _ in range(2))
+    assert one == other
+    assert one["scale"]["assumed"]
+    assert any("ASSUMPTION" in warning for warning in one["warnings"])
+
+
+def test_shots_of_a_rig_share_its_cameras(tmp_path: Path) -> None:
+    """Another texture in each shot: nothing of one is in the other, and both place the same cameras."""
+    found = calibrate_scene(write_photographs(tmp_path, wedge_rig(), {"first": 0, "second": 1}), one_lens=True)
+    assert found.rig.names == wedge_rig().names
+    assert len(found.structure.points) > 1.5 * len(solved().structure.points)
+    assert found.figures()["rms_px"] < 0.3
+
+
+def test_views_that_do_not_join_are_named(tmp_path: Path) -> None:
+    photos = write_photographs(tmp_path, wedge_rig().subset(["cam00", "cam01", "cam02"]))
+    write_image(photos / "dark.png", np.full((HEIGHT, WIDTH), 20, np.uint8))
+    found = calibrate_scene(photos)
+    assert list(found.left_out) == ["dark"]
+    assert "only 0 distinct points" in found.left_out["dark"]
+    assert any(warning.startswith("left out: dark") for warning in found.warnings)
+    with pytest.raises(CalibrationRefused, match="the front camera dark: only 0"):
+        calibrate_scene(photos, front="dark")
+
+
+def test_too_few_views_are_refused_by_name(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for index in range(4):
+        write_image(tmp_path / f"noise{index}.png", rng.integers(0, 255, (120, 160), dtype=np.uint8))
+    with pytest.raises(CalibrationRefused, match=r"none of the 4 views join; noise0: .*noise1: .*noise2: .*noise3: "):
+        calibrate_scene(tmp_path)
+
+
+def test_faults_of_the_photographs_are_named(tmp_path: Path) -> None:
+    photos = write_photographs(tmp_path, wedge_rig().subset(["cam00", "cam01", "cam02"]))
+    with pytest.raises(InputError, match="'cam9' is none of the photographs'"):
+        calibrate_scene(photos, front="cam9")
+    (photos / "cam00.png").write_bytes(b"no picture")
+    write_image(photos / "cam01.png", np.zeros((50, 60), np.uint8))
+    with pytest.raises(InputError, match=r"cam00\.png is damaged"):
+        calibrate_scene(photos)
+    write_image(photos / "cam00.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(InputError, match="2 sizes"):
+        calibrate_scene(photos, one_lens=True)
+
+
+def test_half_of_the_views_must_join() -> None:
+    """Asked of a structure, for a scene that falls apart so is slow to draw."""
+    from calibration.scene.matching import Matches
+
+    structure = solved().structure
+    names = [*structure.rig.names, *(f"more{index}" for index in range(7))]
+    matches = Matches((), True, dict.fromkeys(names, (640, 480)), dict.fromkeys(names, 500), {}, 0)
+    with pytest.raises(CalibrationRefused, match="only 6 of 13 views join; more0"):
+        judged(structure, matches)

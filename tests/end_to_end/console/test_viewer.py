@@ -1,0 +1,113 @@
+"""The 3D view in a real browser, of balls whose colours and outlines are known."""
+
+import io
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect
+
+from tests.support.ball_results import RADIUS_MM
+from tests.support.browser import keep_screenshots, visit
+from tests.support.services import RunningService, await_state, packed_capture, running_service
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+# viridis at the nine places between which result.js steps linearly
+RAMP = 255 * np.array(
+    [[0.267, 0.005, 0.329], [0.283, 0.141, 0.458], [0.254, 0.265, 0.53], [0.207, 0.372, 0.553], [0.164, 0.471, 0.558],
+     [0.128, 0.567, 0.551], [0.267, 0.679, 0.48], [0.478, 0.821, 0.318], [0.993, 0.906, 0.144]]
+)  # fmt: skip
+PARTS = 255 * np.array([[0.9, 0.65, 0.5], [0.35, 0.25, 0.6]])  # skin and hair
+
+
+@pytest.fixture
+def heads(tmp_path: Path) -> Iterator[RunningService]:
+    """Two heads of Anna, one of Bert."""
+    with running_service(tmp_path / "data", work="tests.support.ball_results:work", console="true") as running:
+        client = httpx.Client(base_url=running.url, timeout=60)
+        sessions = {n: client.post("/v1/sessions", json={"label": n}).json()["id"] for n in ("Anna", "Bert")}
+        for seed, name in enumerate(("Bert", "Anna", "Anna")):
+            file = {"file": packed_capture(tmp_path, seed).read_bytes()}
+            capture = client.post("/v1/captures/uploads", files=file, data={"session": sessions[name]}).json()["id"]
+            job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+            await_state(client, job, ("succeeded",))
+        yield running
+
+
+def pixels(page: Page, half: float = 0.16) -> np.ndarray:
+    """Of the middle of the 3D view."""
+    shown = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), float)
+    height, width = shown.shape[:2]
+    reach = round(half * min(height, width))
+    return shown[height // 2 - reach : height // 2 + reach, width // 2 - reach : width // 2 + reach]
+
+
+def off_the_ramp(colours: np.ndarray) -> np.ndarray:
+    """How far colours lie from the legend's (levels)."""
+    steps = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(RAMP)])
+    return np.min(np.linalg.norm(colours.reshape(-1, 1, 3) - steps, axis=2), axis=1)
+
+
+def test_what_is_shown_is_what_the_files_hold(browser: Browser, heads: RunningService, screenshots: Path) -> None:
+    v = visit(browser, heads.url)
+    page = v.go("/result")
+    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    page.keyboard.press("u")
+    expect(page.locator(".view3d").get_by_text("Standard deviation")).to_be_visible()
+    page.wait_for_timeout(500)
+    # 2 of 255 are rounding of the colours and of their interpolation; light would add tens.
+    assert off_the_ramp(pixels(page)).max() < 6, "data are not lit"
+    page.keyboard.press("b")
+    page.wait_for_selector("canvas[data-loaded$=bust]", timeout=60_000)
+    page.keyboard.press("p")
+    expect(page.get_by_label("Parts")).to_contain_text("hair")
+    page.wait_for_timeout(500)
+    found = pixels(page).reshape(-1, 1, 3)
+    nearest = np.linalg.norm(found - PARTS, axis=2).min(axis=1)
+    # edges of 3 mm: a row of triangles between the parts is an eighth of the 40 mm that are looked at, at most
+    assert np.mean(nearest < 3) > 7 / 8
+    keep_screenshots(page, screenshots, "viewer-parts")
+    check_comparison(page)
+    check_look_through(page)
+    v.check_clean()
+
+
+def check_comparison(page: Page) -> None:
+    """Only the subject's own head is offered until others are asked for."""
+    options = page.get_by_label("Compare with").locator("option")
+    expect(options).to_have_count(2)
+    expect(options.nth(1)).to_contain_text("Anna")
+    page.locator("#strangers").check()
+    expect(options).to_have_count(3)
+    expect(options.nth(2)).to_contain_text("ANOTHER PERSON? Bert")
+    page.get_by_label("Compare with").select_option(index=2)
+    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=30_000)
+    page.get_by_label("Compare with").select_option("")
+
+
+def check_look_through(page: Page) -> None:
+    """The ball's outline lies where cam01 sees it: f = 30 px, the centre at (12, 12), 40 mm aside and 1 m away."""
+    page.keyboard.press("g")
+    page.locator("#through").select_option("cam01")
+    expect(page.get_by_alt_text("Photograph of cam01")).to_be_visible()
+    page.get_by_label("How much of the photograph").fill("0")
+    page.wait_for_function("document.querySelector('.view3d img').naturalWidth === 24")
+    page.evaluate("document.querySelector('.view3d img').style.visibility = 'hidden'")
+    page.wait_for_timeout(500)
+    shown = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), float)
+    height, width = shown.shape[:2]
+    scale = min(width, height) / 24
+    ball = shown[:, :, 0] > 60  # clay on a dark ground
+    rows, columns = np.nonzero(ball)
+    radius = 30 * RADIUS_MM / np.sqrt(1000**2 - RADIUS_MM**2) * scale
+    left, top = (width - 24 * scale) / 2, (height - 24 * scale) / 2
+    middle = np.array([left + scale * (12 + 30 * 0.04 + 0.5), top + scale * 12.5])
+    box = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+    # a pixel of the screen at each side; off the axis by 1.2 of 30 px a ball's outline is an ellipse longer by 0.1 %
+    np.testing.assert_allclose(box.mean(axis=0), middle, atol=1.5)
+    np.testing.assert_allclose((box[1] - box[0]) / 2, radius, atol=1.5)

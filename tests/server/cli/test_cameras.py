@@ -1,0 +1,54 @@
+"""``eigenhead calibrate --from scene``: what it writes and says, what it refuses, and which options go together."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rig.formats.cameras_json import read_rig
+from tests.server.cli.test_main import run
+from tests.support.textured_wedge import wedge_rig, write_photographs
+
+
+def test_photographs_become_cameras_and_a_page(tmp_path: Path) -> None:
+    photos = write_photographs(tmp_path / "photos", wedge_rig().subset(["cam00", "cam01", "cam02"]))
+    out = tmp_path / "new" / "cameras.json"
+    done = run("calibrate", str(photos), "--from", "scene", "--out", str(out), "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert set(told["figures"]["cameras"]) == {"cam00", "cam01", "cam02"}
+    assert {"rms_px", "used_share"} <= set(told["figures"])
+    assert told["scale"]["assumed"]
+    assert "ASSUMPTION" in done.stderr
+    assert all(camera.covariance is not None for camera in read_rig(out))
+    assert "3 of 3 views joined" in out.with_suffix(".html").read_text()
+
+
+def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
+    for name in "abc":
+        (tmp_path / f"{name}.png").write_bytes(b"")
+    (tmp_path / "scale.json").write_text(json.dumps({"cameras": ["a", "d"], "distance_mm": -1}))
+    scale = str(tmp_path / "scale.json")
+    done = run("calibrate", str(tmp_path), "--from", "scene", "--scale", scale, "--out", str(tmp_path / "cameras.json"))
+    assert done.returncode == 1
+    assert "distance_mm is -1" in done.stderr
+    assert "cameras names 'd'" in done.stderr
+    assert not (tmp_path / "cameras.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ((), "--board"),
+        (("--from", "sky"), "'sky' is none of board, scene"),
+        (("--from", "scene", "--lenses", "two"), "'two' is none of one, each"),
+        (("--from", "scene", "--board", "{file}"), "is for a board"),
+        (("--scale", "{file}"), "is for --from scene"),
+    ],
+)
+def test_options_that_do_not_go_together_are_wrong_usage(tmp_path: Path, options: tuple[str, ...], told: str) -> None:
+    (tmp_path / "file").write_text("")
+    given = [option.format(file=tmp_path / "file") for option in options]
+    done = run("calibrate", str(tmp_path), "--out", str(tmp_path / "cameras.json"), *given)
+    assert done.returncode == 2
+    assert told in done.stderr

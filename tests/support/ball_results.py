@@ -1,0 +1,48 @@
+"""Work that writes a ball for a head, where the pages around a result are tested: every colour and outline is known."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from rig.atomic_write import write_atomically
+from rig.formats.glb import write_glb
+from rig.formats.ply import write_ply
+from rig.mesh import Mesh
+from server.tasks.child import Bench, Report
+
+RADIUS_MM = 90.0
+QUALITY_MOST_MM = 2.0  # at the top of the ball; 1.0 at the bottom
+
+
+def work(
+    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """A grey ball about the world's origin; its standard deviation grows with its height; the upper half of the bust is
+    hair."""
+    folder, round_mesh = Path(result), trimesh.creation.icosphere(subdivisions=5, radius=RADIUS_MM)
+    ball = Mesh(np.asarray(round_mesh.vertices), np.asarray(round_mesh.faces, np.int32))
+    normals = ball.vertices / RADIUS_MM
+    colours = np.full((len(ball.vertices), 3), 128, np.uint8)
+    height = (normals[:, 1] + 1) / 2
+    views = np.ones(len(ball.vertices), np.uint8)
+    quality = (1 + (QUALITY_MOST_MM - 1) * height).astype(np.float32)
+    for name in ("head", "bust"):
+        part = None if name == "head" else np.where(normals[:, 1] > 0, 2, 1).astype(np.uint8)
+        write_ply(
+            folder / f"{name}.ply",
+            ball,
+            normals=normals,
+            colours=colours,
+            quality=quality,
+            views=views,
+            part=part,
+            comments=["unit mm"],
+        )
+        write_glb(folder / f"{name}.glb", Mesh(ball.vertices, ball.faces, colours), normals=normals, colours=colours)
+    place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
+    document = {"model": {"name": "ball", "sha256": "0"}, "method": "contour", "world_from_head": place}
+    write_atomically(folder / "report.json", json.dumps(document).encode())
+    return {}
