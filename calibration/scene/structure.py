@@ -89,7 +89,7 @@ def _start_lenses(path: Path, lens: Float[np.ndarray, " 5"] | None) -> None:
     database = pycolmap.Database.open(path)
     try:
         for camera in database.read_all_cameras():
-            camera.params = np.array([lens[0], *camera.params[1:3], *lens[3:]])
+            camera.params = [float(value) for value in (lens[0], *camera.params[1:3], *lens[3:])]
             database.update_camera(camera)
     finally:
         database.close()
