@@ -76,4 +76,5 @@ def is_no_known_failure(record: logging.LogRecord) -> bool:
         return True
     from dbos import error as dbos_error  # 2 s, and a process that logs such a line has it
 
-    return not isinstance(error, EigenheadError | dbos_error.DBOSWorkflowCancelledError)
+    cancelled = (dbos_error.DBOSWorkflowCancelledError, dbos_error.DBOSAwaitedWorkflowCancelledError)
+    return not isinstance(error, (EigenheadError, *cancelled))

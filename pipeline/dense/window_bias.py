@@ -35,7 +35,9 @@ def windowed_height(
     """How far (mm, along the normal) the mean of the surface over a window lies above each vertex; sheets that face
     another way do not count. 0 where nobody asks: only the ``wanted`` ones are found (all of them, if None)."""
     height_mm, cells = np.zeros(len(vertices)), sorted_into_cells(vertices, REACH_MM)
-    chosen = np.ones(len(vertices), bool) if wanted is None else wanted
+    chosen = (
+        np.ones(len(vertices), bool) if wanted is None else wanted.copy()
+    )  # a model's own is read-only: another type
     surface = (np.ascontiguousarray(vertices), np.ascontiguousarray(normals), chosen)
     given = (*surface, *cells, WINDOW_MM, REACH_MM, height_mm)
     in_threads(len(vertices), lambda first, last: windowed_heights(*given, first, last))

@@ -57,7 +57,7 @@ def overlay(
 
 def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
     """Each pixel moved towards the parts' colours by their probabilities."""
-    own = box_around(parts.any(axis=2), 0)
+    own = box_around(np.asarray(parts.any(axis=2)), 0)
     share, out = TINT * parts[own], image.copy()
     colours = np.array(list(PART_COLOURS.values()), np.float32)
     out[own] = np.rint(out[own] * (1.0 - share.sum(axis=2, keepdims=True)) + share @ colours).astype(np.uint8)

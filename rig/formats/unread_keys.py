@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from rig.formats.cameras_json import FORMAT
 from rig.recorded_lens import COEFFICIENTS
 
 READ = {
@@ -35,7 +36,7 @@ def unread_keys(path: Path) -> tuple[str, ...]:
 
 
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[str, ...]:
-    """The same of a decoded file. What many cameras have alike is said once, with their number."""
+    """The same of a decoded file of this format. What many cameras have alike is said once, with their number."""
     counts = Counter(_unread(document))
     told = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:
@@ -49,7 +50,7 @@ def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[str, .
 
 def _unread(document: Any) -> Iterator[tuple[str, str]]:
     """Place and name of each key."""
-    if not isinstance(document, Mapping):
+    if not isinstance(document, Mapping) or document.get("format") != FORMAT:
         return
     yield from _beside(document, "")
     cameras = document.get("cameras")

@@ -52,6 +52,8 @@ def rig_of(capture: Path) -> Rig:
 def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
     """The photograph without the lens's distortion, at most ``WIDTH_MOST`` wide."""
     lens = camera.intrinsics
+    if camera.recorded is not None:
+        image = camera.recorded.undistort(image, lens.matrix(), smooth=True)
     factor = min(1.0, WIDTH_MOST / lens.width)
     size = (round(lens.width * factor), round(lens.height * factor))
     wanted = np.diag([factor, factor, 1.0]) @ lens.matrix()

@@ -4,6 +4,7 @@ attributes of results. Each asks who the browser's session is, as the API asks f
 import asyncio
 import json
 import threading
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -142,11 +143,13 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
 
 @pages.get("/console/jobs/{job_id}/cameras")
 def cameras(who: Reader, job_id: str) -> Response:
-    """The cameras that took the pictures, in the head's frame; none where the capture was removed."""
-    service = who[0]
-    capture, _ = _capture_files(service, job_id)
-    report = json.loads((_result_folder(service, job_id) / "report.json").read_text())
-    found = camera_views(rig_of(capture), report) if capture.is_dir() else []
+    """The cameras that took the pictures, in the head's frame; none where the capture was removed, or the result has no
+    report that places the head."""
+    service, found = who[0], []
+    report = _result_folder(who[0], job_id) / "report.json"
+    with suppress(NotFound, FileNotFoundError, KeyError):
+        capture, _ = _capture_files(service, job_id)
+        found = camera_views(rig_of(capture), json.loads(report.read_text()))
     return JSONResponse(found, headers={"Cache-Control": "no-store"})
 
 

@@ -142,16 +142,18 @@ class Page(Element):
             await self._do(arguments.pop("name"), arguments)
 
     async def _do(self, name: str, event: Mapping[str, object]) -> None:
+        done = False
         try:
             action = UNDO if name == "undo" else self.actions[name]
             said = await anyio.to_thread.run_sync(self._run, action, event, limiter=_threads)
             if said:
                 self.frame.say("done", said)
+            done = True
         except Exception as error:
             problem = as_problem(error)
             self.frame.say("fault", problem.detail, problem.errors)
         await self.refresh()
-        self.run_method("acted", name)
+        self.run_method("acted", name, done)  # a form that was refused keeps what was typed
 
     def _run(self, action: Action, event: Mapping[str, object]) -> str | None:
         current = caller_of(self.service, {"key_id": self.caller.key})

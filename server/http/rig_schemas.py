@@ -1,6 +1,6 @@
 """Documents on the wire of what the rig's pictures are worth."""
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from server.http.schemas import Answer, Moment, Received
 
@@ -52,4 +52,12 @@ class PlatesList(Answer):
 
 
 class UsePlates(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"version": "20261122T215052123456Z"}]})
+
     version: str = Field(max_length=64, description="an id of GET /v1/rig/background")
+
+
+class BackgroundOut(Answer):
+    cameras: list[str]
+    plates: int
+    note: str

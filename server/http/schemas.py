@@ -13,8 +13,6 @@ Text = Annotated[str, Field(max_length=500)]
 Moment = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
 JobSettings = Annotated[JsonObject, WithJsonSchema(SETTINGS)]
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
-
-
 EXAMPLE_ID = "0198c0de" + 20 * "0"
 
 
@@ -50,9 +48,7 @@ class NewCapture(Received):
 
 
 class NewImport(Received):
-    model_config = ConfigDict(
-        json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz", "label": "Anna"}]}
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz"}]})
 
     url: str = Field(max_length=2000, description="of an archive of a capture, at a server that the operator allowed")
     session: Id | None = None
@@ -89,8 +85,6 @@ class NewFeatures(Received):
 
 
 class JobWebhook(Received):
-    """Told when this one job ends."""
-
     url: str = Field(pattern="^https?://", max_length=2000, description="at a server that the operator allowed")
     secret: str | None = Field(
         None, pattern="^whsec_[A-Za-z0-9+/]{32,}={0,2}$", description="signs the messages (standardwebhooks.com)"
@@ -394,9 +388,3 @@ class Lights(Received):
     outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
         max_length=4, description="light outputs of the trigger box that are on during a shot"
     )
-
-
-class BackgroundOut(Answer):
-    cameras: list[str]
-    plates: int
-    note: str

@@ -240,7 +240,7 @@ class Jobs:
         try:
             return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
         except FileNotFoundError as error:
-            raise NotFound("log of the job", job_id, "it has not begun, or was cancelled") from error
+            raise NotFound("log of the job", job_id, "it has not begun") from error
 
     def without_result(self) -> list[str]:
         """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""

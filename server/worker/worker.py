@@ -131,7 +131,6 @@ class Worker:
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
-                    log.info("job cancelled")
                     raise
                 worker.settle(job_id, "succeeded", request.get("webhook"))
                 return files
@@ -192,6 +191,8 @@ class Worker:
                 self._durations.learn(chosen, progress.finish())
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, Cancelled):
+                log.info("job cancelled")  # here: the engine ends a cancelled workflow before its own handlers run
             raise self._failure(error) from error
         return name
 

@@ -1,7 +1,7 @@
 """Seconds of a job's stages, from image files to result files, warm: medians and least of several rounds; peak memory.
 
 python -m tests.benchmarks.image_stages --detail photo --surface head --json
-python -m tests.benchmarks.image_stages --rounds 2    # the default job
+python -m tests.benchmarks.image_stages --rounds 2 --steps depth    # the default job
 
 ``segmentation`` is eleven 1024 x 768 images, ``texture`` colours the model's full mesh from them. ``total`` is from
 opening the first file to the last one written. Processor seconds are those of all threads, which a busy machine
@@ -14,6 +14,7 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,17 @@ from rig.render.renderer import Renderer
 class Meter:
     """Seconds by the clock and of the processor, and peak memory (MB), stage by stage: a job's ``report``."""
 
-    def __init__(self) -> None:
+    def __init__(self, steps: Collection[str] = ()) -> None:
+        self.steps = steps  # stages whose shares have rows of their own: what follows each
         self.wall, self.cpu, self.peak_mb = dict[str, float](), dict[str, float](), dict[str, float]()
         self._stage, self._since = "", (0.0, 0.0)
 
     def __call__(self, stage: str, share: float) -> None:
-        if share == 0.0 and stage != self._stage:
-            self.enter(stage)
+        if share and stage not in self.steps:
+            return
+        row = f"{stage} {share:.2f}" if share else stage
+        if row != self._stage:
+            self.enter(row)
 
     def enter(self, stage: str) -> None:
         """What follows belongs to ``stage``; nothing does where that is empty."""
@@ -59,9 +64,11 @@ def _forget_peak() -> None:
     Path("/proc/self/clear_refs").write_text("5")  # proc(5): resets the peak resident set size
 
 
-def one_round(capture_folder: Path, out: Path, model: HeadModel, settings: Settings, renderer: Renderer) -> Meter:
+def one_round(
+    capture_folder: Path, out: Path, model: HeadModel, settings: Settings, renderer: Renderer, steps: Collection[str]
+) -> Meter:
     """A job from its files to its results."""
-    meter = Meter()
+    meter = Meter(steps)
     meter.enter("read")
     capture, rig = read_capture(capture_folder)
     result = reconstruct(capture, rig, model, settings, renderer=renderer, report=meter)
@@ -80,13 +87,14 @@ def main() -> None:
     parser.add_argument("--detail", choices=("span", "kernel", "photo", "fine"), help="the default where none is asked")
     parser.add_argument("--surface", choices=("head", "bust", "both"), help="both where nothing is asked")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--steps", action="append", default=[], help="stage whose steps have rows, as depth or bust")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     model, settings = load_model(), replace(Settings(), detail=arguments.detail or Settings().detail)
     if arguments.surface:
         settings = replace(settings, outputs=replace(settings.outputs, surface=arguments.surface))
     with Renderer.create() as renderer, tempfile.TemporaryDirectory() as scratch:
-        given = (arguments.capture, Path(scratch), model, settings, renderer)
+        given = (arguments.capture, Path(scratch), model, settings, renderer, arguments.steps)
         rounds = [one_round(*given) for _ in range(1 + arguments.rounds)][1:]  # the first reads what was compiled
     stages = list(rounds[0].wall)
     found: dict[str, object] = {"rounds": arguments.rounds, "detail": arguments.detail or "default"}

@@ -42,7 +42,11 @@ def test_lines_of_libraries_are_json_too(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_a_known_failure_leaves_no_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     set_up(as_json=False)
-    for error in (InputError("capture", ["cam00 sees nobody"]), dbos_error.DBOSWorkflowCancelledError("cancelled")):
+    for error in (
+        InputError("capture", ["cam00 sees nobody"]),
+        dbos_error.DBOSWorkflowCancelledError("cancelled"),
+        dbos_error.DBOSAwaitedWorkflowCancelledError("cancelled"),
+    ):
         logging.getLogger("dbos").error("Exception encountered in background workflow:", exc_info=error)
     assert capsys.readouterr().err == ""
 

@@ -162,10 +162,13 @@ def run_tests(folder: Path, tests: list[str], patience_s: float) -> int:
         sys.path[:] = [str(folder), *(place for place in sys.path if Path(place or ".").resolve() != ROOT)]
         for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
             del sys.modules[name]
-        quiet = os.open(os.devnull, os.O_WRONLY)
+        ended, quiet = 1, os.open(os.devnull, os.O_WRONLY)
         os.dup2(quiet, 1)
         os.dup2(quiet, 2)
-        os._exit(int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests])))
+        try:
+            ended = int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]))
+        finally:
+            os._exit(ended)
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         ended, status = os.waitpid(pid, os.WNOHANG)
@@ -194,7 +197,6 @@ def main() -> None:
     every = [mutant for module in arguments.modules for mutant in mutants_of(module)]
     drawn = random.Random(arguments.seed).sample(every, min(arguments.count, len(every)))
     import cv2  # noqa: F401  before the forks: what every one of them needs
-    import hypothesis  # noqa: F401
     import numba  # noqa: F401
     import pytest  # noqa: F401
     import scipy.ndimage
@@ -205,7 +207,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="eigenhead-mutants-") as scratch:
         folder = Path(scratch)
         copied(folder)
-        for mutant in sorted(drawn, key=lambda mutant: (mutant.module, mutant.line)):
+        for mutant in drawn:
             tests = LOOPS[mutant.module]
             if mutant.module not in patience_s:
                 began = time.monotonic()
@@ -214,10 +216,9 @@ def main() -> None:
                 patience_s[mutant.module] = max(LEAST_S, 5 * (time.monotonic() - began))
             is_dead = is_noticed(mutant, folder, tests, patience_s[mutant.module])
             noticed += is_dead
-            if not is_dead:
-                told = f"survived {mutant.module}:{mutant.line}\n-  {mutant.before}\n+  {mutant.after}\n"
-                sys.stdout.write(told)
-                sys.stdout.flush()
+            told = f"{'noticed ' if is_dead else 'SURVIVED'} {mutant.module}:{mutant.line}\n"
+            sys.stdout.write(told if is_dead else f"{told}-  {mutant.before}\n+  {mutant.after}\n")
+            sys.stdout.flush()
     figures = {"mutants": len(every), "tried": len(drawn), "noticed": noticed}
     sys.stdout.write(json.dumps({"figures": figures}) + "\n")
     sys.exit(noticed < KILLED_LEAST * len(drawn))

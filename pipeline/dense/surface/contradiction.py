@@ -52,14 +52,15 @@ def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray
     """Pixels in and next to solid blocks, of those connected ones that reach farther beyond the outline than windows
     make anything wider."""
     height, width = outline_px.shape
-    count, labels = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
+    count, found = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
+    labels = np.asarray(found, np.int32)
     middle = BLOCK // 2
     rows, columns = (
         np.minimum(middle + BLOCK * np.arange(n), size - 1)
         for n, size in zip(solid.shape, (height, width), strict=True)
     )
     farthest = ndimage.maximum(np.where(solid, outline_px[np.ix_(rows, columns)], 0.0), labels, np.arange(count))
-    wrong = np.asarray(farthest)[labels] > WIDENED_PX
+    wrong = np.asarray(farthest)[np.asarray(labels, np.int32)] > WIDENED_PX
     return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]
 
 

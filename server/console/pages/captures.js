@@ -1,17 +1,21 @@
 // Sessions and captures at the left, the pictures of the chosen one at the right.
 import { Outline, Verdict, checksOf, faultsOf, verdictTag } from "/console/static/verdict.js";
-import { clock, keepSession, openSession, send, sessionName, size } from "/console/static/words.js";
+import { clock, keepAddress, keepSession, openSession, send, sessionName, size } from "/console/static/words.js";
 
 export default {
   mixins: [checksOf],
   components: { Outline, Verdict },
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ chosen: null, outlines: false, drawing: 0, large: null, removal: null, over: false, uploads: [], busy: "", session: openSession(), form: null, erasing: false, draft: {}, writing: false, method: "", model: "" }),
+  data: () => ({ chosen: new URLSearchParams(location.search).get("capture"), sought: new URLSearchParams(location.search).get("find") || "", outlines: false, drawing: 0, large: null, removal: null, over: false, uploads: [], busy: "", session: openSession(), form: null, erasing: false, draft: {}, writing: false, method: "", model: "" }),
   computed: {
     sessions() { return this.state.sessions || []; },
     open() { return this.sessions.find((s) => s.id === this.session) || null; },
-    captures() { return (this.state.captures || []).filter((c) => !this.open || c.session === this.open.id); },
+    captures() {
+      const words = this.sought.toLowerCase().split(/\s+/).filter(Boolean);
+      const told = (c) => [c.label, c.expression, this.name(this.sessions.find((s) => s.id === c.session)), c.verdict, c.source, c.id, c.job?.state].filter(Boolean).join(" ").toLowerCase();
+      return (this.state.captures || []).filter((c) => (!this.open || c.session === this.open.id) && words.every((word) => told(c).includes(word)));
+    },
     models() { return this.state.models || []; },
     current() { return this.captures.find((c) => c.id === this.chosen) || this.captures[0] || null; },
   },
@@ -22,7 +26,8 @@ export default {
       else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
     }, immediate: true },
     session(id) { keepSession(id); this.erasing = false; this.large = null; },
-    "current.id": { handler(id) { this.readChecks(id); }, immediate: true },
+    "current.id": { handler(id) { this.readChecks(id); if (id) this.keepAddress(); }, immediate: true },
+    sought() { this.keepAddress(); },
     current: { handler(c) { if (!this.writing) this.draft = c ? { label: c.label, expression: c.expression, session: c.session || "" } : {}; }, immediate: true },
   },
   template: `
@@ -63,6 +68,7 @@ export default {
             <div v-if="!u.done" class="bar" role="progressbar" :aria-valuenow="Math.round(100 * u.share)" aria-valuemin="0" aria-valuemax="100" :aria-label="'Upload of ' + u.name"><i :style="{ width: 100 * u.share + '%' }"></i></div>
             <template v-if="u.detail"><p class="fault">{{ u.detail }}</p><ul class="faults scroll" style="max-height: 14rem"><li v-for="(f, i) in u.errors" :key="i">{{ f }}</li></ul></template>
           </div>
+          <input v-model="sought" id="find" type="search" placeholder="Find: label, session, verdict, id" aria-label="Find captures">
           <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures">
             <button v-for="c in captures" :key="c.id" class="row-button" :aria-current="current && c.id === current.id" @click="chosen = c.id">
               <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
@@ -73,7 +79,7 @@ export default {
         </div>
         <div class="panel pad scroll" style="position: relative" tabindex="0" role="region" aria-label="Pictures">
           <div v-if="!state.loading && !current" class="empty" style="height: 100%; align-content: center">
-            <h2>{{ open ? 'No captures in this session yet' : 'No captures yet' }}</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
+            <h2>{{ sought ? 'No capture matches' : open ? 'No captures in this session yet' : 'No captures yet' }}</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
             <a class="b main-action" href="/">Go to the rig</a></div>
           <div v-if="removal && current && removal.id === current.id" class="panel pad stack small" role="alertdialog" aria-label="Remove the capture" id="removal" style="border-color: var(--warn); margin-bottom: .7rem">
             <p><strong>Remove</strong> takes the {{ removal.pictures }} pictures with clean plates and caches ({{ size(removal.bytes) }}); it can be taken back for 10 s. <strong v-if="removal.heads.length" class="warn">{{ removal.heads.length }} {{ removal.heads.length === 1 ? 'head' : 'heads' }} ({{ size(removal.head_bytes) }}) with photographs of the face in the overlays would stay.</strong><span v-else>No head was made of it.</span></p>
@@ -111,10 +117,14 @@ export default {
       if (answer.ok) this.removal = { id, ...(await answer.json()) };
     },
     act(name, id, more) { this.busy = name; this.$emit("act", { name, id, ...more }); },
-    acted() { this.busy = ""; },
+    acted(name, done) {
+      this.busy = "";
+      if (name === "new_session" && done) this.form = null;
+    },
+    keepAddress() { keepAddress({ capture: this.current?.id, find: this.sought }); },
     name(session) { return sessionName(session, this.sessions); },
     count(id) { return (this.state.captures || []).filter((c) => c.session === id).length; },
-    begin() { this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) }; this.act("new_session", "", this.form); this.form = null; },
+    begin() { this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) }; this.act("new_session", "", this.form); },
     tag(c) {
       if (!c.job) return { text: "new", kind: "" };
       if (c.job.state === "running") return { text: `${Math.round(100 * c.job.progress)} %`, kind: "accent" };

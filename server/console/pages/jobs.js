@@ -1,5 +1,5 @@
 // The queue at the left, one job at the right.
-import { clock, fixed, span, stageWords } from "/console/static/words.js";
+import { clock, fixed, keepAddress, span, stageWords } from "/console/static/words.js";
 
 const MOSTLY = 0.25; // of the rim: beyond it hair or clothes hide the face, and the residual says nothing
 const POOR_PX = 3.0; // contour residual from which a camera is worth a look
@@ -7,14 +7,24 @@ const POOR_PX = 3.0; // contour residual from which a camera is worth a look
 export default {
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ form: null, busy: "", show: "" }),
+  data: () => ({ form: null, busy: "", show: "", sought: new URLSearchParams(location.search).get("find") || "" }),
+  watch: {
+    "job.id"() { this.keepAddress(); }, sought() { this.keepAddress(); },
+  },
   computed: {
     jobs() { return this.state.jobs || []; },
+    shown() { // running ones first, then the queue in its order, then what ended, newest first
+      const words = this.sought.toLowerCase().split(/\s+/).filter(Boolean);
+      const told = (j) => [j.capture, j.state, j.id, j.model, j.settings.method || "contour", j.settings.detail].filter(Boolean).join(" ").toLowerCase();
+      const found = this.jobs.filter((j) => words.every((word) => told(j).includes(word)));
+      const of = (...states) => found.filter((j) => states.includes(j.state));
+      return [...of("running"), ...of("queued").sort((a, b) => (this.before(a, b) ? -1 : 1)), ...of("succeeded", "failed", "cancelled")];
+    },
     job() { return this.jobs.find((j) => j.id === this.state.detail?.id) || null; },
     active() { return this.job && ["queued", "running"].includes(this.job.state); },
     waiting() {
       if (this.job.notice) return this.job.notice;
-      const before = this.jobs.filter((j) => ["queued", "running"].includes(j.state) && j.created < this.job.created).length;
+      const before = this.jobs.filter((j) => j.state === "running" || (j.state === "queued" && this.before(j, this.job))).length;
       return before ? `Waiting, ${before} ${before === 1 ? "job" : "jobs"} before it` : "Waiting for the worker";
     },
     sheet() { return `/console/jobs/${this.job.id}/contact_sheet.png`; },
@@ -34,7 +44,9 @@ export default {
         </template></header>
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
         <div class="panel scroll" tabindex="0" role="region" aria-label="List of jobs">
-          <button v-for="j in jobs" :key="j.id" class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="$emit('choose', { job: j.id }); form = null">
+          <input v-model="sought" id="find" type="search" placeholder="Find: label, state, solver, id" aria-label="Find jobs" style="width: calc(100% - 1rem); margin: .5rem">
+          <p v-if="sought && !shown.length" class="muted small" style="padding: .5rem .75rem">No job matches.</p>
+          <button v-for="j in shown" :key="j.id" class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="$emit('choose', { job: j.id }); form = null">
             <span class="line"><strong class="cut grow">{{ j.capture || clock(j.captured) }}</strong><span class="tag" :class="kind(j)">{{ j.state }}</span></span>
             <span class="bar" role="progressbar" :aria-label="'Progress of ' + j.id.slice(-6)" :aria-valuenow="Math.round(100 * j.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * j.progress + '%' }"></i></span>
             <span class="small muted line"><span class="grow cut">{{ j.state === 'running' ? stageWords(j.stage) : clock(j.created) }}<template v-if="j.restart_of"> &middot; after {{ j.restart_of.slice(-6) }}</template></span>
@@ -83,8 +95,15 @@ export default {
     took(j) { return j.started && j.finished ? span((new Date(j.finished) - new Date(j.started)) / 1000) : ""; },
     overlay(name) { return `/console/jobs/${this.job.id}/overlays/${name}.png`; },
     act(name) { this.busy = name; this.$emit("act", { name, id: this.job.id }); },
-    acted() { this.busy = ""; },
+    acted(name, done) {
+      this.busy = "";
+      if (name === "restart" && done) this.form = null;
+    },
+    before(one, other) { // in the queue: lower priority numbers first, then who came first
+      return (one.priority - other.priority || one.created.localeCompare(other.created) || one.id.localeCompare(other.id)) < 0;
+    },
+    keepAddress() { keepAddress({ job: this.job?.id, find: this.sought }); },
     open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { method, model: "", detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
-    restart() { this.busy = "restart"; this.$emit("act", { name: "restart", id: this.job.id, ...this.form }); this.form = null; },
+    restart() { this.busy = "restart"; this.$emit("act", { name: "restart", id: this.job.id, ...this.form }); },
   },
 };

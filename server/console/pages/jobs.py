@@ -99,7 +99,8 @@ class ListedJob:
 class JobsPage(Page, component="jobs.js"):
     def look(self) -> JobsShown:
         state: JobsState = shared.get("jobs", 0.3, lambda: jobs_state(self.service))
-        chosen = self.choice.get("job") or (state["jobs"][0]["id"] if state["jobs"] else None)
+        first = next((job for job in state["jobs"] if job["state"] == "running"), next(iter(state["jobs"]), None))
+        chosen = self.choice.get("job") or (first["id"] if first else None)
         known = next((job["id"] for job in state["jobs"] if job["id"] == chosen), None)
         return {**state, "detail": None if known is None else job_detail(self.service, known)}
 
@@ -210,5 +211,5 @@ JobsPage.actions = {
 
 
 @ui.page("/jobs")
-async def jobs_page() -> RedirectResponse | None:
-    return await show("jobs", JobsPage)
+async def jobs_page(job: str = "") -> RedirectResponse | None:
+    return await show("jobs", JobsPage, job=job or None)

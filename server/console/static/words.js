@@ -34,6 +34,11 @@ export function stageWords(stage) { return STAGES[stage] || stage; }
 // The session that the operator works in, kept for the pages of this browser tab.
 export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
 export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }
+// What is chosen and sought stands in the address, so that a reload or a bookmark brings it back.
+export function keepAddress(fields) {
+  const kept = new URLSearchParams(Object.entries(fields).filter(([, value]) => value));
+  history.replaceState(history.state, "", location.pathname + (kept.size ? `?${kept}` : ""));
+}
 // Two sessions of one name are told apart by when they began.
 export function sessionName(session, all) {
   if (!session) return "";

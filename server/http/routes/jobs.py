@@ -126,8 +126,7 @@ def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
     response_class=PlainTextResponse,
 )
 def get_job_log(service: ServiceOf, caller: Reader, job_id: str) -> str:
-    """What its workers said of this job: stages, warnings, how it ended. 404 before it begins and once it was
-    cancelled."""
+    """What its workers said of this job: stages, warnings, how it ended. 404 before it begins."""
     return service.jobs.log(job_id)
 
 

@@ -10,9 +10,8 @@ from fastapi.responses import StreamingResponse
 
 from server.errors import Unavailable
 from server.http.auth import ServiceOf, require
-from server.http.rig_schemas import PlatesList, PlatesOut, UsePlates
+from server.http.rig_schemas import BackgroundOut, PlatesList, PlatesOut, UsePlates
 from server.http.schemas import (
-    BackgroundOut,
     CameraSettingsEdit,
     CameraSettingsOut,
     Lights,

@@ -9,8 +9,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from rig.formats.archive import pack_folder
-from tests.support.browser import keep_screenshots, visit
-from tests.support.services import RunningService, packed_capture, small_capture, uploaded_capture
+from tests.support.browser import keep_screenshots, violations, visit
+from tests.support.services import RunningService, packed_capture, running_service, small_capture, uploaded_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -132,3 +132,23 @@ def test_a_session_is_begun_filled_and_erased(
     assert httpx.get(service.url + "/v1/jobs").json()["jobs"] == []
     assert len([*(service.data / "cache/captures").iterdir()]) == 1
     v.check_clean()
+
+
+def test_consent_is_asked_for_before_the_first_shot(browser: Browser, tmp_path: Path) -> None:
+    with running_service(tmp_path / "data", worker=False, console="true", ask_consent="true") as asking:
+        v = visit(browser, asking.url)
+        page = v.go("/")
+        expect(page.locator("article.tile")).to_have_count(11)
+        page.keyboard.press("Space")
+        dialog = page.get_by_role("dialog")
+        expect(dialog).to_contain_text("Consent comes before the first shot")
+        assert violations(page) == []
+        dialog.get_by_label("Subject").fill("Anna")
+        dialog.get_by_label("Consent").fill("signed 2026-11-22")
+        dialog.get_by_role("button", name="Go on").click()
+        expect(page.locator(".countdown")).to_be_visible(timeout=20_000)
+        page.keyboard.press("Escape")
+        expect(page.locator("#session option:checked")).to_have_text("Anna")
+        session = httpx.get(asking.url + "/v1/sessions").json()["sessions"][0]
+        assert (session["label"], session["consent"]) == ("Anna", "signed 2026-11-22")
+        v.check_clean()

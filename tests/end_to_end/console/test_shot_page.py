@@ -73,7 +73,7 @@ def test_plates_are_judged_and_a_shot_is_kept_retaken_or_reconstructed(
     studio.clear()
     page.keyboard.press("r")
     expect(page.locator(".countdown")).to_be_visible(timeout=10_000)
-    expect(page.get_by_text("Removed: capture")).to_be_visible()
+    expect(page.get_by_text("Removed: the 4 pictures of capture")).to_be_visible()
     expect(page.locator("[data-verdict=good]")).to_be_visible(timeout=60_000)
     keep_screenshots(page, screenshots, "shot-good")
     page.keyboard.press("Enter")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Page, expect
 
 from rig.formats.archive import pack_folder
 from tests.support.browser import LONG_MS, keep_screenshots, live_rate, visit
@@ -47,13 +47,41 @@ def test_a_job_is_cancelled_and_restarted_with_other_settings(
     expect(page.locator("[data-state=cancelled]")).to_have_count(1, timeout=10_000)
     page.locator("#restart").click()
     page.get_by_label("Front camera").fill("fail")
+    page.get_by_label("Further settings").fill("{")
+    page.get_by_role("button", name="Queue the new job").click()
+    expect(page.get_by_text("the further settings are no JSON")).to_be_visible(timeout=10_000)
+    expect(page.get_by_label("Front camera")).to_have_value("fail")  # a refused form keeps what was typed
+    page.get_by_label("Further settings").fill("")
     page.get_by_role("button", name="Queue the new job").click()
     expect(page.locator("[data-state=failed]")).to_have_count(1, timeout=30_000)
     expect(page.get_by_text("cam01 sees nobody")).to_be_visible()
     newest = httpx.get(service.url + "/v1/jobs").json()["jobs"][0]
     assert newest["settings"] == {"front": "fail"}
     assert newest["restart_of"] is not None
+    check_list(page, service, capture)
     v.check_clean()
+
+
+def check_list(page: Page, service: RunningService, capture: str) -> None:
+    """The running job lies on top, whatever came after it; what is sought and chosen outlives a reload."""
+    jobs = service.url + "/v1/jobs"
+    running = httpx.post(jobs, json={"capture_id": capture, "settings": {"front": "long"}}).json()["id"]
+    expect(page.locator(f"[data-job='{running}'][data-state=running]")).to_have_count(1, timeout=30_000)
+    queued = [
+        httpx.post(jobs, json={"capture_id": capture, "priority": priority}).json()["id"] for priority in (100, 50)
+    ]
+    expect(page.locator("[data-job]")).to_have_count(5, timeout=10_000)
+    listed = [row.get_attribute("data-job") for row in page.locator("[data-job]").all()]
+    assert listed[:3] == [running, *reversed(queued)], "then the queue in its order"
+    page.locator(f"[data-job='{queued[0]}']").click()
+    expect(page.get_by_text("Waiting, 2 jobs before it")).to_be_visible()
+    page.locator("#find").fill("queued")
+    expect(page.locator("[data-job]")).to_have_count(2)
+    page.reload()
+    expect(page.locator("#find")).to_have_value("queued", timeout=30_000)
+    expect(page.locator("[data-job][aria-current=true]")).to_have_attribute("data-job", queued[0])
+    for job in (*queued, running):
+        httpx.post(f"{jobs}/{job}/cancel")
 
 
 def test_pages_show_the_truth_after_the_service_was_killed_under_a_job(

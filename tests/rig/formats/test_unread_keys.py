@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.formats.cameras_json import document_from_rig, read_rig
+from rig.formats.cameras_json import FORMAT, document_from_rig, read_rig
 from rig.formats.capture_folder import read_capture
 from rig.formats.unread_keys import unread_keys, unread_keys_of
 from rig.studio.scene.layout import default_layout
@@ -40,7 +40,7 @@ def test_what_all_cameras_have_alike_is_said_once() -> None:
 
 
 def test_a_thousand_keys_are_a_few_lines() -> None:
-    assert len(unread_keys_of({f"key{i}": 0 for i in range(1000)})) == 9
+    assert len(unread_keys_of({"format": FORMAT} | {f"key{i}": 0 for i in range(1000)})) == 9
 
 
 def test_a_capture_with_such_a_key_is_read_and_says_so(tmp_path: Path) -> None:
@@ -52,6 +52,14 @@ def test_a_capture_with_such_a_key_is_read_and_says_so(tmp_path: Path) -> None:
     assert len(read_rig(path)) == 3
     capture, _ = read_capture(folder)
     assert [remark for remark in capture.remarks if "cameras.covarianse is not read" in remark]
+
+
+def test_each_lens_model_has_its_own_keys() -> None:
+    document = json.loads(json.dumps(document_from_rig(default_layout())))
+    document["cameras"][0]["distortion"] = {"model": "kannala-brandt", "k1": 0, "k2": 0, "k3": 0, "k4": 0}
+    assert unread_keys_of(document) == ()
+    document["cameras"][0]["distortion"]["p1"] = 0
+    assert len(unread_keys_of(document)) == 1
 
 
 def test_files_of_other_programs_and_damaged_ones_are_not_judged(tmp_path: Path) -> None:

@@ -76,19 +76,23 @@ def test_what_is_no_upload_is_not_found(store: Store) -> None:
     damaged = some.create(40, {}, "key")
     (store.data / "uploads" / damaged.id / "upload.json").write_text("{")
     for identity in (damaged.id, new_id(), "../sessions", "x"):
-        with pytest.raises(NotFound, match="upload"):
+        with pytest.raises(NotFound, match=f"There is no upload '{identity}'"):
             some.get(identity)
+    strange = store.data / "uploads" / new_id()  # neither takes part in what was promised
+    strange.mkdir()
+    assert some.create(400, {}, "key").length == 400
 
 
 def test_what_expired_is_swept_and_nothing_else(store: Store) -> None:
     some = uploads(store)
-    kept, old = some.create(40, {}, "key"), some.create(40, {}, "key")
-    some.save(replace(old, expires=time.time() - 1))
+    kept, old, older = (some.create(40, {}, "key") for _ in range(3))
+    for record in (old, older):
+        some.save(replace(record, expires=time.time() - 1))
     strange = store.data / "uploads" / new_id()  # somebody else's folder
     strange.mkdir()
     with pytest.raises(NotFound):
         some.get(old.id)
-    assert some.sweep() == 1
+    assert some.sweep() == 2
     assert sorted(path.name for path in (store.data / "uploads").iterdir()) == sorted([kept.id, strange.name])
     assert some.sweep() == 0
     assert some.get(kept.id) == kept

@@ -55,7 +55,7 @@ def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
     outlined = {name for name, view in found.checks.items() if (view.get("subject") or {}).get("outline")}
     assert outlined >= set(NAMES) - {"cam03"}
     measured = check_capture(tmp_path, PIXELS_MOST, lambda stage, share: None, measured=True)
-    assert measured.faults == ()
+    assert {(fault.code, fault.camera) for fault in measured.faults} <= {("empty", "cam03")}, "the shot has the others"
     assert all(view.keys() == {"subject"} for view in measured.checks.values())
 
 

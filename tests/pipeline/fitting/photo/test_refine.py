@@ -13,7 +13,7 @@ from pipeline.fitting.head_problem import apply_step
 from pipeline.fitting.photo.correlation import choose_views, correlate
 from pipeline.fitting.photo.depth_search import facing_of, pixels_per_mm, sample_visibility
 from pipeline.fitting.photo.patches import Patches, spread_samples
-from pipeline.fitting.photo.refine import finer, refine_with_photographs
+from pipeline.fitting.photo.refine import LOST_MM, finer, refine_with_photographs, unfollowed
 from pipeline.fitting.problem import Stage, State, SurfaceObservations
 from pipeline.fitting.surface_term import SurfaceTerm
 from pipeline.imaging.grey import noise_level
@@ -218,3 +218,21 @@ def test_noise_level_of_planted_noise() -> None:
 def test_pixels_per_mm_is_the_pinhole_s(bump: Scene) -> None:
     expected = [camera.intrinsics.fx / 1200.0 for camera in bump.rig]
     np.testing.assert_allclose(pixels_per_mm(tuple(bump.rig), np.zeros(3)), expected, rtol=1e-9)
+
+
+def test_a_place_that_no_photograph_finds_again_is_misfit_there_and_nowhere_else(model: HeadModel) -> None:
+    """The surface is seen 0.1 mm off all over the front's upper half; at the chin nothing matches."""
+    vertices = model.vertices(np.zeros(0))
+    off_mm = 0.1
+    seen = np.flatnonzero((vertices[:, 2] > 0.0) & (vertices[:, 1] > 0.0))
+    lost = np.flatnonzero((vertices[:, 2] > 0.0) & (vertices[:, 1] < -60.0))
+    count, nothing = len(seen), np.zeros((len(seen), 6))
+    observed = SurfaceObservations(
+        seen, np.zeros((len(model.modes), count, 3), np.float32), vertices[seen], np.tile([0.0, 0.0, 1.0], (count, 1)),
+        vertices[seen], np.full(count, off_mm), np.ones(count), nothing, np.zeros((1, 6)), np.eye(6), np.zeros(6),
+    )  # fmt: skip
+    state = State(np.zeros(len(model.modes)), Similarity.identity(), np.zeros((1, 6)))
+    misfit, cage = unfollowed(model, observed, state, lost), model.mean
+    front = cage[:, 2] > 10.0
+    assert misfit[front & (cage[:, 1] > 20.0)].max() < 1.5 * off_mm
+    assert misfit[front & (cage[:, 1] < -70.0)].max() > 0.7 * LOST_MM

@@ -1,0 +1,34 @@
+"""What the commands that make heads say beside their answer."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from server.cli import reconstruct_local
+from server.cli.main import app
+from tests.support.services import small_capture
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_warnings_of_a_result_reach_the_terminal_and_the_status_stays_0(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, as_json: bool
+) -> None:
+    warnings = [
+        {"code": "cameras-exchanged", "message": "cam04 and cam06 hold each other's pictures"},
+        {"code": "scale-implausible", "message": "too large"},
+    ]
+
+    def reconstructed(*given: Any, **named: Any) -> dict[str, Any]:
+        return {"warnings": warnings}
+
+    monkeypatch.setattr(reconstruct_local, "reconstruct_locally", reconstructed)
+    capture = small_capture(tmp_path / "capture")
+    arguments = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), *(["--json"] if as_json else [])]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0
+    assert done.stderr.splitlines() == [f"eigenhead: {w['code']}: {w['message']}" for w in warnings]
+    if as_json:
+        assert json.loads(done.stdout)["warnings"] == warnings
