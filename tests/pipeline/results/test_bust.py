@@ -41,12 +41,8 @@ def photographed() -> tuple[Bust, Capture, dict]:
         images[camera.name] = np.rint(255 * srgb_from_linear(light)).astype(np.uint8).reshape(*depth.shape, 3)
     sphere = trimesh.creation.icosphere(4, 60.0)
     head, capture = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32)), Capture(images)
-    report = {"report": lambda stage, share: None}
-    return (
-        make_bust(made.maps, capture, made.silhouettes, made.rig, head, None, WindowBias(), SETTINGS, **report),
-        capture,
-        made.silhouettes,
-    )
+    surface = made.maps, capture, made.silhouettes, made.rig, head, None, WindowBias(), SETTINGS
+    return make_bust(*surface, report=lambda stage, share: None), capture, made.silhouettes
 
 
 @pytest.fixture(scope="module")
