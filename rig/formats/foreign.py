@@ -11,7 +11,6 @@ import numpy as np
 
 from rig.errors import InputError
 from rig.formats.cameras_json import FORMAT, name_fault, rig_from_document
-from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.recorded_lens import COEFFICIENTS, LensModel
 from rig.rig import Rig
 
@@ -89,6 +88,8 @@ def xml_root(data: bytes) -> ElementTree.Element:
 def sized(folder: Path, name: str, faults: list[str]) -> tuple[int, int]:
     """Width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold them.
     Where there is none, a fault that says where to put it."""
+    from rig.formats.images import IMAGE_SUFFIXES, picture_size  # decoders, which most formats do without
+
     for place in (folder, folder / "images", folder.parent / "images"):
         for path in sorted(place.glob(f"{name}.*")) if name_fault(name) is None else ():
             if path.suffix.lower() in IMAGE_SUFFIXES:

@@ -7,8 +7,8 @@ pictures tell it.
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from rig.atomic_write import write_atomically
@@ -17,6 +17,9 @@ from rig.formats.foreign import MATRIX_PLACES, judged_rig, lens_entry, number_ar
 from rig.geometry import rotation_from_vector
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
+
+if TYPE_CHECKING:
+    import cv2
 
 FILES = ("intri.yml", "extri.yml")
 
@@ -62,7 +65,9 @@ def write_yaml(rig: Rig, folder: Path) -> None:
     if fisheyes:
         raise InputError("opencv-yaml", [f"does not tell a fisheye from others, as {', '.join(fisheyes)} are"])
 
-    def lenses(file: cv2.FileStorage) -> None:
+    import cv2  # here and below: other formats do without its 0.1 s
+
+    def lenses(file: "cv2.FileStorage") -> None:
         for camera in rig:
             k, lens = camera.intrinsics, camera.recorded
             file.write(f"K_{camera.name}", k.matrix())
@@ -70,7 +75,7 @@ def write_yaml(rig: Rig, folder: Path) -> None:
             file.write(f"W_{camera.name}", k.width)
             file.write(f"H_{camera.name}", k.height)
 
-    def poses(file: cv2.FileStorage) -> None:
+    def poses(file: "cv2.FileStorage") -> None:
         for camera in rig:
             pose = camera.camera_from_world
             file.write(f"R_{camera.name}", cv2.Rodrigues(pose.rotation)[0])
@@ -81,7 +86,9 @@ def write_yaml(rig: Rig, folder: Path) -> None:
         write_atomically(folder / name, _written(rig, fill))
 
 
-def _written(rig: Rig, fill: Callable[[cv2.FileStorage], None]) -> bytes:
+def _written(rig: Rig, fill: "Callable[[cv2.FileStorage], None]") -> bytes:
+    import cv2
+
     file = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     file.startWriteStruct("names", cv2.FILE_NODE_SEQ)
     for camera in rig:
@@ -93,6 +100,8 @@ def _written(rig: Rig, fill: Callable[[cv2.FileStorage], None]) -> bytes:
 
 def _matrices(data: bytes) -> dict[str, np.ndarray]:
     """Every matrix and number of a file by its key. Raises ValueError."""
+    import cv2
+
     try:
         file = cv2.FileStorage(data.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = file.root()

@@ -103,7 +103,7 @@ def rig_plates(
     use: Annotated[str, typer.Option(help="Put these to use instead: an id under plates.versions.")] = "",
     json_out: Json = False,
 ) -> None:
-    """Take new clean plates of the empty studio, or put earlier or refused ones to use."""
+    """Take clean plates of the empty studio, or use earlier ones again."""
     from rig.acquisition.commands import take_plates
     from rig.acquisition.plates import use_plates
     from rig.formats.rig_toml import read_rig_config

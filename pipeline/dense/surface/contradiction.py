@@ -9,7 +9,6 @@ every view alike.
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage
 
 from pipeline.compiled import njit
 from pipeline.dense.surface.view_stack import ViewStack
@@ -59,8 +58,9 @@ def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray
         np.minimum(middle + BLOCK * np.arange(n), size - 1)
         for n, size in zip(solid.shape, (height, width), strict=True)
     )
-    farthest = ndimage.maximum(np.where(solid, outline_px[np.ix_(rows, columns)], 0.0), labels, np.arange(count))
-    wrong = np.asarray(farthest)[np.asarray(labels, np.int32)] > WIDENED_PX
+    part, farthest = np.asarray(labels, np.int32), np.zeros(count)
+    np.maximum.at(farthest, part, np.where(solid, outline_px[np.ix_(rows, columns)], 0.0))
+    wrong = farthest[part] > WIDENED_PX
     return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]
 
 
