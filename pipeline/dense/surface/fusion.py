@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.part_votes import SKIN, UNSEEN, PartVotes, part_codes, part_shares
@@ -33,6 +34,7 @@ Report = Callable[[str, float], None]
 
 TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
 VIEWS_LEAST = 3
+HEAD_STRIDE = 7  # every seventh vertex of the fitted head says which piece is the subject
 CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and others see solid
 
 
@@ -90,7 +92,7 @@ def fuse(
     report("bust", 0.1)
     level = solve(maps, views, head_world, settings.spacing_mm)
     report("bust", 0.6)
-    net, safe = closed_net(level)
+    net, safe = closed_net(level, head_world)
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
     seen = measured.views > 0
     mesh = without_bias(mesh, seen, bias)
@@ -116,23 +118,31 @@ def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) 
             )
 
 
-def closed_net(level: Level) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
-    """The largest piece of the zero level, and places of its vertices at which it cannot cross itself: the corners of
+def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
+    """The subject's piece of the zero level, and places of its vertices at which it cannot cross itself: the corners of
     the cubes about the inner nodes."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     vertices, of_cell = net_vertices(field, grid.index, grid.neighbours)
     faces, cells = net_faces(field, grid.neighbours, vertices, of_cell), np.flatnonzero(of_cell >= 0)
-    kept = _largest(vertices, faces)
+    head = None if head_world is None else (head_world.vertices - grid.corner) / grid.step_mm
+    kept = _subject(vertices, faces, head)
     used, corners = np.unique(faces[kept], return_inverse=True)
     placed = grid.corner + grid.step_mm * vertices[used]
     safe = grid.corner + grid.step_mm * (grid.index[cells[used]] + 0.5)
     return Mesh(placed, corners.reshape(-1, 3).astype(np.int32)), safe
 
 
-def _largest(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Bool[np.ndarray, " f"]:
-    """Faces of the piece that holds the greatest volume; cavities hold a negative one."""
-    piece = component_of(faces, len(vertices))[faces[:, 0]]
+def _subject(
+    vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, head: Float[np.ndarray, "h 3"] | None
+) -> Bool[np.ndarray, " f"]:
+    """Faces of the piece that lies at most of the fitted head's vertices: who stands behind may be larger. Without a
+    head, of the piece that holds the greatest volume; cavities hold a negative one."""
+    piece = component_of(faces, len(vertices))
     towards = vertices[faces[:, 0]] - vertices.mean(axis=0)
-    volume = np.bincount(piece, (face_normals(vertices, faces) * towards).sum(axis=1))
-    return piece == np.argmax(volume)
+    volume = np.bincount(piece[faces[:, 0]], (face_normals(vertices, faces) * towards).sum(axis=1))
+    if head is None or (volume > 0).sum() < 2:
+        return piece[faces[:, 0]] == np.argmax(volume)
+    solid = np.flatnonzero(volume[piece] > 0)
+    nearest = KDTree(vertices[solid]).query(head[::HEAD_STRIDE])[1]
+    return piece[faces[:, 0]] == np.bincount(piece[solid[nearest]]).argmax()

@@ -162,6 +162,19 @@ def test_hand_before_the_face_stands_apart_or_joined_but_closed(ball: Scene) -> 
     assert np.abs(seen_errors(surface, made)).max() < 3.0
 
 
+@pytest.mark.slow
+def test_a_larger_body_behind_takes_nothing_from_the_subject(ball: Scene) -> None:
+    """35 cm behind and to the side, in the masks of all views and before the subject in some."""
+    made = scene([BALL, Ellipsoid((60, 0, -350), (70, 70, 70))], fan(400, 300))
+    sphere = trimesh.creation.icosphere(4, 58.0)
+    surface = fused(made, Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32)))
+    check_closed(surface.mesh_world)
+    assert np.abs(seen_errors(surface, made)).max() < 3.0
+    assert np.linalg.norm(surface.mesh_world.vertices, axis=1).max() < 100.0
+    ours = np.abs(BALL.distance(surface.mesh_world.vertices[surface.seen])) < 1.0
+    assert ours.sum() > 0.95 * fused(ball).seen.sum()
+
+
 def test_strands_leave_no_spike(ball: Scene) -> None:
     """Outlines with hairs a pixel wide and depths of the wall behind them: 20 strands a view."""
     rng = np.random.default_rng(3)
