@@ -29,6 +29,7 @@ def test_schemathesis_finds_nothing(tmp_path: Path) -> None:
             "run",
             service.url + "/openapi.json",
             *("--checks", "all", "--exclude-checks", "positive_data_acceptance"),
+            *("--exclude-path-regex", r"preview\.mjpg$"),  # goes on for as long as it was asked to
             *("-H", f"Authorization: Bearer {key}", "--max-examples", "10", "--seed", "1"),
             *("--suppress-health-check", "all", "--generation-database", "none"),
             *("--request-timeout", str(SECONDS_MOST), "--max-response-time", str(SECONDS_MOST)),
