@@ -14,7 +14,7 @@ PAGES = {
     "CONTRIBUTING.md": "CONTRIBUTING.md",
     "SECURITY.md": "SECURITY.md",
 }
-_FROM_TOP = re.compile(r"(?<=\]\()docs/")
+_FROM_TOP = re.compile(r"""(?:(?<=\]\()|(?<=src="))docs/""")
 _TO_TOP = re.compile(r"(?<=\]\()\.\./(\w+\.md)")
 
 
