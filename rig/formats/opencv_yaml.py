@@ -44,8 +44,12 @@ def read_yaml(path: Path) -> Rig:
             turned = rotation_from_vector(vector.ravel())
         rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
         translation = number_array(poses.get(f"T_{name}", np.zeros(0)).ravel(), (3,), f"T_{name}", faults)
-        sides = [lenses.get(f"{side}_{name}") for side in "WH"]
-        size = sized(path.parent, name, faults) if None in sides else tuple(int(side.ravel()[0]) for side in sides)  # type: ignore[union-attr]
+        size: tuple[float, float]
+        if f"W_{name}" in lenses and f"H_{name}" in lenses:
+            width, height = (number_array(lenses[key].ravel(), (1,), key, faults) for key in (f"W_{name}", f"H_{name}"))
+            size = float(width[0]), float(height[0])
+        else:
+            size = sized(path.parent, name, faults)
         entries.append(
             {
                 "name": name,
