@@ -31,6 +31,7 @@ from rig.rig import Rig
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise, and smaller holes: whites of eyes before a grey wall
+SOLID_HOLE = 0.995  # mean coarse probability: 1.000 in false holes of noisy captures, at most 0.99 in gaps of hair
 NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
@@ -93,7 +94,8 @@ def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings
 
 def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings) -> Silhouette:
     alpha = np.zeros(decision.background.plates.shape[1:3], np.float32)
-    alpha[matte.box], holes = _without_specks(matte.alpha)
+    coarse = cv2.resize(decision.probability.astype(np.float32), alpha.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    alpha[matte.box], holes = _without_specks(matte.alpha, coarse[matte.box])
     distance = distance_to_level(alpha)
     weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
     contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
@@ -110,15 +112,22 @@ def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings
     return Silhouette(mask, distance, _quality(mask, (1, holes), contrast, weak, figures, settings))
 
 
-def _without_specks(alpha: Float32[np.ndarray, "h w"]) -> tuple[Float32[np.ndarray, "h w"], int]:
-    """Alpha of the subject's own component without holes of noise, and how many holes are left."""
+def _without_specks(
+    alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, "h w"], int]:
+    """Alpha of the subject's own component without holes of noise, and how many holes are left.
+
+    Noise is what is small, and what the ``coarse`` probability, whose pixels average the sensor's noise away, calls
+    subject all over: shaded skin before a backdrop of its colour. A gap in hair of that size is seen there, too.
+    """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)
     if len(areas) > 2:
         main = int(np.argmax(areas[1:])) + 1
         alpha = np.where(mask & (labels != main), np.float32(0.49), alpha)
     labels, areas = _labelled(alpha <= 0.5, 8)
-    small = areas < max(NOISE_HOLE, STRANGER_SHARE * np.count_nonzero(mask))
+    solid = np.bincount(labels.ravel(), coarse.ravel(), len(areas)) > SOLID_HOLE * areas
+    small = solid | (areas < max(NOISE_HOLE, STRANGER_SHARE * np.count_nonzero(mask)))
     small[0] = False
     if small.any():
         alpha = np.where(small[labels], np.float32(0.51), alpha)
