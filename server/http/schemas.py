@@ -180,20 +180,12 @@ class CaptureOut(Answer):
     faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
 
 
-class CaptureList(Answer):
-    captures: list[CaptureOut]
-
-
 class SessionOut(Answer):
     id: str
     created: Moment
     label: str
     consent: str
     captures: list[str]
-
-
-class SessionList(Answer):
-    sessions: list[SessionOut]
 
 
 class JobError(Answer):
@@ -234,14 +226,11 @@ class JobOut(Answer):
     restart_of: str | None
     queue: str | None
     priority: int
+    ahead: int | None = Field(None, description="jobs of its queue that go before a queued one")
     created: Moment | None
     started: Moment | None
     finished: Moment | None
     files: dict[str, FileOut]
-
-
-class JobList(Answer):
-    jobs: list[JobOut]
 
 
 class ModelOut(Answer):

@@ -9,7 +9,6 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import Settings, document_from_settings
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
-from server.services.jobs import STATES, WORKFLOW
 from server.services.service import Check, Service
 from server.storage.database import alive_workers
 from server.storage.records import JsonObject
@@ -82,7 +81,7 @@ def _records(service: Service) -> Check:
 
 def exposition(service: Service) -> bytes:
     """The metrics of this moment, in Prometheus' text format."""
-    jobs = _jobs_by_state(service)
+    jobs = service.jobs.counts()
     captures, damaged = len(service.store.ids("captures")), len(service.store.set_aside())
     return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)
 
@@ -104,7 +103,7 @@ class Info:
 
 
 def about(service: Service) -> Info:
-    jobs, limits = _jobs_by_state(service), service.settings
+    jobs, limits = service.jobs.counts(), service.settings
     return Info(
         version("eigenhead"),
         len(os.sched_getaffinity(0)),
@@ -117,10 +116,3 @@ def about(service: Service) -> Info:
         limits.jobs_per_key,
         document_from_settings(Settings()),
     )
-
-
-def _jobs_by_state(service: Service) -> dict[str, int]:
-    jobs = dict.fromkeys(set(STATES.values()), 0)
-    for row in service.jobs.client.list_workflows(name=WORKFLOW, load_input=False, load_output=False):
-        jobs[STATES[row.status]] += 1
-    return jobs

@@ -18,6 +18,7 @@ from server.services.uploads import ResumableUploads
 from server.services.webhooks import Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import open_database
+from server.storage.library import Library
 from server.storage.store import Store
 from server.tasks.calibrate import ingest_board_pictures
 from server.tasks.child import Children
@@ -81,18 +82,20 @@ class Service:
 
 def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     """Opens the data folder, the database and the rig's description. Raises InputError, DatabaseUnavailable."""
-    store = Store(settings.data)
     engine = open_database(settings)
+    library = Library(engine)
+    store = Store(settings.data, library)
+    library.reconcile(store)
     migrate(settings)
-    jobs, rig = Jobs(settings, store, engine), open_rig(settings)
+    jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)
     children = Children(settings.checks_at_once, niceness=3)
     return Service(
         settings=settings,
         store=store,
         engine=engine,
         jobs=jobs,
-        captures=Captures(store, jobs, rig, children, settings),
-        sessions=Sessions(store, jobs),
+        captures=Captures(store, jobs, rig, children, settings, library),
+        sessions=Sessions(store, jobs, library),
         calibrations=Calibrations(store, jobs.client, settings.queue),
         keys=Keys(engine),
         webhooks=Webhooks(engine, settings.webhook_origins),

@@ -43,6 +43,31 @@ job_index = sa.Table(  # what jobs are looked up by; the job itself is the engin
     sa.Column("job_id", sa.String(64), primary_key=True),
     sa.Column("capture_id", sa.String(64), nullable=False, index=True),
     sa.Column("session", sa.String(64), nullable=True, index=True),
+    sa.Column("words", sa.Text, nullable=True),  # what a search compares; None in rows of earlier versions
+)
+
+capture_index = sa.Table(  # what captures are found by; the capture itself is its record in the data folder
+    "eigenhead_capture_index",
+    metadata,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("session", sa.String(64), nullable=True, index=True),
+    sa.Column("label", sa.Text, nullable=False),
+    sa.Column("verdict", sa.String(16), nullable=False),
+    sa.Column("source", sa.String(16), nullable=False),
+    sa.Column("board", sa.Boolean, nullable=False),
+    sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
+    sa.Column("changed", sa.BigInteger, nullable=False),  # of its record, in ns: tells whether the row is of it still
+)
+
+session_index = sa.Table(
+    "eigenhead_session_index",
+    metadata,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("subject", sa.Text, nullable=False, index=True),  # what sessions of one person have alike
+    sa.Column("label", sa.Text, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
+    sa.Column("changed", sa.BigInteger, nullable=False),
 )
 
 workers = sa.Table(
@@ -99,9 +124,18 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
         engine = sa.create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10, connect_args=patience)
     try:
         metadata.create_all(engine)
+        _add_columns(engine)
     except SQLAlchemyError as error:
         raise DatabaseUnavailable(settings.place, error) from error
     return engine
+
+
+def _add_columns(engine: sa.Engine) -> None:
+    """Gives tables of an earlier version the columns that they lack; all of those may be empty."""
+    known = {column["name"] for column in sa.inspect(engine).get_columns(job_index.name)}
+    if job_index.c.words.name not in known:
+        with engine.begin() as connection:
+            connection.execute(sa.text(f"ALTER TABLE {job_index.name} ADD COLUMN words TEXT"))
 
 
 def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElement[bool]:

@@ -13,8 +13,8 @@ from rig.errors import InputError
 from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.removal import removals
 from server.services.captures import TEXT_MOST, About
-from server.services.jobs import Work
 from server.services.service import Service
+from server.services.work import Work
 from server.storage.records import CaptureRecord
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 

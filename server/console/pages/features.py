@@ -17,8 +17,8 @@ from server.console.guides import Helps, helps, mean_landmarks, nearest_views
 from server.console.page import Action, Page, shared, show
 from server.console.removal import removals
 from server.errors import Conflict
-from server.services.jobs import Work
 from server.services.service import Service
+from server.services.work import Work
 from server.tasks.ingest import Points
 
 VIEWS = 4

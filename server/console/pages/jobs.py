@@ -15,9 +15,10 @@ from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.services.documents import JobLine
-from server.services.jobs import FINISHED, Work
+from server.services.jobs import FINISHED
 from server.services.records import Job
 from server.services.service import Service
+from server.services.work import Work
 from server.storage.events import JobEvent
 
 SHOWN = 200
