@@ -21,6 +21,7 @@ from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
 from server.console.look_through import camera_views, rig_of, straightened
 from server.console.page import as_problem
+from server.console.portrait import write_portrait
 from server.console.silhouettes import draw
 from server.errors import Conflict, NotFound
 from server.services.keys import Caller
@@ -139,6 +140,17 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
     if not path.is_file():
         raise NotFound("surface of the result", surface)
     return _floats(comparison.ply_property(path, name))
+
+
+@pages.get("/console/jobs/{job_id}/portrait.jpg")
+def portrait(who: Reader, job_id: str) -> Response:
+    """A small picture of the head, drawn at the first look; it goes with the job."""
+    result = _result_folder(who[0], job_id)
+    kept = result.parent / "portrait.jpg"
+    if not kept.is_file():
+        with _drawing:
+            write_portrait(result, kept)
+    return FileResponse(kept, headers=FOREVER)
 
 
 @pages.get("/console/jobs/{job_id}/cameras")

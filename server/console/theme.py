@@ -10,6 +10,7 @@ from nicegui.element import Element
 ACCENT = "#6cb2ff"
 PAGES = (
     ("rig", "/", "Rig"),
+    ("subjects", "/subjects", "Subjects"),
     ("captures", "/captures", "Captures"),
     ("features", "/features", "Features"),
     ("jobs", "/jobs", "Jobs"),

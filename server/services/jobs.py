@@ -7,6 +7,7 @@ input, its state the workflow's status. Progress comes from the event log, files
 import hashlib
 import json
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
@@ -178,8 +179,8 @@ class Jobs:
         return self._jobs(rows)
 
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
-        """Raises InputError for a cursor of another list."""
-        page = self.index.page(query, limit, cursor)
+        """A word that names a state is looked for as that. Raises InputError for a cursor of another list."""
+        page = self.index.page(_by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[Job]:
@@ -238,10 +239,9 @@ class Jobs:
 
     def without_result(self) -> list[str]:
         """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
-        rows = self.client.list_workflows(
-            name=WORKFLOW, status=STATUSES["succeeded"], sort_desc=True, load_input=False, load_output=False
-        )
-        return [row.workflow_id for row in rows if not self._result(row.workflow_id).is_dir()]
+        there = set(self._store.ids("jobs"))
+        done = self.index.newest_first(STATUSES["succeeded"])
+        return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
 
     def _result(self, job_id: str) -> Path:
         return self._store.folder("jobs", job_id) / "result"
@@ -342,6 +342,17 @@ class Jobs:
             finished=_moment(row.completed_at) if state in FINISHED else None,
             files=dict(row.output or {}) if state == "succeeded" else {},
         )
+
+
+def _by_state(query: JobQuery) -> JobQuery:
+    words = query.sought.split()
+    states = [word.casefold() for word in words if word.casefold() in STATUSES]
+    if not states:
+        return query
+    statuses = [status for state in states for status in STATUSES[state]]
+    both = statuses if query.statuses is None else [status for status in statuses if status in query.statuses]
+    rest = " ".join(word for word in words if word.casefold() not in STATUSES)
+    return replace(query, sought=rest, statuses=both)
 
 
 def _request(row: WorkflowStatus) -> JobRequest | None:

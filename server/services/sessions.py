@@ -9,7 +9,7 @@ from server.errors import NotFound
 from server.services.erasure import erase_captures
 from server.services.jobs import Jobs
 from server.services.records import Found, Session, Subject
-from server.storage.library import Library, SubjectOrder
+from server.storage.library import Library, SubjectOrder, subject_of
 from server.storage.records import SessionRecord
 from server.storage.store import Store, new_id
 
@@ -47,6 +47,13 @@ class Sessions:
                 theirs = {capture: jobs[capture] for session in sessions for capture in captures[session]}
                 found.append(_subject(records, theirs))
         return Found(tuple(found), page.next, page.total)
+
+    def captures_of_subject(self, session: str | None) -> list[str]:
+        """Ids of the captures of all sessions that bear the name of this one; none without a session."""
+        if session is None or (record := self._record(session)) is None:
+            return []
+        sessions = self._library.sessions_of(subject_of(record))
+        return [capture for some in self._library.captures_of(sessions).values() for capture in some]
 
     def _record(self, identity: str) -> SessionRecord | None:
         """None where it was removed since the index was asked."""

@@ -101,6 +101,13 @@ class JobIndex:
         with self._engine.connect() as connection:
             return {row[0]: row[1] for row in connection.execute(query)}
 
+    def newest_first(self, statuses: Sequence[str]) -> list[str]:
+        """Ids of all jobs with one of the engine's statuses."""
+        status = self._status.c
+        query = sa.select(status.workflow_uuid).where(status.name == self._workflow, status.status.in_(statuses))
+        with self._engine.connect() as connection:
+            return [*connection.scalars(query.order_by(status.created_at.desc()))]
+
     def places(self) -> dict[str, int]:
         """How many jobs of its queue go before each queued one: those that run, then lower priority numbers, then who
         came first. The engine takes jobs of one millisecond in no order of its own; here the id settles it."""

@@ -103,6 +103,11 @@ class Library:
         with self._engine.connect() as connection:
             return [*connection.scalars(query)]
 
+    def sessions_of(self, subject: str) -> list[str]:
+        """Ids of a person's sessions; ``subject`` as of ``subject_of``."""
+        with self._engine.connect() as connection:
+            return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
+
     def sessions(self, sought: str, limit: int, cursor: str | None = None) -> PageOf:
         """Newest first. Raises InputError for a cursor of another list."""
         rows = sa.select().select_from(session_index)

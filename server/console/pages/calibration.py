@@ -130,7 +130,7 @@ def shoot(page: Page, event: BoardForm) -> str:
         found = child.remote(detect_shot)(files=str(files), board=board)
     seen = sum(bool(corners) for corners in found.values())
     if not seen:
-        service.store.remove(service.store.folder("captures", identity))
+        service.store.remove_capture(identity)
         detail = "No camera saw the board; the shot was not kept. Check columns, rows and kind, and hold it in view."
         raise Unusable("no-board", detail)
     shots.add(board, identity, found)

@@ -19,9 +19,12 @@ from server.console.removal import removals
 from server.errors import Conflict
 from server.services.service import Service
 from server.services.work import Work
+from server.storage.library import CaptureQuery
+from server.storage.records import CaptureRecord
 from server.tasks.ingest import Points
 
 VIEWS = 4
+CHOICES = 100  # captures to choose from; the page Captures leads to all
 
 
 class CaptureChoice(TypedDict):
@@ -77,13 +80,14 @@ class FeaturesPage(Page, component="features.js"):
     picked: Picked | None = None
 
     def look(self) -> FeaturesShown:
-        captures: list[CaptureChoice] = [
-            {"id": c.id, "label": c.label, "created": c.created, "features": c.features}
-            for c in self.service.store.captures()
-            if not c.board and c.id not in removals
-        ]
+        captures: list[CaptureChoice] = shared.get("choices", 0.3, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
-        if chosen is None or all(capture["id"] != chosen for capture in captures):
+        known = any(capture["id"] == chosen for capture in captures)
+        if not known and chosen is not None:  # an older one, by its address
+            older = [record for record in self.service.captures.of([chosen]) if not record.board]
+            captures = [*captures, *(choice_of(record) for record in older if record.id not in removals)]
+            known = bool(older)
+        if chosen is None or not known:
             return {"captures": captures, "capture": None, "asked": self.choice.get("capture")}
         return {"captures": captures, "capture": self._picking(chosen)}
 
@@ -111,6 +115,16 @@ class FeaturesPage(Page, component="features.js"):
         if self.picked is None:
             raise Conflict("no-capture", "No capture is shown: choose one first.")
         return self.picked
+
+
+def captures_to_pick(service: Service) -> list[CaptureChoice]:
+    """The newest ones that show a head."""
+    found = service.captures.page(CaptureQuery(board=False), CHOICES)
+    return [choice_of(record) for record in found.items if record.id not in removals]
+
+
+def choice_of(record: CaptureRecord) -> CaptureChoice:
+    return {"id": record.id, "label": record.label, "created": record.created, "features": record.features}
 
 
 def rig_of(service: Service, capture_id: str) -> Rig:

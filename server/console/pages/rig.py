@@ -103,14 +103,14 @@ def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
     if identity is None or identity in removals:
         return None
     with suppress(NotFound):
-        return capture_line(service.store.capture(identity), None)
+        return capture_line(service.store.capture(identity), [])
     return None
 
 
 def rig_state(service: Service) -> RigShown:
     """What the tiles say beside the live pictures: the driver's state, the last shot's sync, the calibration."""
     rig = service.rig.describe()
-    last = next(service.store.captures(), None)
+    last = service.captures.newest()
     sync = {} if last is None or last.shot is None else sync_of(last.shot)
     moved = moved_cameras(service)
     cameras: list[Tile] = [

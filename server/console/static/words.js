@@ -34,6 +34,9 @@ export function stageWords(stage) { return STAGES[stage] || stage; }
 // The session that the operator works in, kept for the pages of this browser tab.
 export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
 export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }
+// What was typed and not sent is kept in this browser tab: a reload brings it back.
+export function kept(name) { try { return JSON.parse(sessionStorage.getItem(`eigenhead ${name}`)); } catch (error) { return null; } }
+export function keepDraft(name, value) { value ? sessionStorage.setItem(`eigenhead ${name}`, JSON.stringify(value)) : sessionStorage.removeItem(`eigenhead ${name}`); }
 // What is chosen and sought stands in the address, so that a reload or a bookmark brings it back.
 export function keepAddress(fields) {
   const kept = new URLSearchParams(Object.entries(fields).filter(([, value]) => value));
