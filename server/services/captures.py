@@ -181,6 +181,7 @@ class Captures:
         with or without a session. Raises NotFound, and Unavailable while a worker still writes."""
         self._store.capture(identity)
         erase_captures(self._store, self._jobs, [identity])
+        self._library.scrub()
 
     def _check_consent(self, session: str | None) -> None:
         """Raises NotFound; Conflict where the service asks for consent and the session has no note of it."""

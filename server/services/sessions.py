@@ -83,6 +83,7 @@ class Sessions:
         jobs = {job.id for job in self._jobs.find(session=identity, limit=100_000)}
         erase_captures(self._store, self._jobs, captures, jobs)
         self._store.remove_session(identity)
+        self._library.scrub()
 
 
 def _with_captures(record: SessionRecord, captures: list[str]) -> Session:

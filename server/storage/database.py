@@ -3,6 +3,7 @@
 Times are seconds since 1970 on the *database's* clock, so that two hosts whose clocks differ agree on who is silent.
 """
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from rig.errors import EigenheadError
 from server.settings import ServiceSettings
 
 CONNECT_S = 10  # a database that does not even refuse
+SCRUB_TRIES, SCRUB_PAUSE_S = 20, 0.05
 
 metadata = sa.MetaData()
 
@@ -118,6 +120,7 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
             connection.isolation_level = "IMMEDIATE"  # a writer that starts as a reader could not wait for its turn
             connection.execute("PRAGMA busy_timeout=30000")
             connection.execute("PRAGMA journal_mode=WAL")  # kept in the file: the job engine's connections read it too
+            connection.execute("PRAGMA secure_delete=ON")  # names of people who were erased stand in no free page
             connection.execute("PRAGMA synchronous=FULL")  # WAL's default loses the last commits with the power
     else:
         patience = {"connect_timeout": CONNECT_S}
@@ -136,6 +139,20 @@ def _add_columns(engine: sa.Engine) -> None:
     if job_index.c.words.name not in known:
         with engine.begin() as connection:
             connection.execute(sa.text(f"ALTER TABLE {job_index.name} ADD COLUMN words TEXT"))
+
+
+def scrub(engine: sa.Engine) -> None:
+    """Lets go of what removed rows have left in the database's files: names of people among it. Where somebody reads at
+    this moment, the files keep it until the next time."""
+    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        if engine.dialect.name != "sqlite":
+            connection.execute(sa.text(f"VACUUM {capture_index.name}, {session_index.name}, {job_index.name}"))
+            return
+        for _ in range(SCRUB_TRIES):
+            busy, _, _ = connection.execute(sa.text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
+            if not busy:
+                return
+            time.sleep(SCRUB_PAUSE_S)
 
 
 def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElement[bool]:

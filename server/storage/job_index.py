@@ -92,7 +92,7 @@ class JobIndex:
         column = sa.func.coalesce(status.completed_at, 0) if finished else status.created_at
         order = Order(column, status.workflow_uuid, query.order.startswith("-"))
         with self._engine.connect() as connection:
-            return page_of(connection, rows, order, limit, cursor)
+            return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def counts(self) -> dict[str, int]:
         """Jobs by the engine's status."""

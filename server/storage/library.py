@@ -12,7 +12,7 @@ import sqlalchemy as sa
 import structlog
 from sqlalchemy.dialects import postgresql, sqlite
 
-from server.storage.database import capture_index, session_index
+from server.storage.database import capture_index, scrub, session_index
 from server.storage.pages import Order, PageOf, contains, folded, page_of, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store
@@ -66,6 +66,10 @@ class Library:
     def drop_session(self, identity: str) -> None:
         self._drop(session_index, [identity])
 
+    def scrub(self) -> None:
+        """Lets go of what removed rows have left in the database's files."""
+        scrub(self._engine)
+
     def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> PageOf:
         """Raises InputError for a cursor of another list."""
         table = capture_index.c
@@ -81,10 +85,10 @@ class Library:
         for word in words_of(query.sought):
             rows = rows.where(captures_with(word))
         name = query.order.removeprefix("-")
-        column = {"created": table.id, "label": sa.func.lower(table.label)}.get(name)
+        column = {"created": table.id, "label": sa.func.lower(table.label, type_=sa.Text())}.get(name)
         order = Order(table[name] if column is None else column, table.id, query.order.startswith("-"))
         with self._engine.connect() as connection:
-            return page_of(connection, rows, order, limit, cursor)
+            return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def captures_of(self, sessions: Collection[str]) -> dict[str, list[str]]:
         """Ids of the captures of some sessions, newest first."""
@@ -121,7 +125,10 @@ class Library:
         """Sessions of one name are one person's; one without a name is somebody by itself. A subject is as new as its
         newest session. Raises InputError for a cursor of another list."""
         table = session_index.c
-        newest, name = sa.func.max(table.id).label("newest"), sa.func.min(sa.func.lower(table.label)).label("name")
+        newest, name = (
+            sa.func.max(table.id).label("newest"),
+            sa.func.min(sa.func.lower(table.label), type_=sa.Text()).label("name"),
+        )
         rows = sa.select(table.subject, newest, name).group_by(table.subject)
         for word in words_of(sought):
             rows = rows.where(contains(table.words, word))

@@ -41,29 +41,43 @@ class Order:
 
     def after(self, cursor: str) -> sa.ColumnElement[bool]:
         """Of the rows that come after a cursor. Raises InputError for what is no cursor of such a list."""
-        value, identity = place_of(cursor)
-        if isinstance(value, str) != isinstance(self.column.type, sa.String):
+        place = place_of(cursor)
+        if isinstance(place.value, str) != isinstance(self.column.type, sa.String):
             raise no_cursor()
         if self.column is self.identity:
-            return self.identity < identity if self.descending else self.identity > identity
-        place, row = sa.tuple_(sa.literal(value), sa.literal(identity)), sa.tuple_(self.column, self.identity)
-        return row < place if self.descending else row > place
+            return self.identity < place.identity if self.descending else self.identity > place.identity
+        ended, row = (
+            sa.tuple_(sa.literal(place.value), sa.literal(place.identity)),
+            sa.tuple_(self.column, self.identity),
+        )
+        return row < ended if self.descending else row > ended
 
 
-def cursor_of(value: Value, identity: str) -> str:
-    return base64.urlsafe_b64encode(json.dumps([value, identity]).encode()).decode().rstrip("=")
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a page ended, and how many rows the list had when its first page was made."""
+
+    value: str | int
+    identity: str
+    total: int
 
 
-def place_of(cursor: str) -> tuple[str | int, str]:
+def cursor_of(value: Value, identity: str, total: int) -> str:
+    return base64.urlsafe_b64encode(json.dumps([value, identity, total]).encode()).decode().rstrip("=")
+
+
+def place_of(cursor: str) -> Place:
     """What a cursor names. Raises InputError."""
     try:
-        value, identity = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
     except (ValueError, RecursionError, TypeError) as error:
         raise no_cursor() from error
-    whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**62
-    if not (isinstance(value, str) or whole) or not isinstance(identity, str) or "\0" in f"{value}{identity}":
+    numbers = [part for part in (value, total) if not isinstance(part, str)]
+    whole = all(isinstance(part, int) and not isinstance(part, bool) and abs(part) < 2**62 for part in numbers)
+    texts = isinstance(identity, str) and "\0" not in f"{value}{identity}" and not isinstance(total, str)
+    if not (whole and texts) or total < 0:
         raise no_cursor()
-    return value, identity
+    return Place(value, identity, total)
 
 
 def no_cursor() -> InputError:
@@ -71,18 +85,23 @@ def no_cursor() -> InputError:
 
 
 def page_of(
-    connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, total: int | None = None
+    connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
 ) -> PageOf:
-    """One page of ``rows``, which select nothing yet; ``total`` where it is known. Raises InputError."""
-    if total is None:
-        total = connection.scalar(rows.with_only_columns(sa.func.count())) or 0
+    """One page of ``rows``, which select nothing yet. ``searched``: finding the rows is what takes long, so that they
+    are counted as they are found. Raises InputError."""
     wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
     if cursor is not None:
-        wanted = wanted.where(order.after(cursor))
+        total, wanted = place_of(cursor).total, wanted.where(order.after(cursor))
+    elif searched:
+        total, wanted = 0, wanted.add_columns(sa.func.count().over().label("total"))
+    else:
+        total = connection.scalar(rows.with_only_columns(sa.func.count())) or 0
     found = connection.execute(wanted.order_by(*order.by()).limit(limit + 1)).all()
+    if cursor is None and searched and found:
+        total = found[0].total
     more = len(found) > limit
     ids = tuple(row.id for row in found[:limit])
-    return PageOf(ids, cursor_of(found[limit - 1].value, ids[-1]) if more else None, total)
+    return PageOf(ids, cursor_of(found[limit - 1].value, ids[-1], total) if more else None, total)
 
 
 def words_of(sought: str) -> Sequence[str]:
