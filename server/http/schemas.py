@@ -318,6 +318,7 @@ class UseCalibration(Received):
     model_config = ConfigDict(json_schema_extra={"examples": [{"calibration_id": EXAMPLE_ID}]})
 
     calibration_id: Id
+    poor: bool = Field(False, description="use it although its verdict is poor")
 
 
 class CalibrationOut(Answer):
@@ -327,7 +328,12 @@ class CalibrationOut(Answer):
     label: str
     pictures: dict[str, int] = Field(description="number of pictures by camera")
     state: State
+    stage: str | None = None
+    progress: float = Field(0.0, ge=0, le=1)
+    eta_s: float | None = None
     error: JobError | None
+    verdict: Literal["good", "usable", "poor"] | None = Field(None, description="null: not judged")
+    missing: list[str] = Field([], description="what would make the verdict better, most urgent first")
     figures: JsonObject
     checks: list[JsonObject]
     warnings: list[str]

@@ -85,7 +85,8 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera."""
+    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera; ``stage``,
+    ``progress`` (0 to 1) and remaining seconds of one that runs; ``missing``: what would make its verdict better."""
 
     id: str
     created: str
@@ -93,7 +94,12 @@ class Calibration:
     label: str
     pictures: dict[str, int]
     state: str
+    stage: str | None = None
+    progress: float = 0.0
+    eta_s: float | None = None
     error: Failure | None = None
+    verdict: str | None = None
+    missing: tuple[str, ...] = ()
     figures: Mapping[str, object] = field(default_factory=dict)
     checks: tuple[Mapping[str, object], ...] = ()
     warnings: tuple[str, ...] = ()

@@ -66,8 +66,11 @@ class Service:
             child.remote(ingest_board_pictures)(archive=str(archive), folder=str(target), limits=limits)
         return self.calibrations.add(target, "upload", label)
 
-    def use_calibration(self, identity: str) -> RigState:
-        """Every capture from now on gets this calibration; returns the rig's state. Raises NotFound, Conflict."""
+    def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
+        """Every capture from now on gets this calibration; returns the rig's state. Raises NotFound; Conflict, for a
+        poor one, too, unless ``poor`` says that it is to be used all the same."""
+        if not poor:
+            self.calibrations.check_usable(identity)
         self.rig.use(self.calibrations.cameras_json(identity))
         self.calibrations.mark_in_use(identity)
         return self.rig.describe()
@@ -96,7 +99,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
         jobs=jobs,
         captures=Captures(store, jobs, rig, children, settings, library),
         sessions=Sessions(store, jobs, library),
-        calibrations=Calibrations(store, jobs.client, settings.queue),
+        calibrations=Calibrations(store, jobs.client, settings.queue, jobs.events),
         keys=Keys(engine),
         webhooks=Webhooks(engine, settings.webhook_origins),
         uploads=ResumableUploads(store, settings),

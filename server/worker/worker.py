@@ -42,7 +42,7 @@ from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store, move_durably
-from server.tasks.calibrate import calibrate_folder
+from server.tasks.calibrate import calibrate_folder, expected
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
@@ -201,9 +201,15 @@ class Worker:
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
+        meter = ProgressMeter(self.events, identity, JobProgress(expected(folder)))
+
+        def tick() -> bool:
+            meter.tick()
+            return False
+
         try:
             with self._children.one() as child:
-                result = child.remote(calibrate_folder)(
+                result = child.remote(calibrate_folder, report=meter.report, cancelled=tick)(
                     folder=str(folder),
                     result=str(attempt),
                     previous=str(in_use) if in_use.is_file() else None,
