@@ -234,8 +234,10 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
 
 
 class Status(TypedDict):
-    """What the frame shows of the service; ``faults``: what to do, by what is wrong."""
+    """What the frame shows of the service; ``faults``: what to do, by what is wrong; ``starting``: what is not there
+    yet."""
 
+    starting: list[str]
     faults: dict[str, str]
     jobs: int
     disk: str
@@ -249,10 +251,17 @@ def status_of(service: Service, caller: Caller) -> Status | None:
 
     def make() -> Status:
         checks = readiness(service)
-        wrong = {name: check.detail for name, check in checks.items() if not check.ok}
+        wrong = {name: check.detail for name, check in checks.items() if not check.ok and not check.starting}
+        starting = [name for name, check in checks.items() if check.starting]
         counts = service.jobs.counts()
         disk = checks["disk"].detail.partition(" free")[0] + " free"
-        return {"faults": wrong, "jobs": counts["queued"] + counts["running"], "disk": disk, "local": False}
+        return {
+            "faults": wrong,
+            "starting": starting,
+            "jobs": counts["queued"] + counts["running"],
+            "disk": disk,
+            "local": False,
+        }
 
     shown: Status = shared.get("status", STATUS_S / 2, make)
     return {**shown, "local": caller.key == "local"}

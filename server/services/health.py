@@ -51,7 +51,11 @@ def _workers(service: Service) -> Check:
             count = connection.scalar(sa.select(sa.func.count()).where(alive)) or 0
     except SQLAlchemyError:
         return Check(ok=False, detail="unknown: the database does not answer")
-    return Check(ok=count > 0, detail=f"{count} alive" if count else "none alive: start one with `eigenhead worker`")
+    if count:
+        return Check(ok=True, detail=f"{count} alive")
+    if service.jobs.worker_may_start():
+        return Check(ok=False, detail="being started: it loads for some seconds", starting=True)
+    return Check(ok=False, detail="none alive: start one with `eigenhead worker`")
 
 
 def check_egl(service: Service) -> None:
@@ -64,7 +68,9 @@ def check_egl(service: Service) -> None:
 
 
 def _egl(service: Service) -> Check:
-    return service.known.get("egl") or Check(ok=False, detail="being started; ask again in a few seconds")
+    return service.known.get("egl") or Check(
+        ok=False, detail="being started; ask again in a few seconds", starting=True
+    )
 
 
 def _rig(service: Service) -> Check:

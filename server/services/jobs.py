@@ -6,6 +6,7 @@ input, its state the workflow's status. Progress comes from the event log, files
 
 import hashlib
 import json
+import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -44,6 +45,7 @@ STATES = {
     "CANCELLED": "cancelled",
 }
 STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
+WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where all cores are busy
 FINISHED = ("succeeded", "failed", "cancelled")
 
 log = structlog.get_logger()
@@ -75,6 +77,7 @@ class Jobs:
             system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
         )
         self.index.complete(self._requests)
+        self._began = time.monotonic()
 
     def close(self) -> None:
         self.client.destroy()
@@ -303,7 +306,13 @@ class Jobs:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
                 return None
+        if queue == self._settings.queue and self.worker_may_start():
+            return "The worker is being started."
         return f"No worker serves the queue {queue!r}: start one with `eigenhead worker --queue {queue}`."
+
+    def worker_may_start(self) -> bool:
+        """Whether the service is so young that its worker may still be loading."""
+        return time.monotonic() - self._began < WORKER_START_S
 
     def _status(self, job_id: str, load: bool = True) -> WorkflowStatus | None:
         rows = self.client.list_workflows(workflow_ids=[job_id], name=WORKFLOW, load_input=load, load_output=load)

@@ -26,10 +26,12 @@ from server.tasks.child import Children
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding about the service: whether it is well, and what to do where it is not."""
+    """One finding about the service: whether it is well, and what to do where it is not; ``starting``: it is not well
+    yet, and nothing is to be done."""
 
     ok: bool
     detail: str
+    starting: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -179,6 +179,7 @@ class Worker:
                 meter.tick()  # asked many times a second, also where a stage reports nothing
                 return not self._states.runs(job_id)
 
+            meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
             with self._children.one() as child:
                 child.remote(self._work, report=meter.report, cancelled=cancelled)(
                     capture=str(self.store.folder("captures", request["capture_id"]) / "files"),

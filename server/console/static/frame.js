@@ -10,6 +10,7 @@ export default {
   emits: ["undo"],
   data: () => ({ messages: [], next: 1, help: false }),
   computed: {
+    starting() { return (this.status?.starting || []).map((name) => (name === "egl" ? "graphics" : name)); },
     faults() { return Object.entries(this.status?.faults || {}); },
   },
   template: `
@@ -19,7 +20,7 @@ export default {
         <a v-for="(link, i) in links" :key="link.name" :href="link.path" :aria-current="link.name === current ? 'page' : null">
           <span>{{ link.title }}</span><kbd aria-hidden="true">{{ i + 1 }}</kbd></a>
         <div class="foot" role="status">
-          <div class="line"><i :class="['dot', faults.length ? 'warn' : 'good']"></i>{{ faults.length ? 'Needs a look' : 'Ready' }}</div>
+          <div class="line"><i :class="['dot', faults.length ? 'warn' : starting.length ? '' : 'good']"></i>{{ faults.length ? 'Needs a look' : starting.length ? 'Starting: ' + starting.join(', ') : 'Ready' }}</div>
           <div v-for="[name, detail] in faults" :key="name" class="warn">{{ name === 'egl' ? 'graphics' : name }}: {{ detail }}</div>
           <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
           <div>{{ status.disk || '\\u00a0' }}</div>

@@ -1,9 +1,14 @@
 """The service over HTTP: what it says of itself, and of requests that make no sense."""
 
 import socket
+from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 
+from server.services import health
+from server.settings import ServiceSettings
+from server.storage.database import open_database
 from tests.support.services import RunningService, await_state, upload
 
 
@@ -59,6 +64,19 @@ def test_health_metrics_models(http: httpx.Client) -> None:
     assert {"egl", "disk", "database", "rig", "worker"} <= set(ready.json()["checks"])
     assert "eigenhead_requests_total" in http.get("/metrics").text
     assert any(model["default"] for model in http.get("/v1/models").json()["models"])
+
+
+def test_a_worker_that_loads_is_no_fault(tmp_path: Path) -> None:
+    engine = open_database(ServiceSettings(data=tmp_path))
+    jobs = SimpleNamespace(worker_may_start=lambda: True)
+    service = SimpleNamespace(engine=engine, settings=ServiceSettings(data=tmp_path), jobs=jobs)
+    early = health._workers(service)  # type: ignore[arg-type]
+    assert (early.ok, early.starting, "being started" in early.detail) == (False, True, True)
+    jobs.worker_may_start = lambda: False
+    late = health._workers(service)  # type: ignore[arg-type]
+    assert (late.ok, late.starting) == (False, False)
+    assert "eigenhead worker" in late.detail
+    engine.dispose()
 
 
 def test_info_tells_limits_waiting_jobs_and_default_settings(http: httpx.Client, archive: bytes) -> None:
