@@ -68,8 +68,9 @@ def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
     took = guessed = 0.0
     for kind, stages in learnt.items():
         simplex = kind.startswith("simplex")
-        took += sum(stages.values())
-        guessed += sum(SIMPLEX_S if simplex and stage == "fit" else FIRST_S[stage] for stage in stages)
+        known = {stage: seconds for stage, seconds in stages.items() if seconds > 0}
+        took += sum(known.values())
+        guessed += sum(SIMPLEX_S if simplex and stage == "fit" else FIRST_S[stage] for stage in known)
     return took / guessed if took > 0 and guessed > 0 else 1.0
 
 
