@@ -28,7 +28,7 @@ from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import CaptureRecord
 from server.wire.multipart import receive_board_pictures, receive_capture
-from server.wire.send_file import send_file
+from server.wire.send_file import send_archive, send_file
 
 THUMBNAIL_WIDTH = 480
 THUMBNAIL_QUALITY = 82
@@ -77,6 +77,12 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     if not path.is_file():
         make_thumbnail(service.store.folder("captures", capture_id) / "files" / name, path)
     return FileResponse(path, headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/front")
+def front(who: Reader, capture_id: str) -> Response:
+    """The same of the front camera."""
+    return thumbnail(who, capture_id, who[0].store.capture(capture_id).front)
 
 
 @pages.get("/console/captures/{capture_id}/checks")
@@ -192,6 +198,12 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
     other_job = service.jobs.get(other)
     same = other_job.capture_id == job.capture_id
     return _floats(comparison.to_surface(mine, _result_folder(service, other) / "head.ply", align=not same))
+
+
+@pages.get("/console/jobs/{job_id}/all.zip")
+def all_files(who: Reader, request: Request, job_id: str) -> Response:
+    """Every file of the result in one archive."""
+    return send_archive(request, _result_folder(who[0], job_id), who[0].jobs.files(job_id))
 
 
 @pages.get("/console/jobs/{job_id}/{name}")

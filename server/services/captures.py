@@ -16,7 +16,7 @@ from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs, refuse_board
 from server.services.records import Found
-from server.services.rigs import SHOT_BYTES, RigBackend
+from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
@@ -24,6 +24,7 @@ from server.storage.store import Store, StoredFile, new_id
 from server.tasks.child import Children
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
+SAMPLE_SEED = 11
 TEXT_MOST = 500  # characters of a label and the like
 
 
@@ -75,6 +76,23 @@ class Captures:
                 judged = {} if board else {"measured": "checks" in shot}
                 content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
             return self._add(capture, "rig", content, about, shot)
+
+    def sample(self) -> CaptureRecord:
+        """A shot of the simulated studio, also where the rig is a real one. It shows nobody, so that nobody is asked
+        for consent. Raises Unavailable, and DiskFull."""
+        self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
+        studio = SimulatedRig(self._store.data / "rig" / "none")
+        try:
+            with self._store.incoming() as folder:
+                capture = folder / "capture"
+                shot = studio.capture(capture, seed=SAMPLE_SEED)
+                with self._children.one() as child:
+                    content = child.remote(ingest_folder)(
+                        folder=str(capture / "files"), image_pixels=self._settings.image_pixels, measured=False
+                    )
+                return self._add(capture, "rig", content, About(label="Sample, simulated studio"), shot, asked=False)
+        finally:
+            studio.close()
 
     def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
         """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
@@ -200,8 +218,10 @@ class Captures:
         content: CaptureContent,
         about: About,
         shot: Mapping[str, object] | None = None,
+        *,
+        asked: bool = True,
     ) -> CaptureRecord:
-        if not content.board:
+        if asked and not content.board:
             self._check_consent(about.session)
         faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
         self._store.put_checks(folder, all_checks(shot, content))

@@ -18,6 +18,7 @@ export default {
     listed() { return this.captures; },
     models() { return this.state.models || []; },
     current() { return this.state.chosen || null; },
+    preset() { return (this.state.presets || []).find((p) => p.id === this.method); },
     narrowed() { return !!(this.sought || this.verdict); },
   },
   watch: {
@@ -74,10 +75,9 @@ export default {
             <div v-if="!u.done" class="bar" role="progressbar" :aria-valuenow="Math.round(100 * u.share)" aria-valuemin="0" aria-valuemax="100" :aria-label="'Upload of ' + u.name"><i :style="{ width: 100 * u.share + '%' }"></i></div>
             <template v-if="u.detail"><p class="fault">{{ u.detail }}</p><ul class="faults scroll" style="max-height: 14rem"><li v-for="(f, i) in u.errors" :key="i">{{ f }}</li></ul></template>
           </div>
-          <input v-model="sought" id="find" type="search" maxlength="200" placeholder="Find: label, session, verdict, id" aria-label="Find captures">
+          <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, verdict, id" aria-label="Find captures"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
           <div class="line"><select v-model="verdict" id="verdict" class="grow" aria-label="Verdict"><option value="">every verdict</option><option value="good">good</option><option value="usable">usable</option><option value="poor">poor</option><option value="none">not judged</option></select>
-            <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="label">by label</option><option value="verdict">by verdict</option><option value="-bytes">largest first</option></select>
-            <button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
+            <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="label">by label</option><option value="verdict">by verdict</option><option value="-bytes">largest first</option></select></div>
           <div v-if="picking" class="panel pad stack small" role="region" aria-label="Selected captures">
             <div class="line wrap"><strong>{{ picked.length }} selected</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button></div>
             <div class="line wrap"><button class="b" id="bulk-reconstruct" :disabled="!picked.length || !!busy" @click="bulk('reconstruct', '', { method, model })">Reconstruct</button>
@@ -88,7 +88,8 @@ export default {
           <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures" data-scroll="captures" @keydown="walk">
             <div v-for="c in captures" :key="c.id" class="row-line"><input v-if="picking" type="checkbox" :value="c.id" v-model="picked" :aria-label="'Select ' + (c.label || clock(c.created))">
             <button class="row-button" :data-capture="c.id" :aria-current="current && c.id === current.id" @click="choose(c.id)">
-              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span v-for="t in tags(c)" :key="t.text" class="tag" :class="t.kind">{{ t.text }}</span></span>
+              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span v-if="tags(c).length === 1" class="tag" :class="tags(c)[0].kind">{{ tags(c)[0].text }}</span></span>
+              <span v-if="tags(c).length > 1" class="line wrap" style="gap: .3rem"><span v-for="t in tags(c)" :key="t.text" class="tag" :class="t.kind">{{ t.text }}</span></span>
               <span class="small muted">{{ clock(c.created) }} &middot; {{ c.source === 'rig' ? 'rig' : 'upload' }} &middot; {{ c.cameras.length }} cameras &middot; {{ size(c.bytes) }}</span>
               <span v-if="c.session || c.expression || c.features" class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression, c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
             </button></div>
@@ -98,7 +99,7 @@ export default {
         <div class="panel pad scroll" style="position: relative" tabindex="0" role="region" aria-label="Pictures">
           <div v-if="!state.loading && !current" class="empty" style="height: 100%; align-content: center">
             <h2>{{ narrowed ? 'No capture matches' : open ? 'No captures in this session yet' : 'No captures yet' }}</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
-            <a class="b main-action" href="/">Go to the rig</a></div>
+            <div class="line wrap" style="justify-content: center"><a class="b main-action" href="/">Go to the rig</a><button v-if="!narrowed && !open" class="b" id="sample" :disabled="!!busy" @click="act('sample', '')">{{ busy === 'sample' ? 'Drawing the studio ...' : 'Try a sample capture' }}</button></div></div>
           <div v-if="removal && current && removal.id === current.id" class="panel pad stack small" role="alertdialog" aria-label="Remove the capture" id="removal" style="border-color: var(--warn); margin-bottom: .7rem">
             <p><strong>Remove</strong> takes the {{ removal.pictures }} pictures with clean plates and caches ({{ size(removal.bytes) }}); it can be taken back for 10 s. <strong v-if="removal.heads.length" class="warn">{{ removal.heads.length }} {{ removal.heads.length === 1 ? 'head' : 'heads' }} ({{ size(removal.head_bytes) }}) with photographs of the face in the overlays would stay.</strong><span v-else>No head was made of it.</span></p>
             <p><strong>Erase for good</strong> takes {{ ['the pictures', removal.heads.length && (removal.heads.length === 1 ? 'the head' : 'all ' + removal.heads.length + ' heads'), removal.jobs.length && 'all other jobs'].filter(Boolean).join(', ') }} and every record of them. It cannot be taken back.</p>
@@ -107,10 +108,11 @@ export default {
             <label class="field grow">Label<input v-model="draft.label" maxlength="500" :placeholder="clock(current.created)" @change="act('edit', current.id, { label: draft.label })"></label>
             <label class="field grow">Expression<input v-model="draft.expression" maxlength="500" placeholder="neutral, smile ..." @change="act('edit', current.id, { expression: draft.expression })"></label>
             <label class="field">Session<select v-model="draft.session" style="max-width: 11rem" @change="act('edit', current.id, { session: draft.session || null })"><option value="">none</option><option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option></select></label>
-            <label class="field">Solver<select v-model="method" id="method"><option value="">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
+            <label class="field" :title="preset?.explanation">Settings<select v-model="method" id="method" aria-describedby="preset"><option v-for="p in state.presets" :key="p.id" :value="p.id">{{ p.title }}</option></select></label>
             <label v-if="models.length > 1" class="field">Model<select v-model="model" id="model"><option value="">default</option><option v-for="m in models.filter(m => m !== 'default')" :key="m">{{ m }}</option></select></label>
           </form>
-          <p v-if="current && large === null && current.jobs.length" class="line wrap small" id="jobs-of-capture" style="margin-bottom: .7rem"><span class="muted">Jobs</span><a v-for="j in current.jobs" :key="j.id" class="tag" :class="jobKind(j)" :href="j.state === 'succeeded' ? '/result/' + j.id : '/jobs?job=' + j.id">{{ j.state === 'succeeded' ? 'head' : j.state }} {{ j.progress === null ? j.id.slice(-6) : Math.round(100 * j.progress) + ' %' }}</a></p>
+          <p v-if="current && large === null && !current.board && preset" id="preset" class="small muted" style="margin-bottom: .7rem">{{ preset.explanation }}</p>
+          <p v-if="current && large === null && current.jobs.length" class="line wrap small" id="jobs-of-capture" style="margin-bottom: .7rem"><span class="muted">Jobs</span><a v-for="j in current.jobs.slice(0, 12)" :key="j.id" class="tag" :class="jobKind(j)" :href="j.state === 'succeeded' ? '/result/' + j.id : '/jobs?job=' + j.id">{{ j.state === 'succeeded' ? 'head' : j.state }} {{ j.progress === null ? j.id.slice(-6) : Math.round(100 * j.progress) + ' %' }}</a><a v-if="current.jobs.length > 12" :href="'/jobs?find=' + current.id">all {{ current.jobs.length }}</a></p>
           <verdict v-if="current && large === null && !current.board" :capture="current" style="margin-bottom: .7rem"></verdict>
           <div v-if="current && large === null" class="thumbs four">
             <button v-for="(camera, i) in current.cameras" :key="current.id + camera" class="thumb" style="padding: 0; border: 0; cursor: zoom-in" :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }" :aria-label="'Enlarge ' + camera" @click="large = i">

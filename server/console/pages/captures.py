@@ -17,6 +17,7 @@ from server.console.removal import removals
 from server.errors import NotFound, Unusable
 from server.services.bulk import each
 from server.services.captures import TEXT_MOST, About
+from server.services.presets import PRESETS, settings_of
 from server.services.records import Session
 from server.services.service import Service
 from server.services.work import Work
@@ -76,6 +77,12 @@ class SessionLine(TypedDict):
     captures: int
 
 
+class PresetLine(TypedDict):
+    id: str
+    title: str
+    explanation: str
+
+
 class CapturesState(TypedDict):
     """One page of captures; ``chosen`` is the one that is looked at, which may lie on another page."""
 
@@ -85,9 +92,12 @@ class CapturesState(TypedDict):
     total: int
     sessions: list[SessionLine]
     models: list[str]
+    presets: list[PresetLine]
 
 
 class WorkForm(Chosen):
+    """``method`` is a preset's id."""
+
     model: NotRequired[str | None]
     method: NotRequired[str | None]
 
@@ -138,6 +148,7 @@ def captures_state(service: Service, asked: Mapping[str, str | None]) -> Capture
         "total": found.total - (len(found.items) - len(records)),
         "sessions": sessions_list(service, asked["session"]),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
+        "presets": [{"id": p.id, "title": p.title, "explanation": p.explanation} for p in PRESETS],
     }
 
 
@@ -228,10 +239,16 @@ def reconstruct_session(page: Page, event: WorkForm) -> str:
 
 
 def chosen_work(event: WorkForm) -> Work:
-    """Model and solver of the form; what is not chosen is the service's default."""
-    method = event.get("method")
-    settings = {"method": method} if method else {}
-    return Work(event.get("model") or None, settings)
+    """Model and preset of the form; what is not chosen is the service's default."""
+    return Work(event.get("model") or None, settings_of(event.get("method")))
+
+
+def sample(page: Page, event: object) -> str:
+    """A capture of the simulated studio, for who has no pictures yet."""
+    record = page.service.captures.sample()
+    page.choice["capture"] = record.id
+    forget_captures()
+    return "A sample capture of the simulated studio is here: press Reconstruct."
 
 
 def edit(page: Page, event: EditForm) -> None:
@@ -323,6 +340,7 @@ CapturesPage.actions = {
     "erase_capture": Action("capture", erase_capture),
     "remove": Action("capture", discard),
     "bulk": Action("capture", bulk),
+    "sample": Action("capture", sample),
 }
 
 

@@ -45,10 +45,9 @@ export default {
         </template></header>
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
         <div class="stack" style="min-height: 0">
-          <input v-model="sought" id="find" type="search" maxlength="200" placeholder="Find: label, session, solver, id" aria-label="Find jobs">
+          <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, solver, id" aria-label="Find jobs"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
           <div class="line"><select v-model="only" id="state" class="grow" aria-label="State"><option value="">every state</option><option v-for="(n, s) in state.counts" :key="s" :value="s">{{ s }} ({{ n }})</option></select>
-            <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="-finished">ended last first</option></select>
-            <button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
+            <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="-finished">ended last first</option></select></div>
           <div v-if="picking" class="panel pad line wrap small" role="region" aria-label="Selected jobs"><strong>{{ picked.length }} selected</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button>
             <button class="b" id="bulk-cancel" :disabled="!picked.length || !!busy" @click="bulk('cancel')">Cancel</button><button class="b" id="bulk-restart" :disabled="!picked.length || !!busy" @click="bulk('restart')">Restart</button><button class="b" id="bulk-remove" :disabled="!picked.length || !!busy" @click="bulk('remove')">Remove</button></div>
         <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of jobs" data-scroll="jobs" @keydown="walk">

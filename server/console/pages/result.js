@@ -80,7 +80,7 @@ export default {
               <label v-if="cameras.length" class="field">Look through<select v-model="through" id="through"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
               <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
-            <h3>Downloads</h3>
+            <div class="line"><h3 class="grow">Downloads</h3><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="'head-' + job.id.slice(-6) + '.zip'">All files (.zip)</a></div>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
             <h3>Measurements, mm</h3>
             <table class="small"><tbody><tr v-for="[name, m] in rows" :key="name"><td>{{ name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td></tr></tbody></table>

@@ -28,14 +28,14 @@ export default {
           <div class="stack pad" style="gap: .3rem"><h2 class="cut">{{ title(s) }}</h2>
             <p class="small muted">{{ clock(s.created) }} &middot; {{ s.captures }} {{ s.captures === 1 ? 'shot' : 'shots' }} &middot; {{ s.heads }} {{ s.heads === 1 ? 'head' : 'heads' }}<template v-if="s.sessions.length > 1"> &middot; {{ s.sessions.length }} sessions</template></p>
             <p v-if="!s.consent" class="small warn">no note of consent</p><p v-if="s.running" class="small accent">{{ s.running }} {{ s.running === 1 ? 'job' : 'jobs' }} under way</p>
-            <div class="line wrap"><a class="b" :href="'/captures?session=' + s.id" @click="open(s)">Shots</a><a class="b" href="/" @click="open(s)">Shoot</a><a v-if="s.head" class="b push" :href="'/result/' + s.head">Head</a></div></div></article></div>
+            <div class="line wrap" style="gap: .3rem"><a class="b" :href="'/captures?session=' + s.id" @click="open(s)">Shots</a><a class="b" href="/" @click="open(s)">Shoot</a><a v-if="s.head" class="b push" :href="'/result/' + s.head">Head</a></div></div></article></div>
         <pager :behind="behind.length" :next="state.next" :size="listed.length" :total="state.total" @back="back" @forward="forward"></pager>
       </div>
     </section>`,
   created() { this.clock = clock; },
   methods: {
     title(s) { return s.label || "without a name, " + clock(s.created); },
-    picture(s) { return this.plain[s.id] ? "" : s.head ? `/console/jobs/${s.head}/portrait.jpg` : ""; },
+    picture(s) { return this.plain[s.id] ? "" : s.head ? `/console/jobs/${s.head}/portrait.jpg` : s.capture ? `/console/captures/${s.capture}/front` : ""; },
     open(s) { keepSession(s.id); },
     fields() { return { find: this.sought, sort: this.sort }; },
     question() { return { ...this.fields(), after: this.behind.at(-1) || "" }; },

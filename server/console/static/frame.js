@@ -43,7 +43,7 @@ export default {
       </div>
     </div>`,
   created() {
-    this.keys = [["1 - 7", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["Esc", "stop a countdown, close"],
+    this.keys = [["1 - 7", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["H", "Rig: open the head that is ready"], ["Esc", "stop a countdown, close"],
       ["1 - 7", "Features: choose a point"], ["Arrows", "Features: move it by 0.25 px (Shift: 2 px)"], ["Tab", "Features: next view"], ["Enter", "Features: take the suggested place"],
       ["Del", "Features: take the point back"], ["S", "Features: save"], ["H B", "Result: head, bust"], ["T G U P", "Result: texture, clay, uncertainty, parts"], ["W M", "Result: wireframe, measure"], ["?", "this list"]];
     window.eigenheadSay = (kind, text, faults) => this.say(kind, text, faults || []);
