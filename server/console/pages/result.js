@@ -80,11 +80,11 @@ export default {
               <label v-if="cameras.length" class="field">Look through<select v-model="through" id="through"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
               <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
-            <div class="line"><h3 class="grow">Downloads</h3><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="'head-' + job.id.slice(-6) + '.zip'">All files (.zip)</a></div>
+            <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="'head-' + job.id.slice(-6) + '.zip'">All files (.zip)</a></div>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
-            <h3>Measurements, mm</h3>
+            <h2 class="third">Measurements, mm</h2>
             <table class="small"><tbody><tr v-for="[name, m] in rows" :key="name"><td>{{ name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td></tr></tbody></table>
-            <h3>Fit</h3>
+            <h2 class="third">Fit</h2>
             <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">contour residual, {{ job.clear_views }} clear {{ job.clear_views === 1 ? 'view' : 'views' }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ job.method }}</td></tr><tr><td>level of detail</td><td class="num">{{ job.level }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
           </template>

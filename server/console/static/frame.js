@@ -8,7 +8,8 @@ const SCROLL_BACK_MS = 3000;
 export default {
   props: { links: Array, current: String, status: Object, removed: Array },
   emits: ["undo"],
-  data: () => ({ messages: [], next: 1, help: false }),
+  data: () => ({ messages: [], next: 1, help: false, look: localStorage.getItem("eigenhead-look") || "dark" }),
+  watch: { look: { handler(look) { document.documentElement.dataset.look = look; localStorage.setItem("eigenhead-look", look); }, immediate: true } },
   computed: {
     starting() { return (this.status?.starting || []).map((name) => (name === "egl" ? "graphics" : name)); },
     faults() { return Object.entries(this.status?.faults || {}); },
@@ -25,10 +26,10 @@ export default {
           <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
           <div>{{ status.disk || '\\u00a0' }}</div>
           <a v-if="status.local === false" href="/sign-in" style="padding: 0">Other API key</a>
-          <div><kbd>?</kbd> keys</div>
+          <div class="line"><span><kbd>?</kbd> keys</span><button class="b quiet small push" id="look" :aria-pressed="look === 'light'" @click="turn">{{ look === 'light' ? 'Dark' : 'Light' }}</button></div>
         </div>
       </nav>
-      <main class="main"><slot></slot></main>
+      <div class="main"><slot></slot></div>
       <div class="messages" role="log" aria-live="polite" aria-label="Messages">
         <div v-for="r in removed" :key="r.id" class="message line"><span class="grow">Removed: {{ r.title }}</span><button class="b" @click="$emit('undo', r.id)">Undo</button></div>
         <div v-for="m in messages" :key="m.id" :class="['message', m.kind]">
@@ -56,6 +57,7 @@ export default {
       this.messages = [...this.messages, { id, kind, text, faults: further }].slice(-MESSAGES_MOST);
       if (kind === "done") setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
     },
+    turn() { this.look = this.look === "light" ? "dark" : "light"; },
     place(name) { return `eigenhead scroll ${location.pathname} ${name}`; },
     scrolled(event) { const name = event.target.dataset?.scroll; if (name && !this.scrolling) sessionStorage.setItem(this.place(name), event.target.scrollTop); },
     scrollBack() { // to where the lists were before a reload, as soon as they are long enough again
