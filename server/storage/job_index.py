@@ -14,7 +14,7 @@ from sqlalchemy.exc import IntegrityError
 
 from server.storage.database import capture_index, job_index
 from server.storage.library import captures_with
-from server.storage.pages import Order, PageOf, contains, folded, page_of, words_of
+from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, words_of
 from server.storage.records import JobRequest
 
 ENQUEUED = ("DELAYED", "ENQUEUED")
@@ -59,7 +59,7 @@ class JobIndex:
         """Nothing happens where the job is known."""
         row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
         with suppress(IntegrityError), self._engine.begin() as connection:
-            connection.execute(sa.insert(job_index).values(**row, words=words_of_job(job_id, request)))
+            connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
 
     def remove(self, job_id: str) -> None:
         with self._engine.begin() as connection:
@@ -72,7 +72,7 @@ class JobIndex:
         for start in range(0, len(bare), AT_ONCE):
             some = bare[start : start + AT_ONCE]
             requests = requests_of(some)
-            words = {job: words_of_job(job, requests[job]) if job in requests else job for job in some}
+            words = {job: words_of_job(requests[job]) if job in requests else "" for job in some}
             change = sa.update(job_index).where(job_index.c.job_id == sa.bindparam("job"))
             with self._engine.begin() as connection:
                 connection.execute(
@@ -152,11 +152,12 @@ class JobIndex:
             clauses.append(row.session == query.session)
         for word in words_of(query.sought):
             captures = sa.select(capture_index.c.id).where(captures_with(word))
-            clauses.append(sa.or_(contains(row.words, word), row.capture_id.in_(captures)))
+            own = sa.or_(contains(row.words, word), is_or_ends(row.job_id, word))
+            clauses.append(sa.or_(own, row.capture_id.in_(captures)))
         return clauses
 
 
-def words_of_job(job_id: str, request: JobRequest) -> str:
+def words_of_job(request: JobRequest) -> str:
     settings = request.get("settings") or {}
     chosen = [str(settings[key]) for key in ("method", "detail") if settings.get(key)]
-    return folded(request.get("name"), request.get("model") or "default", *(chosen or ["contour"]), job_id)
+    return folded(request.get("name"), request.get("model") or "default", *(chosen or ["contour"]))

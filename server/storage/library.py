@@ -13,7 +13,7 @@ import structlog
 from sqlalchemy.dialects import postgresql, sqlite
 
 from server.storage.database import capture_index, scrub, session_index
-from server.storage.pages import Order, PageOf, contains, folded, page_of, words_of
+from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store
 
@@ -116,7 +116,7 @@ class Library:
         """Newest first. Raises InputError for a cursor of another list."""
         rows = sa.select().select_from(session_index)
         for word in words_of(sought):
-            rows = rows.where(contains(session_index.c.words, word))
+            rows = rows.where(sessions_with(word))
         with self._engine.connect() as connection:
             order = Order(session_index.c.id, session_index.c.id, descending=True)
             return page_of(connection, rows, order, limit, cursor)
@@ -131,7 +131,7 @@ class Library:
         )
         rows = sa.select(table.subject, newest, name).group_by(table.subject)
         for word in words_of(sought):
-            rows = rows.where(contains(table.words, word))
+            rows = rows.where(sessions_with(word))
         one = rows.subquery()
         by = one.c.newest if order.removeprefix("-") == "created" else one.c.name
         wanted = Order(by, one.c.newest, order.startswith("-"))
@@ -181,8 +181,14 @@ class Library:
 
 def captures_with(word: str) -> sa.ColumnElement[bool]:
     """Of captures that a word of a search stands in, or in whose session it does."""
-    sessions = sa.select(session_index.c.id).where(contains(session_index.c.words, word))
-    return sa.or_(contains(capture_index.c.words, word), capture_index.c.session.in_(sessions))
+    sessions = sa.select(session_index.c.id).where(sessions_with(word))
+    own = sa.or_(contains(capture_index.c.words, word), is_or_ends(capture_index.c.id, word))
+    return sa.or_(own, capture_index.c.session.in_(sessions))
+
+
+def sessions_with(word: str) -> sa.ColumnElement[bool]:
+    """Of sessions that a word of a search stands in."""
+    return sa.or_(contains(session_index.c.words, word), is_or_ends(session_index.c.id, word))
 
 
 def subject_of(record: SessionRecord) -> str:
@@ -207,7 +213,7 @@ def _capture_row(record: CaptureRecord, changed: int) -> dict[str, object]:
         "source": record.source,
         "board": record.board,
         "bytes": record.bytes,
-        "words": folded(record.label, record.expression, record.verdict, record.source, record.id, record.created[:10]),
+        "words": folded(record.label, record.expression, record.verdict, record.source),
         "changed": changed,
     }
 
@@ -217,7 +223,7 @@ def _session_row(record: SessionRecord, changed: int) -> dict[str, object]:
         "id": record.id,
         "subject": subject_of(record),
         "label": record.label,
-        "words": folded(record.label, record.consent, record.id),
+        "words": folded(record.label, record.consent),
         "changed": changed,
     }
 

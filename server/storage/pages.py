@@ -14,6 +14,7 @@ import sqlalchemy as sa
 from rig.errors import InputError
 
 WORDS_MOST = 10  # of a search: each is one comparison with every row
+ID_LEAST = 6  # digits of an id's end that name it
 Value = str | int | None
 
 
@@ -116,3 +117,8 @@ def folded(*texts: str | None) -> str:
 
 def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
     return column.contains(word, autoescape=True)
+
+
+def is_or_ends(identity: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
+    """Of rows whose id is ``word`` or ends with it, as pages shorten ids; a short word stands in too many ids."""
+    return identity.endswith(word, autoescape=True) if len(word) >= ID_LEAST else sa.false()

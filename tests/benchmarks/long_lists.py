@@ -84,7 +84,7 @@ def fill_jobs(engine: sa.Engine, jobs: Jobs, captures: list[str], count: int) ->
     with engine.connect() as connection:
         row = dict(connection.execute(sa.select(status).where(status.c.workflow_uuid == template.id)).mappings().one())
         inputs = dict(connection.execute(sa.select(given).where(given.c.workflow_uuid == template.id)).mappings().one())
-    words = words_of_job(template.id, {"capture_id": captures[0], "model": None, "settings": {"detail": "fine"}})
+    words = words_of_job({"capture_id": captures[0], "model": None, "settings": {"detail": "fine"}})
     for start in range(0, count, AT_ONCE):
         rows: list[list[dict[str, Any]]] = [[], [], [], []]
         for number in range(start, min(count, start + AT_ONCE)):

@@ -86,6 +86,8 @@ def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library
         return library.captures(replace(CaptureQuery(sought), **more), 10).ids
 
     assert found("müller") == found("POOR änne") == found("100%_l") == (identity(2),)
+    assert found("2") == ()  # a digit stands in too many ids
+    assert found(identity(2)) == found(identity(2)[-6:]) == (identity(2),)
     assert found("nobody") == found("front poor") == ()
     assert found("", session=identity(1)) == found("", verdict="poor") == found("", board=False) == (identity(2),)
     assert found("", verdict="none") == found("", before=identity(3))[:0] + (identity(3),)
