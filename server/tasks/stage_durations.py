@@ -62,6 +62,18 @@ def first_guess(settings: Settings) -> dict[str, float]:
     return seconds
 
 
+def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
+    """Seconds that a second of the first guess takes on this machine, by the kinds of jobs that it has done; 1 where
+    there is none."""
+    took = guessed = 0.0
+    for kind, stages in learnt.items():
+        simplex = kind.startswith("simplex")
+        known = {stage: seconds for stage, seconds in stages.items() if seconds > 0}
+        took += sum(known.values())
+        guessed += sum(SIMPLEX_S if simplex and stage == "fit" else FIRST_S[stage] for stage in known)
+    return took / guessed if took > 0 and guessed > 0 else 1.0
+
+
 class StageDurations:
     """Seconds that each stage is expected to take. ``file`` need not exist; where it cannot be written, only this
     process learns."""
@@ -71,9 +83,14 @@ class StageDurations:
         self._learnt: dict[str, dict[str, float]] = {}
 
     def of(self, settings: Settings) -> dict[str, float]:
-        """Seconds by stage, in their order."""
-        known = self._read().get(kind_of(settings), {})
-        return {stage: known.get(stage, seconds) for stage, seconds in first_guess(settings).items()}
+        """Seconds by stage, in their order. The first job of a kind goes by the guess, at the pace of the other kinds
+        that this machine has done."""
+        learnt, guess = self._read(), first_guess(settings)
+        known = learnt.get(kind_of(settings))
+        if known is None:
+            known, pace = {}, pace_of(learnt)
+            guess = {stage: pace * seconds for stage, seconds in guess.items()}
+        return {stage: known.get(stage, seconds) for stage, seconds in guess.items()}
 
     def learn(self, settings: Settings, seconds: Mapping[str, float]) -> None:
         """Takes in how long the stages of a job took."""
