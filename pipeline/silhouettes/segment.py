@@ -25,6 +25,7 @@ from pipeline.silhouettes.cross_view import count_rejecting_cameras
 from pipeline.silhouettes.foreground import Decision, decide, doubtful, reconsider
 from pipeline.silhouettes.matting import Matte, solve_matte
 from pipeline.silhouettes.view_consistency import judge_agreement
+from pipeline.silhouettes.without_plates.decide import decide_without_plates
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.rig import Rig
@@ -38,7 +39,10 @@ LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot;
 def segment(
     capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Callable[[str, float], None]
 ) -> dict[str, Silhouette]:
-    """The silhouette of every camera of the rig. Raises InputError where a camera has neither plate nor mask."""
+    """The silhouette of every camera of the rig; without any plate or mask the subject is found from the photographs.
+    Raises InputError where only some cameras have neither."""
+    if not capture.backgrounds and not capture.masks:
+        return _without_plates(capture, rig, settings, report)
     blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
     if blind:
         raise InputError(
@@ -69,6 +73,23 @@ def segment(
         for count, name in enumerate(rig.names, 1):
             silhouettes[name] = (given | finished)[name].result()
             report("segmentation", 0.4 + 0.5 * count / len(rig))
+    agreed = judge_agreement(silhouettes, rig, settings)
+    report("segmentation", 1.0)
+    return agreed
+
+
+def _without_plates(
+    capture: Capture, rig: Rig, settings: SegmentationSettings, report: Callable[[str, float], None]
+) -> dict[str, Silhouette]:
+    decisions = decide_without_plates(
+        capture.images, rig, settings, report=lambda share: report("segmentation", 0.8 * share)
+    )
+    with ThreadPoolExecutor(thread_count()) as pool:
+        jobs = {
+            name: pool.submit(_refined, capture.images[name], decision, settings)
+            for name, decision in decisions.items()
+        }
+        silhouettes = {name: job.result() for name, job in jobs.items()}
     agreed = judge_agreement(silhouettes, rig, settings)
     report("segmentation", 1.0)
     return agreed
