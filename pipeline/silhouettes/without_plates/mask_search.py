@@ -37,6 +37,8 @@ SUPPORT_WEIGHT, SUPPORT_MOST, DENIAL_MOST = 0.5, 1.0, 5.0  # of what the other v
 SOLID_ODDS = 3.0  # that a pixel gains where every other view has the subject
 CORE_ODDS, BORDER_ODDS = 2.0, -1.0
 LINK, LINK_NOISE, SWEEPS = 0.7, 2.0, 12  # of neighbours: log odds, noise levels that hardly count as an edge
+GREY_MOST = 2.0  # levels by which the channels of a grey photograph differ
+TEXTURE_PX, TEXTURE_GAIN = 2.0, 4.0  # sigma of the window; scatter by it counts like a colour
 SAMPLES_LEAST = 50  # pixels that a background is learnt from
 
 Mask = Bool[np.ndarray, "h w"]
@@ -84,20 +86,23 @@ def search_masks(
     volume: ViewingVolume,
     background: Mapping[str, Bool[np.ndarray, "_ _"]],
     *,
+    bounded: bool,
     report: Callable[[float], None],
 ) -> dict[str, CoarseMask]:
-    """The subject in every reduced image. ``background``: pixels that are known not to show it."""
+    """The subject in every reduced image. ``background``: pixels that are known not to show it. ``bounded``: the
+    volume holds all of the subject, so that what is beyond it may be learnt as background nearby at once."""
     up = guessed_up(rig)
     sizes = {name: image.shape[:2] for name, image in images.items()}
     seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name]) for camera in rig}
-    known = {name: seed.border | (background[name] & ~seed.core) for name, seed in seeds.items()}
+    known = {name: seed.border | ~seed.reachable | (background[name] & ~seed.core) for name, seed in seeds.items()}
+    images = {name: _with_texture(image) for name, image in images.items()}
     noise = {name: _noise(image) for name, image in images.items()}
     samples = {name: Samples(seed.core, known[name]) for name, seed in seeds.items()}
     found: dict[str, CoarseMask] = {}
     for step in range(ROUNDS):
         report(step / ROUNDS)
         common = sum((histogram(images[name][own.subject]) for name, own in samples.items()), np.float32(0))
-        local = step >= LOCAL_ROUNDS
+        local = step >= (BORDER_ROUNDS if bounded else LOCAL_ROUNDS)
         odds = {}
         for name, image in images.items():
             own = colour_odds(image, samples[name], common, noise[name], nearby=local)
@@ -147,6 +152,16 @@ def _one_piece(mask: Mask, core: Mask) -> Mask:
     sizes = np.bincount(labels[core & mask], minlength=count)
     sizes = sizes if sizes[1:].any() else np.bincount(labels.ravel(), minlength=count)
     return labels == 1 + int(np.argmax(sizes[1:]))
+
+
+def _with_texture(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """A grey photograph with its surroundings' mean and scatter in place of two channels that say nothing."""
+    if np.ptp(image, axis=2).max() > GREY_MOST:
+        return image
+    grey = image[:, :, 0]
+    mean = cv2.GaussianBlur(grey, (0, 0), TEXTURE_PX)
+    scatter = np.sqrt(np.maximum(cv2.GaussianBlur(grey * grey, (0, 0), TEXTURE_PX) - mean * mean, 0))
+    return cv2.merge([grey, mean, np.minimum(TEXTURE_GAIN * scatter, 255)])
 
 
 def _noise(image: Float32[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:

@@ -17,7 +17,8 @@ from pipeline.multiview.visual_hull import depth_of
 from rig.rig import Rig
 
 CELLS = 96  # voxels a side: 7 mm where images show 0.66 m, 2.6 pixels of the reduced images
-DENIES_MOST, GRANTS_MOST = 4.0, 1.0  # log odds that one view's word is worth: empty space in one view is empty
+DENIES_MOST = 4.0  # log odds that one view's word against a voxel is worth: empty space in one view is empty ...
+GRANTS_MOST, GRANTS_SUM = 1.0, 10.0  # ... and those for it, of one view and of all, however many they are
 WITNESSES_LEAST = 3  # other views that must see a voxel before their word counts
 WITNESSES_SHARE = 0.5  # of the other views that must hold a voxel for the subject before it must be in a mask
 SOLID_ODDS = 0.5  # log odds that all pixels around a voxel must have in a view that holds it for the subject
@@ -42,15 +43,8 @@ class OtherViews:
     solid: Bool[np.ndarray, "h w"]
 
 
-def viewing_volume(
-    rig: Rig,
-    sizes: Mapping[str, tuple[int, int]],
-    *,
-    plane_world: Float[np.ndarray, " 4"] | None = None,
-) -> ViewingVolume:
-    """The volume of a rig whose reduced images have ``sizes`` (height, width).
-
-    ``plane_world``: what the subject stands on; only the side on which ``plane . (x, 1)`` is positive is kept."""
+def viewing_ball(rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre (world) and radius (mm) of what the cameras look at: as far as the corners of the median image reach."""
     centre = rig.centre_world()
     radius = float(
         np.median(
@@ -61,6 +55,20 @@ def viewing_volume(
             ]
         )
     )
+    return centre, radius
+
+
+def viewing_volume(
+    rig: Rig,
+    sizes: Mapping[str, tuple[int, int]],
+    ball: tuple[Float[np.ndarray, " 3"], float],
+    *,
+    plane_world: Float[np.ndarray, " 4"] | None = None,
+) -> ViewingVolume:
+    """The volume of a rig whose reduced images have ``sizes`` (height, width), in ``ball``, centre and radius (mm).
+
+    ``plane_world``: what the subject stands on; only the side on which ``plane . (x, 1)`` is positive is kept."""
+    centre, radius = ball
     line = ((np.arange(CELLS) + 0.5) / CELLS * 2 - 1) * radius
     offsets = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
     voxels = centre + offsets[(offsets**2).sum(axis=1) < radius**2]
@@ -91,13 +99,14 @@ def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray
     """For each view, what the others say; ``odds``: of subject against background, of every view."""
     count = len(next(iter(volume.places.values())))
     total, seen, against = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
+    grants = min(GRANTS_MOST, GRANTS_SUM / max(1, len(odds) - 1))
     words: dict[str, Float32[np.ndarray, " n"]] = {}
     doubts: dict[str, Bool[np.ndarray, " n"]] = {}
     for name, field in odds.items():
         places = volume.places[name]
         shown = places >= 0
         at = np.where(shown, places, 0)
-        words[name] = np.where(shown, np.clip(field.ravel()[at], -DENIES_MOST, GRANTS_MOST), 0).astype(np.float32)
+        words[name] = np.where(shown, np.clip(field.ravel()[at], -DENIES_MOST, grants), 0).astype(np.float32)
         width = 2 * volume.reach_px[name] + 1
         around = cv2.erode(field, np.ones((width, width), np.uint8), borderValue=2 * SOLID_ODDS)
         doubts[name] = shown & (around.ravel()[at] < SOLID_ODDS)
