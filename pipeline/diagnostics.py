@@ -11,6 +11,7 @@ WARNING_CODES = (
     "eyes-closed",
     "features",
     "mask-contradicted",
+    "mask-doubtful",
     "mask-loose",
     "no-bust",
     "no-texture",

@@ -66,3 +66,9 @@ def _pixel_noise(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 3"]
     """Of one pixel (levels): differences of neighbours, most of which lie on no edge."""
     steps = image[::4, 1:].astype(np.float32) - image[::4, :-1]
     return (1.4826 * np.median(np.abs(steps), axis=(0, 1)) / np.sqrt(2)).astype(np.float32)
+
+
+def plate_noise(decision: Decision) -> float:
+    """By how much (levels) the guess is off along the subject's border."""
+    rim = dilated(decision.mask, MARGIN) & ~eroded(decision.mask, MARGIN)
+    return float(np.median(decision.background.noise[rim])) if rim.any() else 0.0
