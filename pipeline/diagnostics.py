@@ -17,11 +17,13 @@ WARNING_CODES = (
     "no-texture",
     "picture-duplicated",
     "plates-exchanged",
+    "scale-assumed",
     "scale-implausible",
     "shape-implausible",
     "unknown-key",
     "view",
     "view-left-out",
+    "views-many",
 )
 """Codes that a result's warnings may have; docs/operator.md says what each means and what to do."""
 
