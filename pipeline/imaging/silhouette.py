@@ -22,8 +22,8 @@ class ViewQuality:
     components: int = 1
     holes: int = 0
     warnings: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
     figures: Mapping[str, float | list[float]] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
