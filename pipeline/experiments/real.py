@@ -91,8 +91,7 @@ def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings:
     seconds = time.perf_counter() - started
     mesh, colours = surface_of(done)
     held_out = [given.rig[name] for name in near if name not in used]
-    unseen = [camera for camera in given.rig if camera.name not in used]
-    outline = {c.name: outline_px(c, mesh, given.drawn[c.name]) for c in unseen if c.name in given.drawn}
+    outline = {c.name: outline_px(c, mesh, given.drawn[c.name]) for c in held_out if c.name in given.drawn}
     of_masks = {c.name: outline_px(c, mesh, silhouettes[c.name].mask) for c in held_out if c.name in sound}
     psnr = {c.name: psnr_db(c, mesh, colours, given.capture.images[c.name], silhouettes[c.name]) for c in held_out}
     away = distances_mm(given, near, silhouettes, mesh)

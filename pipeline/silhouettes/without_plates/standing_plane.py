@@ -10,7 +10,7 @@ from jaxtyping import Float
 TRIPLES, SAMPLES = 20000, 2000  # drawn; of those far enough apart, tried
 OUTER, APART = 0.35, 0.4  # of the radius: how far from the middle, and from each other, the points of a sample are
 NEAR = 0.012  # of the volume's radius: how far a point of the plane may be from it; 3 mm of a head's picture
-POINTS_LEAST, SHARE_LEAST = 40, 0.04  # that lie on it
+POINTS_LEAST, SHARE_LEAST = 40, 0.08  # that lie on it; 0.11 of the Buddha's
 BEYOND_MOST = 0.01  # share of the points within the volume that may lie on its other side
 WIDTH_LEAST = 0.45  # of the radius: root mean square distance of its points from their middle; of a face 0.25
 OUTLYING, ROOM = 0.01, 1.2  # share of points that are wrong; of their distance, room for what shows none
