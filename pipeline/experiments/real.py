@@ -77,7 +77,8 @@ def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings:
     sound = [name for name in near if silhouettes[name].quality.usable]
     if len(sound) <= USED:
         raise InputError(given.name, [f"{len(sound)} views of use on the front side; more than {USED} are needed"])
-    used = spread_views(given.rig.subset(sound), USED)
+    whole = [name for name in sound if not silhouettes[name].quality.cut_off]
+    used = spread_views(given.rig.subset(whole if len(whole) > USED else sound), USED)
     rig = given.rig.subset(used)
     found = {name: silhouettes[name] for name in rig.names}
 
