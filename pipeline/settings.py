@@ -157,6 +157,17 @@ class DenseSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class SelectionSettings:
+    """Which photograph the detail comes from; costs are by that of a view which sees nothing of a place."""
+
+    disagreement: float = 0.12  # of the colour's level: a view that differs so much from the others ...
+    outlier: float = 1.0  # ... has half of this cost
+    smoothness: float = 0.15  # cost of a seam along an edge where views differ by ``disagreement``
+    levelling: float = 30.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
+    sweeps: int = 8  # of belief propagation
+
+
+@dataclass(frozen=True, slots=True)
 class TextureSettings:
     """Section 4.5. Chosen by the colour error over the visible face of captures rendered by another program."""
 
@@ -168,7 +179,8 @@ class TextureSettings:
     least_facing: float = 0.15  # cosine: at a flatter angle than 81 degrees a pixel smears over 6 mm
     footprint_px: float = 0.45  # sigma of the sampling window; 0.7 loses 0.3 dB of detail, 0.4 lets 1.5 dB more noise
     sharpening: float = 1.0  # unsharp mask of 1 px where there is detail: 1.2, 2.2 and 0.8 dB on three true heads
-    highlight: float = 0.12  # excess over the median of the views, by its level, at which a view counts half
+    outlier: float = 0.12  # difference from the median of the views, by its level, at which a view counts half
+    selection: SelectionSettings = field(default_factory=SelectionSettings)
 
 
 SPACING_RANGE_MM = (0.5, 3.0)  # finer is below the photographs' pixels, coarser has no lids

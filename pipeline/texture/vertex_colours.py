@@ -24,8 +24,12 @@ from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.parallel_for import thread_count
 from pipeline.settings import TextureSettings
+from pipeline.texture.decision import Decision, pack_pictures
 from pipeline.texture.inpaint import fill_unknown
+from pipeline.texture.paint_kernels import Pictures
+from pipeline.texture.seam_levelling import level_seams
 from pipeline.texture.vertex_colours_kernels import blend_views
+from pipeline.texture.view_selection import Neighbourhood, select_views
 from pipeline.texture.visibility import Sight, see_points, sharpened
 from rig.camera import Camera
 from rig.capture import Capture
@@ -37,6 +41,8 @@ REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hid
 GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
+
+GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
 
 Rgb = tuple[float, float, float]
 
@@ -50,6 +56,7 @@ class Texture:
     gains: Mapping[str, Rgb] = field(default_factory=dict)  # linear, by camera
     offsets: Mapping[str, Rgb] = field(default_factory=dict)
     filled: int = 0
+    decision: Decision | None = None  # where it was asked for
     warnings: tuple[ReportWarning, ...] = ()
 
 
@@ -61,46 +68,75 @@ def texture(
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
     settings: TextureSettings,
+    *,
+    around: Neighbourhood | None = None,
 ) -> Texture:
-    """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them."""
+    """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them. With
+    ``around``, the mesh's edges, a view is also chosen for every vertex."""
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
         return _reference(mesh_world, normals, capture, silhouettes, views, depths)
     if not len(views):
         return _untextured(len(normals))
 
-    def look(camera: Camera) -> Sight:
+    def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
         given = image, silhouettes[name], depths[name]
-        return see_points(camera, *given, mesh_world.vertices, normals, settings)
+        return see_points(camera, *given, mesh_world.vertices, normals, settings), image
 
     with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
-        sights = list(pool.map(look, views))
+        found = list(pool.map(look, views))
+    weights, colours = _stacked([sight for sight, _ in found])
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
-        gains, offsets = balance(*_stacked(sights))
-    linear, seen = blend(sights, gains, offsets, settings.highlight)
+        gains, offsets = balance(weights, colours)
+    weights *= believed(gains)[:, None]
+    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    agreed, seen = blend_views(weights, balanced, settings.outlier)
     if not seen.any():
         return _untextured(len(seen))
-    colours = np.rint(255 * srgb_from_linear(fill_unknown(linear, seen > 0, mesh_world.faces))).astype(np.uint8)
+    decision = None
+    if around is not None:
+        images = [image for _, image in found]
+        masks = {name: silhouettes[name].mask for name in views.names}
+        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world, settings.footprint_px)
+        decision = decide(views, weights, balanced, agreed, gains, pictures, around, settings)
+    shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
-    return Texture(colours, seen, by_camera, _by_name(views, offsets), filled, _gain_warnings(by_camera))
+    told = _gain_warnings(by_camera)
+    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, told)
+
+
+def believed(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
+    """Share that a camera's word has left: what had to be made much brighter brings its noise along, and a dim view is
+    often a shadowed one."""
+    return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
+
+
+def decide(
+    views: Rig,
+    weights: Float32[np.ndarray, "k v"],
+    balanced: Float32[np.ndarray, "k v 3"],
+    agreed: Float[np.ndarray, "v 3"],
+    gains: Float[np.ndarray, "k 3"],
+    pictures: Pictures,
+    around: Neighbourhood,
+    settings: TextureSettings,
+) -> Decision:
+    """A view for each vertex, and what levels the seams between them."""
+    chosen = settings.selection
+    labels = select_views(weights, balanced, agreed, gains, around, chosen)
+    codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
+    level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
+    correction = level_seams(labels, weights, codes, level_to, around, chosen.levelling)
+    return Decision(views, labels, correction, weights, pictures)
 
 
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
     """The cameras that may colour a head."""
     return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
-
-
-def blend(
-    sights: Sequence[Sight], gains: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, "k 3"], highlight: float
-) -> tuple[Float[np.ndarray, "v 3"], UInt8[np.ndarray, " v"]]:
-    """Linear colour of each point and the number of views that gave it."""
-    weights, colours = _stacked(sights)
-    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    return blend_views(weights, balanced, highlight)
 
 
 def _stacked(sights: Sequence[Sight]) -> tuple[Float32[np.ndarray, "k v"], Float32[np.ndarray, "k v 3"]]:

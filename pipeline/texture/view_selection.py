@@ -1,0 +1,83 @@
+"""Which photograph each part of the head takes its detail from.
+
+After Waechter, Moehrle and Goesele, *Let There Be Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): a
+label a vertex that minimises a data term (projected area and angle, visibility of the whole neighbourhood, how far a
+view's colour is from what the others say, be it a highlight or a shadow, and how strongly the camera had to be
+corrected) and a Potts term on the edges, dearest where the views disagree, so that seams keep out of eyes and lips.
+Labels sit at vertices in place of faces: in the ring of triangles at a seam two photographs are then faded into each
+other. Minimised by belief propagation (Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*,
+IJCV 2006), sweeping through the vertices there and back.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from pipeline.settings import SelectionSettings
+from pipeline.texture.view_selection_kernels import NEVER, best_candidates, propagate, ring_quality
+
+CANDIDATES = 6  # views of a vertex that come into question; a seventh is hardly ever the best
+GAIN_COST = 1.0  # of a camera whose light was doubled or halved
+ABSOLUTE = 0.004  # linear: disagreement that noise makes in the dark
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Neighbourhood:
+    """Vertices about each vertex, in compressed rows, and the place of the same edge seen from its other end."""
+
+    starts: Int32[np.ndarray, " s"]
+    indices: Int32[np.ndarray, " e"]
+    opposite: Int32[np.ndarray, " e"]
+
+    @classmethod
+    def of(cls, starts: Int32[np.ndarray, " s"], indices: Int32[np.ndarray, " e"]) -> "Neighbourhood":
+        """``starts`` and sorted ``indices`` of a symmetric adjacency."""
+        rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
+        # Rows are sorted: ordered by the other end first, the edges of its row come in the same order.
+        opposite = np.empty(len(indices), np.int32)
+        opposite[np.lexsort((rows, indices))] = np.arange(len(indices), dtype=np.int32)
+        return cls(starts, indices, opposite)
+
+    @property
+    def rows(self) -> Int32[np.ndarray, " e"]:
+        return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
+
+
+def select_views(
+    weights: Float32[np.ndarray, "k v"],
+    colours: Float32[np.ndarray, "k v 3"],
+    agreed: Float[np.ndarray, "v 3"],
+    gains: Float[np.ndarray, "k 3"],
+    around: Neighbourhood,
+    settings: SelectionSettings,
+) -> Int32[np.ndarray, " v"]:
+    """A view for each vertex, -1 where none sees it.
+
+    Args:
+        weights: of the views by angle and distance, 0 = not seen.
+        colours: linear, gains applied.
+        agreed: what the views agree on, linear.
+        gains: of the cameras, which multiply to one.
+        around: the mesh's edges.
+        settings: of the selection.
+    """
+    quality = ring_quality(weights, around.starts, around.indices)
+    best = quality.max(axis=1, keepdims=True)
+    costs = 1.0 - quality / np.maximum(best, 1e-12)
+    off = np.abs(colours - agreed).transpose(1, 0, 2) / (settings.disagreement * agreed[:, None] + ABSOLUTE)
+    off = np.sqrt((off**2).mean(axis=2))
+    costs += settings.outlier * off**2 / (1.0 + off**2)
+    costs += GAIN_COST * np.abs(np.log2(gains.mean(axis=1)))
+    costs = np.where(weights.T > 0, costs, NEVER).astype(np.float32)
+    views, candidates = best_candidates(costs, min(CANDIDATES, len(weights)))
+    share = np.where(weights.T > 0, quality, 0.0)
+    spread = (share * off).sum(axis=1) / np.maximum(share.sum(axis=1), 1e-12)
+    unlike = np.minimum(spread, 3.0)
+    penalty = settings.smoothness * (0.3 + 0.5 * (unlike[around.rows] + unlike[around.indices]))
+    chosen = propagate(
+        views, candidates, around.starts, around.indices, around.opposite, penalty.astype(np.float32), len(weights),
+        settings.sweeps,
+    )  # fmt: skip
+    found = np.take_along_axis(views, np.maximum(chosen, 0)[:, None], axis=1)[:, 0]
+    return np.where(chosen >= 0, found, -1).astype(np.int32)
