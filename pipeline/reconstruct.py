@@ -42,9 +42,10 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import usable_views
-from pipeline.texture.atlas import paint_atlas
-from pipeline.texture.uv_unwrap import unwrap
-from pipeline.texture.vertex_colours import texture
+from pipeline.texture.model_layout import ModelLayout, model_layout
+from pipeline.texture.paint import paint_texture, texture_size
+from pipeline.texture.uv_unwrap import Atlas, NoLayout
+from pipeline.texture.vertex_colours import Texture, texture
 from rig.capture import Capture
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
@@ -128,16 +129,14 @@ def reconstruct(
             mesh, quality = Mesh(finer.vertices, full.faces), finer.deviation_mm
     clock("texture")
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture)
+    layout, texture_warnings = find_layout(model, settings)
+    around = None if layout is None else layout.around
+    coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture, around=around)
+    atlas = paint_head(layout, mesh, coloured, full.face_region, settings)
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
         skin = None if finer is None else part_of(mesh, finer.observed)
         bust, bust_warnings = find_bust(maps, votes, bias, capture, silhouettes, rig, mesh, skin, settings, clock)
-    atlas = None
-    if settings.outputs.atlas:
-        clock("atlas")
-        layout = unwrap(model.vertices(np.zeros(0)), full.faces)
-        atlas = paint_atlas(layout, mesh, normals, coloured, capture, silhouettes, rig, depths, settings.texture)
     clock("evidence")
     before = start_masks(model, start, rig)
     fitted_masks = {name: np.isfinite(depth) for name, depth in depths.items()}
@@ -150,6 +149,7 @@ def reconstruct(
         *warnings,
         *eye_warnings(finer),
         *coloured.warnings,
+        *texture_warnings,
         *bust_warnings,
     )
     refuse(told, settings.fail_on)
@@ -182,6 +182,35 @@ def reconstruct(
         bust=bust,
         parts=parts,
     )
+
+
+def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
+    """The model's texture layout where a file of the result has a texture, and warnings of settings and model."""
+    outputs = settings.outputs
+    old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
+    told = [
+        ReportWarning("old-setting", f"{name} is read as it was meant; write outputs.formats in its place")
+        for name, given in old.items()
+        if given
+    ]
+    if not outputs.textured or settings.texture.blend == "reference":
+        return None, told
+    try:
+        return model_layout(model), told
+    except NoLayout as reason:
+        return None, [*told, ReportWarning("no-texture-layout", str(reason))]
+
+
+def paint_head(
+    layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: np.ndarray, settings: Settings
+) -> Atlas | None:
+    """The head's texture; None where there is no layout, or no camera saw it."""
+    if layout is None or coloured.decision is None:
+        return None
+    region = np.flatnonzero(face_region)
+    wanted = settings.outputs.texture_size
+    size = texture_size(layout.layout, mesh, coloured.decision.views, region, wanted=wanted)
+    return paint_texture(layout.layout, mesh, coloured.colours, coloured.decision, size)
 
 
 def find_bust(

@@ -164,6 +164,8 @@ class SelectionSettings:
     outlier: float = 1.0  # ... has half of this cost
     smoothness: float = 0.15  # cost of a seam along an edge where views differ by ``disagreement``
     levelling: float = 30.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
+    views_most: int = 3  # a place's detail is the mean of so many views ...
+    noise_factor: float = 2.0  # ... that differ from the chosen one by no more than this, by the median over the head
     sweeps: int = 8  # of belief propagation
 
 
@@ -193,13 +195,31 @@ class BustSettings:
     spacing_mm: float = 1.5  # of its vertices, 0.5 to 3: three pixels of the usual rig
 
 
+FORMATS = ("glb", "ply", "obj", "usdz", "stl", "3mf")
+TEXTURE_SIZES = (1024, 2048, 4096, 8192)
+
+
 @dataclass(frozen=True, slots=True)
 class OutputSettings:
     """Which surfaces are made, and files beside those that every result has."""
 
     surface: Literal["head", "bust", "both"] = "both"  # the model's head, all that the cameras see, or both
-    obj: bool = False  # head.obj, with vertex colours
-    atlas: bool = False  # head_atlas.glb, whose texture keeps the photographs' resolution
+    formats: tuple[str, ...] = ("glb", "ply")  # of the head, of FORMATS; head.ply is always written
+    image: Literal["jpeg", "webp", "png"] = "jpeg"  # of head.glb's texture
+    texture_size: int | None = None  # texels; None: a texel is about a pixel at the face
+    ply_texture: bool = False  # head.ply names head.png and has texture coordinates
+    obj: bool = False  # of earlier versions: "obj" among the formats
+    atlas: bool = False  # of earlier versions: head.glb has a texture now
+
+    @property
+    def written(self) -> tuple[str, ...]:
+        """The formats, those of earlier settings included."""
+        return (*self.formats, *(["obj"] if self.obj and "obj" not in self.formats else []))
+
+    @property
+    def textured(self) -> bool:
+        """Whether any file has a texture."""
+        return self.surface != "bust" and (self.ply_texture or bool({"glb", "obj", "usdz"} & set(self.written)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +252,11 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
     least, most = SPACING_RANGE_MM
     if not least <= settings.bust.spacing_mm <= most:
         faults.append(f"bust.spacing_mm is {settings.bust.spacing_mm:g}, wanted {least:g} to {most:g}")
+    strange = [name for name in settings.outputs.formats if name not in FORMATS]
+    faults += [f"outputs.formats: {name!r:.80} is none of {', '.join(FORMATS)}" for name in strange]
+    size = settings.outputs.texture_size
+    if size is not None and size not in TEXTURE_SIZES:
+        faults.append(f"outputs.texture_size is {size}, wanted {', '.join(map(str, TEXTURE_SIZES))} or null")
     if faults:
         raise InputError(subject, faults)
     return settings

@@ -18,11 +18,13 @@ CODES = np.arange(256) / 255.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """A view for each vertex (-1: none sees it), what is added to it (codes), and what the cameras see."""
+    """The views of each vertex (-1: none), the first the chosen one, their shares, what is added to them (codes), and
+    what the cameras see."""
 
     views: Rig
-    labels: Int32[np.ndarray, " v"]
-    correction: Float32[np.ndarray, "v 4"]
+    slots: Int32[np.ndarray, "v s"]
+    shares: Float32[np.ndarray, "v s"]
+    corrections: Float32[np.ndarray, "v s 4"]
     weights: Float32[np.ndarray, "k v"]  # 0 where a view does not see a vertex
     pictures: Pictures
 
@@ -30,7 +32,7 @@ class Decision:
         """For the compiled loops; ``colours`` where no view sees a triangle."""
         filled = np.zeros((len(colours), 4), np.float32)
         filled[:, :3] = colours
-        return Choice(self.labels, self.correction, filled, self.weights)
+        return Choice(self.slots, self.shares, self.corrections, filled, self.weights)
 
 
 def window_table(sigma: float) -> Float32[np.ndarray, "_ _"]:

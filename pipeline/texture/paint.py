@@ -15,7 +15,7 @@ from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.parallel_for import in_threads
 from pipeline.texture.decision import Decision
-from pipeline.texture.paint_kernels import face_views, paint_rows
+from pipeline.texture.paint_kernels import paint_rows
 from pipeline.texture.uv_unwrap import Atlas, Layout
 from rig.mesh import Mesh
 from rig.rig import Rig
@@ -41,7 +41,6 @@ def paint_texture(
     cv2.resize(_coarse(layout, colours), (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
     texels = size * layout.uv - 0.5
     choice = decision.choice(colours)
-    views = face_views(choice.labels, choice.weights, mesh_world.faces)
     corners = texels[layout.faces, 1]
     low, high = corners.min(axis=1), corners.max(axis=1)
 
@@ -50,7 +49,7 @@ def paint_texture(
             row = band * BAND_ROWS
             which = np.flatnonzero((high >= row) & (low <= row + BAND_ROWS - 1))
             paint_rows(
-                stored, row, BAND_ROWS, which, texels, layout.faces, layout.source, views, decision.pictures, choice
+                stored, row, BAND_ROWS, which, texels, layout.faces, layout.source, decision.pictures, choice
             )
 
     in_threads(size // BAND_ROWS, paint)

@@ -22,10 +22,11 @@ class Pictures(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What every vertex takes: a view, and what its colour is raised by, in codes."""
+    """What every vertex takes: views, their shares, and what their colours are raised by, in codes."""
 
-    labels: np.ndarray  # int32 (v,), -1: no view
-    correction: np.ndarray  # float32 (v, 4)
+    slots: np.ndarray  # int32 (v, s), -1: no view
+    shares: np.ndarray  # float32 (v, s)
+    corrections: np.ndarray  # float32 (v, s, 4)
     colours: np.ndarray  # float32 (v, 4): codes where no view can be asked
     weights: np.ndarray  # float32 (k, v), 0 where a view does not see a vertex
 
@@ -63,22 +64,52 @@ def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> N
 
 
 @njit(cache=True, nogil=True)
-def face_views(labels: np.ndarray, weights: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which corner's view, and correction, each corner of each face takes: its own where that view sees all of the
-    face, else another corner's that does, else none (-1)."""
-    out = np.full((len(faces), 3), -1, np.int32)
-    for f in range(len(faces)):
-        good = -1
-        for turn in range(3):
-            k = labels[faces[f, turn]]
-            if k >= 0 and weights[k, faces[f, 0]] > 0 and weights[k, faces[f, 1]] > 0 and weights[k, faces[f, 2]] > 0:
-                out[f, turn] = turn
-                if good < 0:
-                    good = turn
-        for turn in range(3):
-            if out[f, turn] < 0:
-                out[f, turn] = good
-    return out
+def gather(
+    corners: tuple[int, int, int], choice: Choice, view: np.ndarray, share: np.ndarray, added: np.ndarray
+) -> int:  # fmt: skip
+    """The views of a triangle's corners that see all of it: ``view`` (n,), ``share`` (n, 3) of each at the corners and
+    ``added`` (3, 3), the corners' corrections. Returns n; 0 where there is none."""
+    slots, weights = choice.slots, choice.weights
+    n = 0
+    for c in range(3):
+        for s in range(slots.shape[1]):
+            k = slots[corners[c], s]
+            if k < 0 or not (weights[k, corners[0]] > 0 and weights[k, corners[1]] > 0 and weights[k, corners[2]] > 0):
+                continue
+            at = 0
+            while at < n and view[at] != k:
+                at += 1
+            if at == n:
+                view[n] = k
+                share[n] = 0.0
+                n += 1
+            share[at, c] = choice.shares[corners[c], s]
+    added[:] = 0.0
+    for c in range(3):
+        total = np.float32(0.0)
+        for at in range(n):
+            total += share[at, c]
+        if total <= 0.0:  # the others' views are asked here, too
+            for at in range(n):
+                share[at, c] = share[at, (c + 1) % 3] + share[at, (c + 2) % 3]
+                total += share[at, c]
+        for at in range(n):
+            share[at, c] /= total
+            if share[at, c] > 0.0:
+                for channel in range(3):
+                    added[c, channel] += share[at, c] * correction_of(corners, c, view[at], channel, choice)
+    return n
+
+
+@njit(cache=True, nogil=True, inline="always")
+def correction_of(corners: tuple[int, int, int], c: int, k: int, channel: int, choice: Choice) -> float:
+    """Of view k at corner c, or at the first other corner that takes it."""
+    for turn in range(3):
+        v = corners[(c + turn) % 3]
+        for s in range(choice.slots.shape[1]):
+            if choice.slots[v, s] == k:
+                return choice.corrections[v, s, channel]
+    return np.float32(0.0)
 
 
 @njit(cache=True, nogil=True)
@@ -90,13 +121,14 @@ def paint_rows(
     texels: np.ndarray,
     faces: np.ndarray,
     source: np.ndarray,
-    views: np.ndarray,
     pictures: Pictures,
     choice: Choice,
 ) -> None:
     """Paints what the faces ``which`` cover of ``rows`` rows from ``row`` on. Blue first, as encoders want it."""
     width = image.shape[1]
     code = np.zeros(3, np.float32)
+    most = 3 * choice.slots.shape[1]
+    view, share, added = np.zeros(most, np.int32), np.zeros((most, 3), np.float32), np.zeros((3, 3), np.float32)
     for n in range(len(which)):
         f = which[n]
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -106,13 +138,12 @@ def paint_rows(
             continue
         low, high = max(np.ceil(min(ay, by, cy)), float(row)), min(np.floor(max(ay, by, cy)), row + rows - 1.0)
         left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
+        if low > high or left > right:
+            continue
         p, q, s = source[i], source[j], source[k]
-        corners = (p, q, s)
-        own = views[f, 0] >= 0
-        first = choice.labels[corners[views[f, 0]]] if own else -1
-        second = choice.labels[corners[views[f, 1]]] if own else -1
-        third = choice.labels[corners[views[f, 2]]] if own else -1
-        alike = own and first == second and second == third
+        found = gather((p, q, s), choice, view, share, added)
+        if found == 0:
+            added[0], added[1], added[2] = choice.colours[p, :3], choice.colours[q, :3], choice.colours[s, :3]
         for y in range(int(low), int(high) + 1):
             for x in range(int(left), int(right) + 1):
                 wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
@@ -120,28 +151,25 @@ def paint_rows(
                 wc = 1.0 - wa - wb
                 if wa < -1e-9 or wb < -1e-9 or wc < -1e-9:
                     continue
-                r, g, b = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-                for corner in range(3):
-                    share = np.float32(wa if corner == 0 else wb if corner == 1 else wc)
-                    if not own:
-                        v = corners[corner]
-                        r += share * choice.colours[v, 0]
-                        g += share * choice.colours[v, 1]
-                        b += share * choice.colours[v, 2]
+                a, b, c = np.float32(wa), np.float32(wb), np.float32(wc)
+                red = a * added[0, 0] + b * added[1, 0] + c * added[2, 0]
+                green = a * added[0, 1] + b * added[1, 1] + c * added[2, 1]
+                blue = a * added[0, 2] + b * added[1, 2] + c * added[2, 2]
+                for at in range(found):
+                    part = a * share[at, 0] + b * share[at, 1] + c * share[at, 2]
+                    if part <= 0.0:
                         continue
-                    v = corners[views[f, corner]]
-                    if corner == 0 or not alike:
-                        at = pictures.places[choice.labels[v]]
-                        sample(
-                            pictures,
-                            choice.labels[v],
-                            wa * at[p, 0] + wb * at[q, 0] + wc * at[s, 0],
-                            wa * at[p, 1] + wb * at[q, 1] + wc * at[s, 1],
-                            code,
-                        )
-                    r += share * (code[0] + choice.correction[v, 0])
-                    g += share * (code[1] + choice.correction[v, 1])
-                    b += share * (code[2] + choice.correction[v, 2])
-                image[y, x, 0] = np.uint8(min(max(b + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
-                image[y, x, 1] = np.uint8(min(max(g + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
-                image[y, x, 2] = np.uint8(min(max(r + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
+                    place = pictures.places[view[at]]
+                    sample(
+                        pictures,
+                        view[at],
+                        a * place[p, 0] + b * place[q, 0] + c * place[s, 0],
+                        a * place[p, 1] + b * place[q, 1] + c * place[s, 1],
+                        code,
+                    )
+                    red += part * code[0]
+                    green += part * code[1]
+                    blue += part * code[2]
+                image[y, x, 0] = np.uint8(min(max(blue + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
+                image[y, x, 1] = np.uint8(min(max(green + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))
+                image[y, x, 2] = np.uint8(min(max(red + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))

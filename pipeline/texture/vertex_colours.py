@@ -27,9 +27,9 @@ from pipeline.settings import TextureSettings
 from pipeline.texture.decision import Decision, pack_pictures
 from pipeline.texture.inpaint import fill_unknown
 from pipeline.texture.paint_kernels import Pictures
-from pipeline.texture.seam_levelling import level_seams
+from pipeline.texture.seam_levelling import level_views
 from pipeline.texture.vertex_colours_kernels import blend_views
-from pipeline.texture.view_selection import Neighbourhood, select_views
+from pipeline.texture.view_selection import Neighbourhood, add_alike, select_views
 from pipeline.texture.visibility import Sight, see_points, sharpened
 from rig.camera import Camera
 from rig.capture import Capture
@@ -127,11 +127,14 @@ def decide(
 ) -> Decision:
     """A view for each vertex, and what levels the seams between them."""
     chosen = settings.selection
-    labels = select_views(weights, balanced, agreed, gains, around, chosen)
+    labels, options, quality = select_views(weights, balanced, agreed, gains, around, chosen)
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
-    correction = level_seams(labels, weights, codes, level_to, around, chosen.levelling)
-    return Decision(views, labels, correction, weights, pictures)
+    fields = level_views(weights, codes, level_to, around, chosen.levelling)
+    detail = codes + fields[:, :, :3]
+    slots, shares = add_alike(labels, options, quality, detail, weights, around, chosen)
+    corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
+    return Decision(views, slots, shares, corrections, weights, pictures)
 
 
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:

@@ -15,7 +15,14 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from pipeline.settings import SelectionSettings
-from pipeline.texture.view_selection_kernels import NEVER, best_candidates, propagate, ring_quality
+from pipeline.texture.view_selection_kernels import (
+    NEVER,
+    best_candidates,
+    differences,
+    fill_slots,
+    propagate,
+    ring_quality,
+)
 
 CANDIDATES = 6  # views of a vertex that come into question; a seventh is hardly ever the best
 GAIN_COST = 1.0  # of a camera whose light was doubled or halved
@@ -51,8 +58,8 @@ def select_views(
     gains: Float[np.ndarray, "k 3"],
     around: Neighbourhood,
     settings: SelectionSettings,
-) -> Int32[np.ndarray, " v"]:
-    """A view for each vertex, -1 where none sees it.
+) -> tuple[Int32[np.ndarray, " v"], Int32[np.ndarray, "v c"], Float32[np.ndarray, "v c"]]:
+    """A view for each vertex, -1 where none sees it; the views that came into question, and their quality.
 
     Args:
         weights: of the views by angle and distance, 0 = not seen.
@@ -80,4 +87,38 @@ def select_views(
         settings.sweeps,
     )  # fmt: skip
     found = np.take_along_axis(views, np.maximum(chosen, 0)[:, None], axis=1)[:, 0]
-    return np.where(chosen >= 0, found, -1).astype(np.int32)
+    labels = np.where(chosen >= 0, found, -1).astype(np.int32)
+    return labels, views, np.where(views >= 0, np.take_along_axis(quality, np.maximum(views, 0), axis=1), 0.0)
+
+
+def add_alike(
+    labels: Int32[np.ndarray, " v"],
+    views: Int32[np.ndarray, "v c"],
+    quality: Float32[np.ndarray, "v c"],
+    detail: Float32[np.ndarray, "k v 3"],
+    weights: Float32[np.ndarray, "k v"],
+    around: Neighbourhood,
+    settings: SelectionSettings,
+) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
+    """The chosen views, and beside them others that differ from them by noise alone: their mean has less of it. Where
+    they differ by more, in eyes, brows and lips, blending would blur.
+
+    Args:
+        labels: the chosen view of each vertex, -1 = none.
+        views: those that come into question.
+        quality: of them.
+        detail: what levelled views show beyond what all agree on, codes.
+        weights: 0 where a view does not see a vertex.
+        around: the mesh's edges.
+        settings: of the selection.
+
+    Returns:
+        Views (-1: none) and shares, the chosen one first.
+    """
+    off = differences(labels, views, detail, weights, around.starts, around.indices)
+    told = off[(off >= 0) & (views != labels[:, None])]
+    noise = max(float(np.median(told)), 0.25) if len(told) else 1.0
+    best = np.maximum(quality.max(axis=1, keepdims=True), 1e-12)
+    shares = (quality / best) * np.exp(-np.maximum(off / (settings.noise_factor * noise) - 1.0, 0.0))
+    shares = np.where((off >= 0) & (labels[:, None] >= 0), shares, 0.0).astype(np.float32)
+    return fill_slots(labels, views, shares, settings.views_most)

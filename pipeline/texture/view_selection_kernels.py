@@ -100,34 +100,91 @@ def propagate(
 
 
 @njit(cache=True, nogil=True)
-def level(
+def level_view(
     aims: np.ndarray,
-    trust: np.ndarray,
-    steps: np.ndarray,
-    strengths: np.ndarray,
+    seen: np.ndarray,
     starts: np.ndarray,
     indices: np.ndarray,
+    strength: float,
     sweeps: int,
     factor: float,
-) -> np.ndarray:
-    """Corrections (v, 4) that minimise ``trust |c_v - aim_v|^2 + strength |c_v - c_w - step_vw|^2``, over-relaxed
-    Gauss-Seidel there and back."""
-    count = len(aims)
-    out = aims.copy()
+) -> None:
+    """Of one view: makes of ``aims`` (v, 4) what minimises ``|c_v - aim_v|^2 + strength |c_v - c_w|^2`` over the
+    vertices that are ``seen`` and their edges, by over-relaxed Gauss-Seidel there and back. In place."""
+    rows = np.flatnonzero(seen)
+    fixed = aims.copy()
+    s, kept = np.float32(strength), np.float32(1.0 - factor)
     for sweep in range(sweeps):
-        for turn in range(count):
-            v = turn if sweep % 2 == 0 else count - 1 - turn
-            share = trust[v]
-            a, b, c = share * aims[v, 0], share * aims[v, 1], share * aims[v, 2]
+        for turn in range(len(rows)):
+            v = rows[turn] if sweep % 2 == 0 else rows[len(rows) - 1 - turn]
+            a, b, c, total = fixed[v, 0], fixed[v, 1], fixed[v, 2], np.float32(1.0)
             for e in range(starts[v], starts[v + 1]):
-                strength, w = strengths[e], indices[e]
-                a += strength * (out[w, 0] + steps[e, 0])
-                b += strength * (out[w, 1] + steps[e, 1])
-                c += strength * (out[w, 2] + steps[e, 2])
-                share += strength
-            if share > 0:
-                move = factor / share
-                out[v, 0] += factor * -out[v, 0] + move * a
-                out[v, 1] += factor * -out[v, 1] + move * b
-                out[v, 2] += factor * -out[v, 2] + move * c
+                w = indices[e]
+                if seen[w]:
+                    a += s * aims[w, 0]
+                    b += s * aims[w, 1]
+                    c += s * aims[w, 2]
+                    total += s
+            move = np.float32(factor) / total
+            aims[v, 0] = kept * aims[v, 0] + move * a
+            aims[v, 1] = kept * aims[v, 1] + move * b
+            aims[v, 2] = kept * aims[v, 2] + move * c
+
+
+@njit(cache=True, nogil=True)
+def differences(
+    labels: np.ndarray, views: np.ndarray, detail: np.ndarray, weights: np.ndarray, starts: np.ndarray,
+    indices: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Mean square by which each candidate's detail (k, v, 3) differs from that of the chosen view, over a vertex and
+    its neighbours that both see; -1 for none."""
+    count, most = views.shape
+    out = np.full((count, most), np.float32(-1.0), np.float32)
+    for v in range(count):
+        own = labels[v]
+        if own < 0:
+            continue
+        for c in range(most):
+            k = views[v, c]
+            if k < 0:
+                continue
+            total, n = np.float32(0.0), 0
+            for e in range(starts[v] - 1, starts[v + 1]):
+                w = v if e < starts[v] else indices[e]
+                if weights[k, w] > 0 and weights[own, w] > 0:
+                    for channel in range(3):
+                        off = detail[k, w, channel] - detail[own, w, channel]
+                        total += off * off
+                    n += 3
+            out[v, c] = total / max(n, 1)
     return out
+
+
+@njit(cache=True, nogil=True)
+def fill_slots(
+    labels: np.ndarray, views: np.ndarray, shares: np.ndarray, slots: int
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """The chosen view and those of the largest shares beside it: views (v, slots), -1 = none, and shares that add up
+    to one."""
+    count, most = views.shape
+    found = np.full((count, slots), -1, np.int32)
+    weight = np.zeros((count, slots), np.float32)
+    for v in range(count):
+        if labels[v] < 0:
+            continue
+        found[v, 0], weight[v, 0] = labels[v], 1.0
+        for c in range(most):
+            share = shares[v, c]
+            if views[v, c] < 0 or views[v, c] == labels[v] or share <= weight[v, slots - 1] or share < 0.05:
+                continue
+            place = slots - 1
+            while place > 1 and weight[v, place - 1] < share:
+                found[v, place], weight[v, place] = found[v, place - 1], weight[v, place - 1]
+                place -= 1
+            found[v, place], weight[v, place] = views[v, c], share
+        total = np.float32(0.0)
+        for c in range(slots):
+            total += weight[v, c]
+        for c in range(slots):
+            weight[v, c] /= total
+    return found, weight
