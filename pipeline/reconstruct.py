@@ -48,6 +48,7 @@ from pipeline.texture.uv_unwrap import Atlas, NoLayout
 from pipeline.texture.vertex_colours import Texture, texture
 from rig.capture import Capture
 from rig.errors import EigenheadError
+from rig.formats.usdz import check_usd
 from rig.geometry import Similarity
 from rig.mesh import Mesh, vertex_normals
 from rig.render.renderer import Renderer
@@ -91,6 +92,8 @@ def reconstruct(
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
     warning is one that the settings do not let pass, and Cancelled when ``report`` does.
     """
+    if "usdz" in settings.outputs.written:
+        check_usd()
     started = time.perf_counter()
     clock = Clock(report)
     clock("segmentation")

@@ -164,8 +164,8 @@ class SelectionSettings:
     outlier: float = 1.0  # ... has half of this cost
     smoothness: float = 0.15  # cost of a seam along an edge where views differ by ``disagreement``
     levelling: float = 30.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
-    views_most: int = 3  # a place's detail is the mean of so many views ...
-    noise_factor: float = 2.0  # ... that differ from the chosen one by no more than this, by the median over the head
+    views_most: int = 4  # a place's detail is the mean of so many views ...
+    noise_factor: float = 4.0  # ... that differ from the chosen one by no more than this, by the median over the head
     sweeps: int = 8  # of belief propagation
 
 
@@ -174,10 +174,11 @@ class TextureSettings:
     """Section 4.5. Chosen by the colour error over the visible face of captures rendered by another program."""
 
     blend: Literal["default", "reference"] = "default"  # reference: the paper's weighted mean
-    sharpness: float = 2.0  # exponent of normal . viewing direction; the paper's weight has 1, 2 to 8 are within 0.3 dB
+    sharpness: float = 1.0  # exponent of normal . viewing direction, as the paper's weight; 2 is 1 dB worse in a view
+    # that was kept back: what shines or is shaded in few views is then that of all
     balance: bool = True  # gain and offset of each camera
     contour_margin_px: float = 2.0  # nothing is sampled nearer to the background: 3 sigma of a 0.7 px defocus
-    hidden_mm: float = 1.0  # a nearer surface hides a vertex beyond this: a fit's own error, and no nose is thinner
+    hidden_mm: float = 1.5  # a nearer surface hides a vertex beyond this: a fit's own error, and no nose is thinner
     least_facing: float = 0.15  # cosine: at a flatter angle than 81 degrees a pixel smears over 6 mm
     footprint_px: float = 0.45  # sigma of the sampling window; 0.7 loses 0.3 dB of detail, 0.4 lets 1.5 dB more noise
     sharpening: float = 1.0  # unsharp mask of 1 px where there is detail: 1.2, 2.2 and 0.8 dB on three true heads

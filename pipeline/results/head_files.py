@@ -79,6 +79,7 @@ def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
         return glb_bytes(head, normals=normals, colours=result.colours, extras=extras)
     kind = result.settings.outputs.image
     source = atlas.layout.source
+    extras["repeated_vertices"] = source[len(head.vertices) :].tolist()
     opened = Mesh(head.vertices[source], atlas.layout.faces)
     skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1])
     return glb_bytes(opened, normals=normals[source], skin=skin, extras=extras)

@@ -93,11 +93,12 @@ def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
     ours = end and "format binary_little_endian 1.0" in lines and names == list(PLY_VERTEX.names or ())
     if not ours or len(counts) != 2:
         raise InputError(path.name, ["is no head.ply of ours"])
-    wanted = counts[0] * PLY_VERTEX.itemsize + counts[1] * PLY_FACE.itemsize
+    face = PLY_TEXTURED_FACE if "property list uchar float texcoord" in lines else PLY_FACE
+    wanted = counts[0] * PLY_VERTEX.itemsize + counts[1] * face.itemsize
     if len(body) != wanted:
         raise InputError(path.name, [f"has {len(body)} bytes of vertices and faces where {wanted} are said"])
     vertices = np.frombuffer(body, PLY_VERTEX, counts[0])
-    faces = np.frombuffer(body, PLY_FACE, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
+    faces = np.frombuffer(body, face, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
     places = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)
     colours = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
     return Mesh(places, faces.astype(np.int32), colours), vertices["quality"].astype(float)
