@@ -160,8 +160,8 @@ class DenseSettings:
 class SelectionSettings:
     """Which photograph the detail comes from; costs are by that of a view which sees nothing of a place."""
 
-    disagreement: float = 0.12  # of the colour's level: a view that differs so much from the others ...
-    outlier: float = 1.0  # ... has half of this cost
+    disagreement: float = 0.06  # of the colour's code: a view that differs so much from the others ...
+    outlier: float = 2.0  # ... has half of this cost
     smoothness: float = 0.15  # cost of a seam along an edge where views differ by ``disagreement``
     levelling: float = 30.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
     views_most: int = 4  # a place's detail is the mean of so many views ...

@@ -1,6 +1,7 @@
 """The fitted head in every format that the settings ask for.
 
-head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm, z up.
+head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm,
+z up.
 With a texture the first vertices of head.glb are head.ply's, in its order; those at the seam follow once more.
 """
 

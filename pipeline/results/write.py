@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.results.bust import Bust
-from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.results.head_files import write_head
 from pipeline.results.metadata import asset_extras, ply_comments
+from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from rig.atomic_write import write_atomically

@@ -6,10 +6,9 @@ included; edges are a few pixels), is read there with a sub-pixel window and get
 other. What no camera sees has the vertices' colours.
 """
 
-
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
@@ -48,9 +47,7 @@ def paint_texture(
         for band in range(first, last):
             row = band * BAND_ROWS
             which = np.flatnonzero((high >= row) & (low <= row + BAND_ROWS - 1))
-            paint_rows(
-                stored, row, BAND_ROWS, which, texels, layout.faces, layout.source, decision.pictures, choice
-            )
+            paint_rows(stored, row, BAND_ROWS, which, texels, layout.faces, layout.source, decision.pictures, choice)
 
     in_threads(size // BAND_ROWS, paint)
     return Atlas(layout, stored[:, :, ::-1])

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from pipeline.parallel_for import in_threads
-from pipeline.texture.view_selection import Neighbourhood
+from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.view_selection_kernels import level_view
 
 SWEEPS, FACTOR = 20, 1.7  # over-relaxed: corrections move by less than 0.2 code after them

@@ -26,10 +26,11 @@ from pipeline.parallel_for import thread_count
 from pipeline.settings import TextureSettings
 from pipeline.texture.decision import Decision, pack_pictures
 from pipeline.texture.inpaint import fill_unknown
+from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.paint_kernels import Pictures
 from pipeline.texture.seam_levelling import level_views
 from pipeline.texture.vertex_colours_kernels import blend_views
-from pipeline.texture.view_selection import Neighbourhood, add_alike, select_views
+from pipeline.texture.view_selection import add_alike, select_views
 from pipeline.texture.visibility import Sight, see_points, sharpened
 from rig.camera import Camera
 from rig.capture import Capture
@@ -127,11 +128,11 @@ def decide(
 ) -> Decision:
     """A view for each vertex, and what levels the seams between them."""
     chosen = settings.selection
-    labels, options, quality = select_views(weights, balanced, agreed, gains, around, chosen)
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
     fields = level_views(weights, codes, level_to, around, chosen.levelling)
     detail = codes + fields[:, :, :3]
+    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around, chosen)
     slots, shares = add_alike(labels, options, quality, detail, weights, around, chosen)
     corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
     return Decision(views, slots, shares, corrections, weights, pictures)
@@ -173,22 +174,35 @@ def _reference(
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> Texture:
     """Section 4.5 to the letter, in the images' own codes; vertices that no camera sees are filled."""
+    colours, weights, views = reference_colours(mesh.vertices, normals, capture, silhouettes, rig, depths)
+    known = weights > 0
+    if not known.any():
+        return _untextured(len(normals))
+    colours = fill_unknown(colours, known, mesh.faces)
+    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+
+
+def reference_colours(
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
+    """The paper's codes of points of a surface, the weight behind each (0: nobody sees it) and the number of images."""
     total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
     views = np.zeros(len(normals), np.uint8)
     for camera in rig:
-        pixels = camera.project(mesh.vertices)
-        seen = _visible(camera, mesh.vertices, pixels, depths[camera.name], silhouettes[camera.name])
-        towards = camera.centre_world - mesh.vertices
+        pixels = camera.project(points)
+        seen = _visible(camera, points, pixels, depths[camera.name], silhouettes[camera.name])
+        towards = camera.centre_world - points
         facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
         weight = np.where(seen, np.clip(facing, 0.0, None), 0.0)
         total += weight[:, None] * _sampled(capture.images[camera.name], pixels)
         weights += weight
         views += weight > 0
-    known = weights > 0
-    if not known.any():
-        return _untextured(len(normals))
-    colours = fill_unknown(total / np.where(known, weights, 1.0)[:, None], known, mesh.faces)
-    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+    return total / np.where(weights > 0, weights, 1.0)[:, None], weights, views
 
 
 def _visible(

@@ -9,12 +9,11 @@ other. Minimised by belief propagation (Felzenszwalb and Huttenlocher, *Efficien
 IJCV 2006), sweeping through the vertices there and back.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from pipeline.settings import SelectionSettings
+from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.view_selection_kernels import (
     NEVER,
     best_candidates,
@@ -26,35 +25,14 @@ from pipeline.texture.view_selection_kernels import (
 
 CANDIDATES = 6  # views of a vertex that come into question; a seventh is hardly ever the best
 GAIN_COST = 1.0  # of a camera whose light was doubled or halved
-ABSOLUTE = 0.004  # linear: disagreement that noise makes in the dark
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Neighbourhood:
-    """Vertices about each vertex, in compressed rows, and the place of the same edge seen from its other end."""
-
-    starts: Int32[np.ndarray, " s"]
-    indices: Int32[np.ndarray, " e"]
-    opposite: Int32[np.ndarray, " e"]
-
-    @classmethod
-    def of(cls, starts: Int32[np.ndarray, " s"], indices: Int32[np.ndarray, " e"]) -> "Neighbourhood":
-        """``starts`` and sorted ``indices`` of a symmetric adjacency."""
-        rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
-        # Rows are sorted: ordered by the other end first, the edges of its row come in the same order.
-        opposite = np.empty(len(indices), np.int32)
-        opposite[np.lexsort((rows, indices))] = np.arange(len(indices), dtype=np.int32)
-        return cls(starts, indices, opposite)
-
-    @property
-    def rows(self) -> Int32[np.ndarray, " e"]:
-        return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
+NOISE_CODES = 2.0  # disagreement that noise makes in the dark
 
 
 def select_views(
     weights: Float32[np.ndarray, "k v"],
-    colours: Float32[np.ndarray, "k v 3"],
-    agreed: Float[np.ndarray, "v 3"],
+    codes: Float32[np.ndarray, "k v 3"],
+    levelled: Float32[np.ndarray, "k v 3"],
+    agreed: Float32[np.ndarray, "v 3"],
     gains: Float[np.ndarray, "k 3"],
     around: Neighbourhood,
     settings: SelectionSettings,
@@ -63,8 +41,9 @@ def select_views(
 
     Args:
         weights: of the views by angle and distance, 0 = not seen.
-        colours: linear, gains applied.
-        agreed: what the views agree on, linear.
+        codes: of every view, gains applied.
+        levelled: the same, after ``pipeline.texture.seam_levelling``: beside a shadow's edge that helps nothing.
+        agreed: codes that the views agree on.
         gains: of the cameras, which multiply to one.
         around: the mesh's edges.
         settings: of the selection.
@@ -72,8 +51,7 @@ def select_views(
     quality = ring_quality(weights, around.starts, around.indices)
     best = quality.max(axis=1, keepdims=True)
     costs = 1.0 - quality / np.maximum(best, 1e-12)
-    off = np.abs(colours - agreed).transpose(1, 0, 2) / (settings.disagreement * agreed[:, None] + ABSOLUTE)
-    off = np.sqrt((off**2).mean(axis=2))
+    off = np.maximum(_disagreement(codes, agreed, settings), _disagreement(levelled, agreed, settings))
     costs += settings.outlier * off**2 / (1.0 + off**2)
     costs += GAIN_COST * np.abs(np.log2(gains.mean(axis=1)))
     costs = np.where(weights.T > 0, costs, NEVER).astype(np.float32)
@@ -89,6 +67,14 @@ def select_views(
     found = np.take_along_axis(views, np.maximum(chosen, 0)[:, None], axis=1)[:, 0]
     labels = np.where(chosen >= 0, found, -1).astype(np.int32)
     return labels, views, np.where(views >= 0, np.take_along_axis(quality, np.maximum(views, 0), axis=1), 0.0)
+
+
+def _disagreement(
+    codes: Float32[np.ndarray, "k v 3"], agreed: Float32[np.ndarray, "v 3"], settings: SelectionSettings
+) -> Float32[np.ndarray, "v k"]:
+    """How far each view is from the others, by what is ordinary."""
+    off = (codes - agreed) / (settings.disagreement * agreed + NOISE_CODES)
+    return np.sqrt(np.einsum("kvc,kvc->vk", off, off) / 3.0)
 
 
 def add_alike(

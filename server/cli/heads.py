@@ -282,7 +282,7 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible or surfaces."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible, surfaces or texture."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
@@ -290,7 +290,7 @@ def experiments(
     simplex: Annotated[
         int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
     ] = None,
-    captures: Annotated[bool, typer.Option(help="hidden, visible: the captures of --shared, too.")] = False,
+    captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
     openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
     shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
     out: Annotated[
