@@ -163,7 +163,7 @@ class SelectionSettings:
     disagreement: float = 0.06  # of the colour's code: a view that differs so much from the others ...
     outlier: float = 2.0  # ... has half of this cost
     smoothness: float = 0.15  # cost of a seam along an edge where views differ by ``disagreement``
-    levelling: float = 30.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
+    levelling: float = 10.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
     views_most: int = 4  # a place's detail is the mean of so many views ...
     noise_factor: float = 4.0  # ... that differ from the chosen one by no more than this, by the median over the head
     sweeps: int = 8  # of belief propagation

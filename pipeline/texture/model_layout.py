@@ -1,4 +1,4 @@
-"""The layout that belongs to a head model: made once, kept by the model's content, and mapped by every later process."""
+"""The layout that belongs to a head model: made once, kept by its content, and mapped by every later process."""
 
 from dataclasses import dataclass
 

@@ -16,7 +16,7 @@ from pipeline.parallel_for import in_threads
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.view_selection_kernels import level_view
 
-SWEEPS, FACTOR = 20, 1.7  # over-relaxed: corrections move by less than 0.2 code after them
+SWEEPS, FACTOR = 25, 1.7  # over-relaxed: corrections are right to 0.1 code after them
 
 
 def level_views(

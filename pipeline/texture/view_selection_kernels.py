@@ -110,13 +110,13 @@ def level_view(
     factor: float,
 ) -> None:
     """Of one view: makes of ``aims`` (v, 4) what minimises ``|c_v - aim_v|^2 + strength |c_v - c_w|^2`` over the
-    vertices that are ``seen`` and their edges, by over-relaxed Gauss-Seidel there and back. In place."""
+    vertices that are ``seen`` and their edges, by over-relaxed Gauss-Seidel. In place."""
     rows = np.flatnonzero(seen)
     fixed = aims.copy()
     s, kept = np.float32(strength), np.float32(1.0 - factor)
-    for sweep in range(sweeps):
+    for _ in range(sweeps):  # always forwards: there and back, over-relaxing gains nothing
         for turn in range(len(rows)):
-            v = rows[turn] if sweep % 2 == 0 else rows[len(rows) - 1 - turn]
+            v = rows[turn]
             a, b, c, total = fixed[v, 0], fixed[v, 1], fixed[v, 2], np.float32(1.0)
             for e in range(starts[v], starts[v + 1]):
                 w = indices[e]
