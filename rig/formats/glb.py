@@ -49,26 +49,7 @@ def glb_bytes(
         skin: the texture.
         extras: what the asset says of itself.
     """
-    position, index = (mesh.vertices / 1000.0).astype("<f4"), mesh.faces.astype("<u4").ravel()
-    unit = normals.astype("<f4")
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    bounds = {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
-    parts: list[tuple[bytes, int, dict[str, Any]]] = [
-        (position.tobytes(), VERTICES, {"componentType": FLOAT, "count": len(position), "type": "VEC3"} | bounds),
-        (unit.tobytes(), VERTICES, {"componentType": FLOAT, "count": len(position), "type": "VEC3"}),
-        (index.tobytes(), INDICES, {"componentType": UINT, "count": len(index), "type": "SCALAR"}),
-    ]
-    attributes = {"POSITION": 0, "NORMAL": 1}
-    if skin is not None:
-        shape = {"componentType": FLOAT, "count": len(position), "type": "VEC2"}
-        parts.append((skin.uv.astype("<f4").tobytes(), VERTICES, shape))
-        attributes["TEXCOORD_0"] = 3
-    elif colours is not None:
-        linear = np.round(linear_from_srgb(colours / 255.0) * 65535).astype("<u2")
-        padded = np.concatenate([linear, np.full((len(linear), 1), 65535, "<u2")], axis=1)  # 4-byte alignment
-        shape = {"componentType": USHORT, "normalized": True, "count": len(position), "type": "VEC4"}
-        parts.append((padded.tobytes(), VERTICES, shape))
-        attributes["COLOR_0"] = 3
+    parts, attributes = _parts(mesh, normals, colours, skin)
     views, payload = [], bytearray()
     for data, target, _ in parts:
         views.append({"buffer": 0, "byteOffset": len(payload), "byteLength": len(data), "target": target})
@@ -90,6 +71,36 @@ def glb_bytes(
         payload += skin.image
         document |= _texture(skin.mime, len(views) - 1)
     return _container(document | {"buffers": [{"byteLength": len(payload)}]}, bytes(payload))
+
+
+Part = tuple[bytes, int, dict[str, Any]]  # data, what they are for, and their accessor
+
+
+def _parts(
+    mesh: Mesh, normals: np.ndarray, colours: np.ndarray | None, skin: Skin | None
+) -> tuple[list[Part], dict[str, int]]:
+    """Positions, normals, faces and looks; and which of them is which attribute."""
+    position, index = (mesh.vertices / 1000.0).astype("<f4"), mesh.faces.astype("<u4").ravel()
+    unit = normals.astype("<f4")
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    bounds = {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
+    parts: list[Part] = [
+        (position.tobytes(), VERTICES, {"componentType": FLOAT, "count": len(position), "type": "VEC3"} | bounds),
+        (unit.tobytes(), VERTICES, {"componentType": FLOAT, "count": len(position), "type": "VEC3"}),
+        (index.tobytes(), INDICES, {"componentType": UINT, "count": len(index), "type": "SCALAR"}),
+    ]
+    attributes = {"POSITION": 0, "NORMAL": 1}
+    if skin is not None:
+        shape = {"componentType": FLOAT, "count": len(position), "type": "VEC2"}
+        parts.append((skin.uv.astype("<f4").tobytes(), VERTICES, shape))
+        attributes["TEXCOORD_0"] = 3
+    elif colours is not None:
+        linear = np.round(linear_from_srgb(colours / 255.0) * 65535).astype("<u2")
+        padded = np.concatenate([linear, np.full((len(linear), 1), 65535, "<u2")], axis=1)  # 4-byte alignment
+        shape = {"componentType": USHORT, "normalized": True, "count": len(position), "type": "VEC4"}
+        parts.append((padded.tobytes(), VERTICES, shape))
+        attributes["COLOR_0"] = 3
+    return parts, attributes
 
 
 def _texture(mime: str, view: int) -> dict[str, Any]:
