@@ -46,7 +46,7 @@ export default {
     surface() { if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture"; this.load(this.job.id); },
     through() { this.fit(); },
     colouring() { this.paint(); this.shine(); }, other() { this.compare(); },
-    wire(on) { this.material.wireframe = this.flat.wireframe = on; this.draw(); },
+    wire() { this.showWire(); this.draw(); },
     lights() { this.shine(); }, measuring(on) { if (!on) this.clearPoints(); },
   },
   template: `
@@ -162,6 +162,7 @@ export default {
         this.mesh = new THREE.Mesh(found.geometry, this.material);
         this.skin?.map.dispose(); this.skin?.dispose();
         this.skin = found.material.map ? new THREE.MeshStandardMaterial({ map: found.material.map, roughness: 0.85, metalness: 0, side: THREE.DoubleSide }) : null;
+        this.showWire();
         this.texture = found.geometry.attributes.color?.clone();
         this.repeated = head.asset.extras?.repeated_vertices || []; // at the texture's seam, after those of the .ply
         this.scene.add(this.mesh);
@@ -198,6 +199,7 @@ export default {
       else { this.mesh.material = this.material; geometry.setAttribute("color", this.texture); }
       this.draw();
     },
+    showWire() { for (const material of [this.material, this.flat, this.skin]) if (material) material.wireframe = this.wire; },
     withRepeated(values) {
       const all = new Float32Array(values.length + this.repeated.length);
       all.set(values); this.repeated.forEach((from, i) => { all[values.length + i] = values[from]; });

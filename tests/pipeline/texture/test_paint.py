@@ -37,10 +37,10 @@ def layout(shot: Shot) -> Layout:
     return unwrap(shot.mesh.vertices, shot.mesh.faces)
 
 
-def coloured(shot: Shot, **settings: float) -> Texture:
+def coloured(shot: Shot) -> Texture:
     mesh = shot.mesh
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
-    given = (shot.capture, shot.silhouettes, shot.rig, depth_maps(shot.rig, mesh), TextureSettings(**settings))
+    given = (shot.capture, shot.silhouettes, shot.rig, depth_maps(shot.rig, mesh), TextureSettings())
     return texture(mesh, mesh.normals(), *given, around=around)
 
 
