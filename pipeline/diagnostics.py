@@ -15,6 +15,8 @@ WARNING_CODES = (
     "mask-loose",
     "no-bust",
     "no-texture",
+    "no-texture-layout",
+    "old-setting",
     "picture-duplicated",
     "plates-exchanged",
     "scale-assumed",

@@ -68,6 +68,6 @@ class Reconstruction:
     detail: Detail = field(default_factory=lambda: Detail("span", "not stated"))
     gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
     pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
-    atlas: Atlas | None = None  # where the settings ask for it
+    atlas: Atlas | None = None  # where a format has a texture and the model a layout
     bust: Bust | None = None  # where the settings ask for it and the photographs carry it
     parts: Mapping[str, PartMap] = field(default_factory=dict)  # skin, hair or clothes in a view's pixels, where told

@@ -48,6 +48,17 @@ def _of_output(name: str) -> Callable[[str | None], str | None]:
     return one_of(choices)
 
 
+def _formats(value: str | None) -> str | None:
+    """A callback: names of ``FORMATS`` with commas between."""
+    from pipeline.settings import FORMATS
+
+    names = [] if value is None else [name.strip() for name in value.split(",")]
+    strange = [name for name in names if name not in FORMATS]
+    if strange:
+        raise typer.BadParameter(f"{strange[0]!r} is none of {', '.join(FORMATS)}")
+    return ",".join(names) or None
+
+
 @app.command(epilog="Example: eigenhead reconstruct shots/anna.tar.gz --out heads/anna --method contour")
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
@@ -59,8 +70,12 @@ def reconstruct(
         str | None, typer.Option(help="span, kernel, photo or fine.", callback=_of_setting("detail"))
     ] = None,
     surface: Annotated[str | None, typer.Option(help="head, bust or both.", callback=_of_output("surface"))] = None,
-    obj: Annotated[bool, typer.Option("--obj", help="Write head.obj too, with vertex colours.")] = False,
-    atlas: Annotated[bool, typer.Option("--atlas", help="Write head_atlas.glb too, with a texture image.")] = False,
+    formats: Annotated[
+        str | None,
+        typer.Option(help="Of the head: glb, ply, obj, usdz, stl, 3mf, with commas between.", callback=_formats),
+    ] = None,
+    obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
+    atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
     json_out: Json = False,
@@ -70,6 +85,7 @@ def reconstruct(
 
     outputs: dict[str, object] = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
     outputs |= {"surface": surface} if surface else {}
+    outputs |= {"formats": formats.split(",")} if formats else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
@@ -266,7 +282,7 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible, surfaces or real."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible, surfaces, texture or real."
         ),
     ],
     folders: Annotated[
@@ -277,7 +293,7 @@ def experiments(
     simplex: Annotated[
         int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
     ] = None,
-    captures: Annotated[bool, typer.Option(help="hidden, visible: the captures of --shared, too.")] = False,
+    captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
     openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
     front: Annotated[str | None, typer.Option(help="real: the view that the subject faces.")] = None,
     outlines: Annotated[

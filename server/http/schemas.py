@@ -98,7 +98,7 @@ class NewJob(Received):
                 {
                     "capture_id": EXAMPLE_ID,
                     "name": "Anna, fine",
-                    "settings": {"detail": "fine", "outputs": {"atlas": True}},
+                    "settings": {"detail": "fine", "outputs": {"formats": ["glb", "obj"]}},
                 }
             ]
         }

@@ -24,11 +24,10 @@ FIRST_S = {
     "fine": 9.0,
     "texture": 1.4,
     "bust": 24.0,
-    "atlas": 62.0,
     "evidence": 0.8,
     "write": 3.0,
 }
-"""Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine --atlas` on two cores that four
+"""Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine` on two cores that four
 other processes share. On idle ones all are three to four times shorter, which a job's own pace soon tells."""
 SIMPLEX_S = 200.0  # of the simplex's fit, at the same pace: a minute on idle cores
 LEARNING = 0.3  # weight of the newest job; the first one of its kind counts alone
@@ -37,8 +36,7 @@ LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
 
 def kind_of(settings: Settings) -> str:
     """What decides which stages a job has and how long they are: "contour photo both", say."""
-    atlas = " atlas" if settings.outputs.atlas else ""
-    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}{atlas}"
+    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}"
 
 
 def first_guess(settings: Settings) -> dict[str, float]:
@@ -52,7 +50,6 @@ def first_guess(settings: Settings) -> dict[str, float]:
         "depth": not (fine or bust),
         "fine": not fine,
         "bust": not bust,
-        "atlas": not settings.outputs.atlas,
     }
     seconds = {stage: took for stage, took in FIRST_S.items() if not left_out.get(stage)}
     if settings.method == "simplex":

@@ -49,7 +49,7 @@ export default {
     surface() { if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture"; this.load(this.job.id); },
     through() { this.fit(); },
     colouring() { this.paint(); this.shine(); }, other() { this.compare(); },
-    wire(on) { this.material.wireframe = this.flat.wireframe = on; this.draw(); },
+    wire() { this.showWire(); this.draw(); },
     lights() { this.shine(); }, measuring(on) { if (!on) this.clearPoints(); },
   },
   template: `
@@ -163,7 +163,11 @@ export default {
         let found = null;
         head.scene.traverse((o) => { if (o.isMesh) found = o; });
         this.mesh = new THREE.Mesh(found.geometry, this.material);
-        this.texture = found.geometry.attributes.color.clone();
+        this.skin?.map.dispose(); this.skin?.dispose();
+        this.skin = found.material.map ? new THREE.MeshStandardMaterial({ map: found.material.map, roughness: 0.85, metalness: 0, side: THREE.DoubleSide }) : null;
+        this.showWire();
+        this.texture = found.geometry.attributes.color?.clone();
+        this.repeated = head.asset.extras?.repeated_vertices || []; // at the texture's seam, after those of the .ply
         this.scene.add(this.mesh);
         this.mesh.geometry.computeBoundingSphere();
         const { center, radius } = this.mesh.geometry.boundingSphere;
@@ -194,12 +198,19 @@ export default {
       } else if (this.colouring === "clay") {
         this.mesh.material = this.material;
         geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * geometry.attributes.position.count).fill(0.55), 3));
-      } else { this.mesh.material = this.material; geometry.setAttribute("color", this.texture); }
+      } else if (this.skin) this.mesh.material = this.skin;
+      else { this.mesh.material = this.material; geometry.setAttribute("color", this.texture); }
       this.draw();
     },
+    showWire() { for (const material of [this.material, this.flat, this.skin]) if (material) material.wireframe = this.wire; },
+    withRepeated(values) {
+      const all = new Float32Array(values.length + this.repeated.length);
+      all.set(values); this.repeated.forEach((from, i) => { all[values.length + i] = values[from]; });
+      return all;
+    },
     paintParts(values) {
-      const colours = new Float32Array(3 * values.length), colour = new THREE.Color();
-      values.forEach((value, i) => colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      const all = this.withRepeated(values), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
+      all.forEach((value, i) => colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i));
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
     },
@@ -216,8 +227,8 @@ export default {
       this.loading = false; this.draw();
     },
     spread(values, title) {
-      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95), colours = new Float32Array(3 * values.length), colour = new THREE.Color();
-      values.forEach((value, i) => colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95), all = this.withRepeated(values), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
+      all.forEach((value, i) => colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i));
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       this.digits = most < 1 ? 2 : 1;

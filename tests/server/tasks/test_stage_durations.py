@@ -11,11 +11,10 @@ from server.tasks.stage_durations import FIRST_S, LEARNING, StageDurations, firs
 @pytest.mark.parametrize(
     ("document", "extra", "missing"),
     [
-        ({}, {"parts", "depth", "fine", "bust"}, {"atlas"}),
+        ({}, {"parts", "depth", "fine", "bust"}, set()),
         ({"detail": "photo"}, {"parts", "depth", "bust"}, {"fine"}),
         ({"detail": "photo", "outputs": {"surface": "head"}}, {"parts"}, {"depth", "fine", "bust"}),
-        ({"outputs": {"atlas": True}}, {"atlas"}, set()),
-        ({"detail": "span", "outputs": {"surface": "head"}}, set(), {"parts", "depth", "fine", "bust", "atlas"}),
+        ({"detail": "span", "outputs": {"surface": "head"}}, set(), {"parts", "depth", "fine", "bust"}),
         ({"detail": "span"}, {"parts", "depth", "bust"}, {"fine"}),
     ],
 )
