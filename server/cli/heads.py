@@ -156,6 +156,10 @@ def simulate(
         typer.Option(help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, glasses."),
     ] = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
+    expression: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
+    ] = None,
     fault: Annotated[
         list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
     ] = None,
@@ -183,20 +187,27 @@ def simulate(
     preset = replace(preset, hairstyle=tuple(hair.split(",")) if hair else ())
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
-                      faults=fault or [])  # fmt: skip
+                      faults=fault or [], expression=expression or [])  # fmt: skip
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
     with wrong_usage("--fault"):
         for text in fault or []:
             fault_from_text(text)
+    with wrong_usage("--expression"):
+        if expression:
+            from pipeline.eigenheads.expressions import weights_from_text
+            from pipeline.eigenheads.model import load_model
+
+            weights_from_text(expression, load_model().expressions.names)
     _make_way(out, overwrite)
     from rig.render.renderer import Renderer
     from server.tasks.subjects import simulate_folder
 
     with progress_bar() as report, Renderer.create() as renderer:
         report("simulate", 0.0)
-        truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer)
+        truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
+                                expression=expression or [])  # fmt: skip
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
 
 
