@@ -18,7 +18,7 @@ from pipeline.dense.surface.skin import part_of
 from pipeline.dense.window_bias import WindowBias
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.gaussian_process import with_kernel
-from pipeline.eigenheads.model import HeadModel, with_modes
+from pipeline.eigenheads.model import HeadModel, with_expressions, with_modes
 from pipeline.fitting.contour import finish, solve_contour
 from pipeline.fitting.fine.dense_points import dense_points
 from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
@@ -211,7 +211,8 @@ def _of_stage(report: Report, stage: str, _: str, fraction: float) -> None:
 
 
 def basis(model: HeadModel, settings: Settings) -> HeadModel:
-    """The modes that the settings ask for: the eigenheads in use, and the kernel's where the detail goes beyond."""
+    """The modes that the settings ask for: the eigenheads in use; where the detail goes beyond, the kernel's and the
+    model's expressions, too."""
     span = settings.detail == "span" or settings.method == "simplex"
     return _basis(model, min(settings.fitting.modes, len(model.modes)), kernel=not span)
 
@@ -227,7 +228,8 @@ def _basis(model: HeadModel, modes: int, *, kernel: bool) -> HeadModel:
         return {"modes": wider.modes, "sigma": wider.sigma}
 
     kept = kept_arrays("kernel-modes", given, make, made_by=(with_kernel, vertex_normals, HeadModel))
-    return replace(with_modes(model, modes), modes=kept["modes"], sigma=kept["sigma"], _bases={})
+    wide = replace(with_modes(model, modes), modes=kept["modes"], sigma=kept["sigma"], _bases={})
+    return with_expressions(wide)
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:

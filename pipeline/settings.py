@@ -75,6 +75,8 @@ class FittingSettings:
     scale_spread: float = 0.01  # prior of log scale: rigs are metric, size is a mode
     feature_noise_px: float = CLICK_NOISE_PX
     landmark_noise_mm: float = LANDMARK_NOISE_MM
+    expression_spread: float = 0.5  # prior of an expression's weight: a Gaussian of that width beyond its threshold ...
+    expression_mean: float = 0.05  # ... which near zero is an exponential of that mean: most faces make few
     bare_px: float = 2.0  # cranium, ears and neck agree with the input to this after a fit to the whole head ...
     bare_share: float = 0.8  # ... over this share of their outline: the head is bare, and all of its rim speaks
     bare_loss: float = 1.25  # and the rim of the face may lose no more than this factor by it

@@ -157,7 +157,13 @@ def finish(solved: Solved) -> Fit:
     scale = max(stage.scales_px[-1], solved.evidence.noise.floor_px)
     whole, there = started_problem(problem, solved.evidence, stage, scale, state)
     kept = stage.modes + POSE
-    covariance = np.linalg.inv(whole.equations(there).matrix)[:kept, :kept]
+    equations = whole.equations(there)
+    if whole.room is not None:
+        # At a bound a posterior is no Gaussian: it falls exponentially with the slope there, its deviation 1 / slope.
+        least, _ = whole.room(state)
+        held = np.flatnonzero((least >= 0.0) & (equations.gradient > 0.0))
+        equations.matrix[held, held] += equations.gradient[held] ** 2
+    covariance = np.linalg.inv(equations.matrix)[:kept, :kept]
     rim = observed_rim(problem, solved.evidence, state, stage)
     names = problem.views.names
     return Fit(

@@ -1,4 +1,8 @@
-"""What is known of a head before it is seen: z ~ N(0, I), a metric scale, and the calibration's covariance.
+"""What is known of a head before it is seen: z ~ N(0, I), few expressions, a metric scale, the cameras' covariance.
+
+Most faces are neutral, and those that are not make few expressions at a time: the weight of one is a Gaussian
+``N(-s^2 / tau, s^2)`` cut to 0..1, which near zero is the exponential of mean ``tau``: a small weight must explain more
+than it costs, and a large one that shows is hardly held back. Its bounds are ``head_problem``'s.
 
 The Gaussian priors of the coefficients, of log scale (rigs are metric) and of each camera's correction, as one term.
 """
@@ -6,11 +10,23 @@ The Gaussian priors of the coefficients, of log scale (rigs are metric) and of e
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, State
 
 LOG_SCALE = 6  # its place in the pose
+
+
+def coefficient_prior(
+    problem: ContourProblem, coefficients: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """How far coefficients are off their prior's middle, and that prior's information."""
+    posed, settings = slice(problem.model.posed.start, problem.model.posed.stop), problem.settings
+    off, information = coefficients.copy(), np.ones(len(coefficients))
+    off[posed] += settings.expression_spread**2 / settings.expression_mean
+    information[posed] = settings.expression_spread**-2
+    return off, information
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,14 +50,16 @@ class PriorAt:
     @property
     def cost(self) -> float:
         state, problem = self.state, self.term.problem
-        shape = float(state.coefficients @ state.coefficients)
+        off, information = coefficient_prior(problem, state.coefficients)
+        shape = float(information @ off**2)
         cameras = float(np.einsum("ki,kij,kj->", state.camera_shift, problem.camera_information, state.camera_shift))
         return shape + cameras + (np.log(state.world_from_head.scale) / problem.settings.scale_spread) ** 2
 
     def add_to(self, equations: NormalEquations) -> None:
         state, problem, m = self.state, self.term.problem, self.term.stage.modes
-        equations.matrix[np.arange(m), np.arange(m)] += 1.0
-        equations.gradient[:m] += state.coefficients
+        off, spread = coefficient_prior(problem, state.coefficients)
+        equations.matrix[np.arange(m), np.arange(m)] += spread
+        equations.gradient[:m] += spread * off
         information = problem.settings.scale_spread**-2
         equations.matrix[m + LOG_SCALE, m + LOG_SCALE] += information
         equations.gradient[m + LOG_SCALE] += np.log(state.world_from_head.scale) * information

@@ -88,7 +88,8 @@ def refine_to_surface(
         model: with the modes that the fit has.
         surface: what the dense stage knows, world frame.
         settings: lengths and floors.
-        eigenheads: how many of the modes are a population's; the rest are smooth deformations along the normals.
+        eigenheads: how many of the modes are a population's; the rest, expressions apart, are smooth deformations along
+            the normals.
         deviation_mm: what the fit says of every vertex (``vertex_deviation_mm``).
         eyes: what photographs show between the lids (``look_at_eyes``); without it they stay as the model has them.
         patches: the photographs, to be asked once more on the displaced head.
@@ -99,7 +100,9 @@ def refine_to_surface(
     """
     faces = model.levels["full"].faces
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
-    shape = fit.world_from_head.apply(model.vertices(fit.coefficients[:eigenheads]))
+    plain = fit.coefficients.copy()
+    plain[np.setdiff1d(np.arange(eigenheads, len(plain)), model.posed)] = 0.0
+    shape = fit.world_from_head.apply(model.vertices(plain))
     closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed)
     base = unfolded(shape, with_plain_lids(fitted, shape, model), faces)
     base = bridged(base, model, closed)
