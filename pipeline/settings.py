@@ -75,8 +75,7 @@ class FittingSettings:
     scale_spread: float = 0.01  # prior of log scale: rigs are metric, size is a mode
     feature_noise_px: float = CLICK_NOISE_PX
     landmark_noise_mm: float = LANDMARK_NOISE_MM
-    expression_spread: float = 0.5  # prior of an expression's weight: a Gaussian of that width beyond its threshold ...
-    expression_mean: float = 0.05  # ... which near zero is an exponential of that mean: most faces make few
+    expression_median: float = 0.1  # prior of an expression's weight, heavy-tailed (prior_term)
     bare_px: float = 2.0  # cranium, ears and neck agree with the input to this after a fit to the whole head ...
     bare_share: float = 0.8  # ... over this share of their outline: the head is bare, and all of its rim speaks
     bare_loss: float = 1.25  # and the rim of the face may lose no more than this factor by it
@@ -189,6 +188,8 @@ class OutputSettings:
 
     surface: Literal["head", "bust", "both"] = "both"  # the model's head, all that the cameras see, or both
     obj: bool = False  # head.obj, with vertex colours
+    neutral: bool = False  # neutral.glb, the head without its expression
+    morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names
     atlas: bool = False  # head_atlas.glb, whose texture keeps the photographs' resolution
 
 

@@ -38,6 +38,7 @@ def weight_room(state: State, posed: range, unknowns: int) -> tuple[Float[np.nda
     """Steps that keep the weights of expressions between 0 and 1."""
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]
+    weights = np.clip(weights, 0.0, 1.0)
     least[posed.start : posed.stop], most[posed.start : posed.stop] = -weights, 1.0 - weights
     return least, most
 

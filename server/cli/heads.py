@@ -61,6 +61,10 @@ def reconstruct(
     surface: Annotated[str | None, typer.Option(help="head, bust or both.", callback=_of_output("surface"))] = None,
     obj: Annotated[bool, typer.Option("--obj", help="Write head.obj too, with vertex colours.")] = False,
     atlas: Annotated[bool, typer.Option("--atlas", help="Write head_atlas.glb too, with a texture image.")] = False,
+    neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
+    morphs: Annotated[
+        bool, typer.Option("--morphs", help="Write posed.glb too, with morph targets under Apple's names.")
+    ] = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
     json_out: Json = False,
@@ -68,7 +72,8 @@ def reconstruct(
     """Reconstruct one capture without the service."""
     from server.cli.reconstruct_local import reconstruct_locally, settings_document
 
-    outputs: dict[str, object] = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
+    flags = {"obj": obj, "atlas": atlas, "neutral": neutral, "morphs": morphs}
+    outputs: dict[str, object] = {name: True for name, asked in flags.items() if asked}
     outputs |= {"surface": surface} if surface else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
     with progress_bar() as report:
@@ -179,7 +184,6 @@ def simulate(
     given) with which the rig commands and the service work as with a real rig."""
     from dataclasses import replace
 
-    from rig.studio.sensor.faults import fault_from_text
     from rig.studio.sensor.preset import PRESET
 
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
@@ -191,15 +195,7 @@ def simulate(
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
-    with wrong_usage("--fault"):
-        for text in fault or []:
-            fault_from_text(text)
-    with wrong_usage("--expression"):
-        if expression:
-            from pipeline.eigenheads.expressions import weights_from_text
-            from pipeline.eigenheads.model import load_model
-
-            weights_from_text(expression, load_model().expressions.names)
+    _check_planted(fault or [], expression or [])
     _make_way(out, overwrite)
     from rig.render.renderer import Renderer
     from server.tasks.subjects import simulate_folder
@@ -209,6 +205,21 @@ def simulate(
         truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
                                 expression=expression or [])  # fmt: skip
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+def _check_planted(faults: list[str], expression: list[str]) -> None:
+    """Faults and expressions that nobody knows are wrong usage."""
+    from rig.studio.sensor.faults import fault_from_text
+
+    with wrong_usage("--fault"):
+        for text in faults:
+            fault_from_text(text)
+    if expression:
+        from pipeline.eigenheads.expressions import weights_from_text
+        from pipeline.eigenheads.model import load_model
+
+        with wrong_usage("--expression"):
+            weights_from_text(expression, load_model().expressions.names)
 
 
 def _make_way(out: Path, overwrite: bool) -> None:
