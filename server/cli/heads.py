@@ -288,7 +288,8 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible or surfaces."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible "
+            "or surfaces."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",

@@ -267,7 +267,7 @@ def test_the_priors_normal_equations_are_differences_of_its_cost() -> None:
 
 
 def test_the_prior_of_weights_is_the_tangent_of_its_cost() -> None:
-    """Half the slope of the cost, exactly; and no curvature beside the Gaussian's, since the logarithm's is negative."""
+    """Half the slope of the cost; and no curvature beside the Gaussian's, since the logarithm's is negative."""
     problem, stage, state = head()
     state = replace(state, coefficients=np.abs(state.coefficients))
     problem = replace(problem, model=replace(problem.model, posed=range(3, 6)))
