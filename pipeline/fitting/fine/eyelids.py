@@ -1,22 +1,25 @@
 """Eyes that are open in the model and closed in the photographs.
 
 Both are told apart by what shows between the lids: the white of an eye has no colour of its own, iris and pupil are
-darker than skin; a closed lid is skin with a thin line of lashes. Closed lids bridge the opening: what lies between
-them, and the margins that stand about it, become the smoothest surface that continues the skin around (biharmonic,
-Botsch and Kobbelt 2004, *An intuitive framework for real-time freeform modeling*), which the dense surface then draws
-to the lids themselves. The eyeball's part of a model lies behind and stays unseen.
+darker than skin; a closed lid is skin with a thin line of lashes. Where the model blinks, that closes the lids; where
+it has no such expression, they bridge the opening: what lies between them, and the margins that stand about it, become
+the smoothest surface that continues the skin around (biharmonic, Botsch and Kobbelt 2004, *An intuitive framework for
+real-time freeform modeling*), which the dense surface then draws to the lids themselves. The eyeball's part of a model
+lies behind and stays unseen.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse.linalg import splu
 
+from pipeline.eigenheads.expressions import BLINKS, plain_name
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fine.smooth_field import smooth_field
+from pipeline.fitting.fit import Fit
 from rig.mesh import vertex_normals
 from rig.rig import Rig
 
@@ -172,6 +175,18 @@ def with_plain_lids(
         rows = _lids(_fissure(model, side))
         moved[rows] = _smoothest(moved, vertices, faces, rows)
     return shape + moved
+
+
+def with_closed_lids(model: HeadModel, fit: Fit, closed: frozenset[str]) -> tuple[Fit, frozenset[str]]:
+    """The fit with the named eyes (``right``, ``left``) closed by blinking, and those that no expression of its modes
+    closes."""
+    coefficients, left = fit.coefficients.copy(), set(closed)
+    for name, place in zip(model.expressions.names, model.posed, strict=False):
+        side = BLINKS.get(plain_name(name))
+        if side in left:
+            coefficients[place] = 1.0
+            left.discard(side)
+    return replace(fit, coefficients=coefficients), frozenset(left)
 
 
 def bridged(vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]) -> Float[np.ndarray, "v 3"]:

@@ -22,7 +22,7 @@ from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import Associated, associate, interpolated
 from pipeline.fitting.fine.ears import with_ears_in_place
-from pipeline.fitting.fine.eyelids import EyeEvidence, bridged, with_plain_lids
+from pipeline.fitting.fine.eyelids import EyeEvidence, bridged, with_closed_lids, with_plain_lids
 from pipeline.fitting.fine.folds import unfolded
 from pipeline.fitting.fine.nodes import NodeMesh, Nodes, solving_nodes
 from pipeline.fitting.fine.patch_points import PatchPlaces, PatchSearch
@@ -99,13 +99,14 @@ def refine_to_surface(
         The displaced head and what was decided about the eyes.
     """
     faces = model.levels["full"].faces
+    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed)
+    fit, bridge = with_closed_lids(model, fit, closed)
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
     plain = fit.coefficients.copy()
     plain[np.setdiff1d(np.arange(eigenheads, len(plain)), model.posed)] = 0.0
     shape = fit.world_from_head.apply(model.vertices(plain))
-    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed)
     base = unfolded(shape, with_plain_lids(fitted, shape, model), faces)
-    base = bridged(base, model, closed)
+    base = bridged(base, model, bridge)
     surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
     base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))
     regions = head_regions(model)
