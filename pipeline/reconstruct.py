@@ -21,6 +21,7 @@ from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_expressions, with_modes
 from pipeline.fitting.contour import finish, solve_contour
 from pipeline.fitting.expression_evidence import with_expression_evidence
+from pipeline.fitting.fine.blink import with_lids
 from pipeline.fitting.fine.dense_points import dense_points
 from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
 from pipeline.fitting.fine.eyelids import look_at_eyes
@@ -146,8 +147,9 @@ def reconstruct(
     figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, before)
     widths = {camera.name: camera.intrinsics.width for camera in rig}
     implausible = plausibility_warnings(fit, figures, widths, model.posed)
-    closed = shut_eyes(model, fit) | (frozenset() if finer is None else finer.closed_eyes)
-    expression = found_expressions(model, fit, closed)
+    made = fit if finer is None else with_lids(fit, model, finer.lids)
+    closed = shut_eyes(model, made) | (frozenset() if finer is None else finer.closed_eyes)
+    expression = found_expressions(model, made)
     asked = settings.outputs.neutral or settings.outputs.morphs
     posable = posable_head(model, fit.world_from_head, mesh, expression) if asked else None
     told = (

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.expressions import ARKIT, BLINKS, arkit_parts, closed_lids, plain_name, words
+from pipeline.eigenheads.expressions import ARKIT, arkit_parts, closed_lids, words
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 
 TOLD = 0.05  # a smaller weight is nothing to speak of
-LEAST_SIGMA = 1.0  # nor one that its own deviation explains
+LEAST_SIGMA = 2.0  # nor one that its own deviation explains
 CLOSED = 0.8  # lids that are so far closed show no eye
 
 
@@ -48,18 +48,14 @@ def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
     return dict(zip(model.expressions.names, (float(w) for w in given), strict=False))
 
 
-def found_expressions(model: HeadModel, fit: Fit, closed_eyes: Collection[str] = ()) -> tuple[Found, ...]:
-    """What the head does, the strongest first. ``closed_eyes`` (``right``, ``left``): those that show no eye in the
-    photographs, whatever their lids' relief says; they blink."""
+def found_expressions(model: HeadModel, fit: Fit) -> tuple[Found, ...]:
+    """What the head does, the strongest first."""
     weights = fitted_weights(model, fit)
     spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]
-    blinking = {_blink(model, side) for side in closed_eyes}
     found = []
     for k, (name, weight) in enumerate(weights.items()):
         std = None if spread is None else float(spread[k])
-        if name in blinking:
-            found.append(Found(name, 1.0, std))
-        elif weight >= TOLD and weight > LEAST_SIGMA * (std or 0.0):
+        if weight >= TOLD and weight > LEAST_SIGMA * (std or 0.0):
             found.append(Found(name, weight, std))
     return tuple(sorted(found, key=lambda each: -each.weight))
 
@@ -67,10 +63,6 @@ def found_expressions(model: HeadModel, fit: Fit, closed_eyes: Collection[str] =
 def shut_eyes(model: HeadModel, fit: Fit) -> frozenset[str]:
     """Eyes whose fitted lids are closed."""
     return frozenset(side for side, share in closed_lids(fitted_weights(model, fit)).items() if share >= CLOSED)
-
-
-def _blink(model: HeadModel, side: str) -> str | None:
-    return next((name for name in model.expressions.names if BLINKS.get(plain_name(name)) == side), None)
 
 
 def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Mesh:

@@ -9,17 +9,15 @@ lies behind and stays unseen.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse.linalg import splu
 
-from pipeline.eigenheads.expressions import BLINKS, plain_name
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fine.smooth_field import smooth_field
-from pipeline.fitting.fit import Fit
 from rig.mesh import vertex_normals
 from rig.rig import Rig
 
@@ -52,7 +50,7 @@ class EyeEvidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fissure:
+class Fissure:
     """The slit between the lids on the mean head: its middle, its length, and every vertex's place about it."""
 
     length_mm: float
@@ -66,7 +64,8 @@ class _Fissure:
         return self.front & inside
 
 
-def _fissure(model: HeadModel, side: str) -> _Fissure:
+def eye_fissure(model: HeadModel, side: str) -> Fissure:
+    """Of the ``right`` or ``left`` eye."""
     mean = model.vertices(np.zeros(0))
     outer, inner = (mean[model.landmarks[f"{corner}canthion_{side}"]] for corner in ("exo", "endo"))
     chord = inner - outer
@@ -74,7 +73,7 @@ def _fissure(model: HeadModel, side: str) -> _Fissure:
     above = np.array([-along[1], along[0], 0.0]) * np.sign(along[0])
     off = mean - 0.5 * (outer + inner)
     front = (np.abs(off[:, 2]) < np.linalg.norm(chord)) & (np.abs(off[:, 0]) < np.linalg.norm(chord))
-    return _Fissure(float(np.linalg.norm(chord)), off @ along, off @ above, front)
+    return Fissure(float(np.linalg.norm(chord)), off @ along, off @ above, front)
 
 
 def look_at_eyes(
@@ -94,7 +93,7 @@ def look_at_eyes(
     normals = vertex_normals(vertices, model.levels["full"].faces)
     found = {}
     for side in SIDES:
-        slit = _fissure(model, side)
+        slit = eye_fissure(model, side)
         shown = np.flatnonzero(slit.ellipse(SHOWN_LENGTH * slit.length_mm, SHOWN_HEIGHT * slit.length_mm))
         size = SKIN_SIZE * slit.length_mm
         skin = np.flatnonzero(slit.ellipse(1.5 * size, size, SKIN_BELOW * slit.length_mm))
@@ -152,7 +151,7 @@ def _light_and_chroma(colours: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarr
     return light, (colours[:, 0] - colours[:, 2]) / np.maximum(light, 1e-3)
 
 
-def _lids(slit: _Fissure) -> Int[np.ndarray, " r"]:
+def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
     """Both lids and what lies between them."""
     half_length, half_height = 0.5 * slit.length_mm + MARGIN_MM, BRIDGE_HEIGHT * slit.length_mm
     return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
@@ -172,21 +171,9 @@ def with_plain_lids(
     """
     moved, faces = vertices - shape, model.levels["full"].faces
     for side in SIDES:
-        rows = _lids(_fissure(model, side))
+        rows = _lids(eye_fissure(model, side))
         moved[rows] = _smoothest(moved, vertices, faces, rows)
     return shape + moved
-
-
-def with_closed_lids(model: HeadModel, fit: Fit, closed: frozenset[str]) -> tuple[Fit, frozenset[str]]:
-    """The fit with the named eyes (``right``, ``left``) closed by blinking, and those that no expression of its modes
-    closes."""
-    coefficients, left = fit.coefficients.copy(), set(closed)
-    for name, place in zip(model.expressions.names, model.posed, strict=False):
-        side = BLINKS.get(plain_name(name))
-        if side in left:
-            coefficients[place] = 1.0
-            left.discard(side)
-    return replace(fit, coefficients=coefficients), frozenset(left)
 
 
 def bridged(vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]) -> Float[np.ndarray, "v 3"]:
@@ -199,7 +186,7 @@ def bridged(vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozen
     """
     out, faces = vertices.copy(), model.levels["full"].faces
     for side in sorted(closed):
-        rows = _lids(_fissure(model, side))
+        rows = _lids(eye_fissure(model, side))
         out[rows] = _smoothest(out, vertices, faces, rows)
     return out
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
+from pipeline.fitting.fine.blink import with_lids
 from pipeline.fitting.fit import Fit
 from pipeline.results.expression import found_expressions, neutral_mesh, posable_head, shut_eyes
 from rig.geometry import Similarity, rotation_from_vector
@@ -34,11 +35,13 @@ def test_a_report_names_what_is_strong_and_sure(posed: tuple[HeadModel, Fit, Mes
     assert found[0].std == pytest.approx(0.1)
 
 
-def test_eyes_that_show_nothing_blink(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+def test_closed_eyes_blink(posed: tuple[HeadModel, Fit, Mesh]) -> None:
     model, fit, _ = posed
-    found = found_expressions(model, fit, {"right"})
-    assert (found[0].name, found[0].weight) == ("eyeBlinkRight", 1.0)
     assert shut_eyes(model, fit) == frozenset()
+    shut = with_lids(fit, model, {"right": 1.0, "left": 0.0})
+    found = found_expressions(model, shut)
+    assert (found[0].name, found[0].weight) == ("eyeBlinkRight", 1.0)
+    assert shut_eyes(model, shut) == {"right"}
 
 
 def test_without_its_expression_a_head_is_neutral(posed: tuple[HeadModel, Fit, Mesh]) -> None:
