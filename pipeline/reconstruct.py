@@ -18,8 +18,10 @@ from pipeline.dense.surface.skin import part_of
 from pipeline.dense.window_bias import WindowBias
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.gaussian_process import with_kernel
-from pipeline.eigenheads.model import HeadModel, with_modes
+from pipeline.eigenheads.model import HeadModel, with_expressions, with_modes
 from pipeline.fitting.contour import finish, solve_contour
+from pipeline.fitting.expression_evidence import with_expression_evidence
+from pipeline.fitting.fine.blink import with_lids
 from pipeline.fitting.fine.dense_points import dense_points
 from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
 from pipeline.fitting.fine.eyelids import look_at_eyes
@@ -36,6 +38,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.kept_arrays import kept_arrays
 from pipeline.results.bust import Bust, make_bust
 from pipeline.results.camera_metrics import camera_figures, start_masks
+from pipeline.results.expression import found_expressions, posable_head, shut_eyes
 from pipeline.results.measurements import landmarks, measurements
 from pipeline.results.plausibility import plausibility_warnings, refuse
 from pipeline.results.reconstruction import Reconstruction
@@ -143,12 +146,17 @@ def reconstruct(
     fitted_masks = {name: np.isfinite(depth) for name, depth in depths.items()}
     figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, before)
     widths = {camera.name: camera.intrinsics.width for camera in rig}
-    implausible = plausibility_warnings(fit, figures, widths)
+    implausible = plausibility_warnings(fit, figures, widths, model.posed)
+    made = fit if finer is None else with_lids(fit, model, finer.lids)
+    closed = shut_eyes(model, made) | (frozenset() if finer is None else finer.closed_eyes)
+    expression = found_expressions(model, made)
+    asked = settings.outputs.neutral or settings.outputs.morphs
+    posable = posable_head(model, fit.world_from_head, mesh, expression) if asked else None
     told = (
         *found.warnings,
         *implausible,
         *warnings,
-        *eye_warnings(finer),
+        *eye_warnings(closed),
         *coloured.warnings,
         *texture_warnings,
         *bust_warnings,
@@ -180,6 +188,9 @@ def reconstruct(
         gains=coloured.gains,
         detail=detail,
         atlas=atlas,
+        expression=expression,
+        posed=model.posed,
+        posable=posable,
         bust=bust,
         parts=parts,
     )
@@ -212,7 +223,8 @@ def _of_stage(report: Report, stage: str, _: str, fraction: float) -> None:
 
 
 def basis(model: HeadModel, settings: Settings) -> HeadModel:
-    """The modes that the settings ask for: the eigenheads in use, and the kernel's where the detail goes beyond."""
+    """The modes that the settings ask for: the eigenheads in use; where the detail goes beyond, the kernel's and the
+    model's expressions, too."""
     span = settings.detail == "span" or settings.method == "simplex"
     return _basis(model, min(settings.fitting.modes, len(model.modes)), kernel=not span)
 
@@ -228,7 +240,8 @@ def _basis(model: HeadModel, modes: int, *, kernel: bool) -> HeadModel:
         return {"modes": wider.modes, "sigma": wider.sigma}
 
     kept = kept_arrays("kernel-modes", given, make, made_by=(with_kernel, vertex_normals, HeadModel))
-    return replace(with_modes(model, modes), modes=kept["modes"], sigma=kept["sigma"], _bases={})
+    wide = replace(with_modes(model, modes), modes=kept["modes"], sigma=kept["sigma"], _bases={})
+    return with_expressions(wide)
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:
@@ -285,6 +298,8 @@ def fit_head(
         hair = {name: part.probability[..., HAIR] for name, part in parts.items()}
         solved, detail = refine_with_photographs(solved, capture.images, settings.photo, hair=hair)
     model, eigenheads = solved.problem.model, min(settings.fitting.modes, len(model.modes))
+    if detail.level == "photo":
+        solved = with_expression_evidence(solved, eigenheads)
     relief_mm = settings.photo.fine_amplitude_mm
     if detail.level == "span":
         wider = _basis(model, eigenheads, kernel=True)
@@ -353,9 +368,9 @@ def fine_head(
     return head, Detail("fine", f"the dense surface shows {share:.0%} of the face")
 
 
-def eye_warnings(head: Displaced | None) -> list[ReportWarning]:
+def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:
     """Closed eyes are no fault, but most studios want another shot."""
-    if head is None or not head.closed_eyes:
+    if not closed:
         return []
-    which = "both eyes are" if len(head.closed_eyes) == 2 else f"the {min(head.closed_eyes)} eye is"
-    return [ReportWarning("eyes-closed", f"{which} closed: no white and no iris in the photographs; lids were closed")]
+    which = "both eyes are" if len(closed) == 2 else f"the {min(closed)} eye is"
+    return [ReportWarning("eyes-closed", f"{which} closed: no white and no iris in the photographs, or lids that meet")]

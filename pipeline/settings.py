@@ -75,6 +75,7 @@ class FittingSettings:
     scale_spread: float = 0.01  # prior of log scale: rigs are metric, size is a mode
     feature_noise_px: float = CLICK_NOISE_PX
     landmark_noise_mm: float = LANDMARK_NOISE_MM
+    expression_median: float = 0.1  # prior of an expression's weight, heavy-tailed (prior_term)
     bare_px: float = 2.0  # cranium, ears and neck agree with the input to this after a fit to the whole head ...
     bare_share: float = 0.8  # ... over this share of their outline: the head is bare, and all of its rim speaks
     bare_loss: float = 1.25  # and the rim of the face may lose no more than this factor by it
@@ -209,6 +210,8 @@ class OutputSettings:
     image: Literal["jpeg", "webp", "png"] = "jpeg"  # of head.glb's texture
     texture_size: int | None = None  # texels; None: a texel is about a pixel at the face
     ply_texture: bool = False  # head.ply names head.png and has texture coordinates
+    neutral: bool = False  # neutral.glb, the head without its expression
+    morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names
     obj: bool = False  # of earlier versions: "obj" among the formats
     atlas: bool = False  # of earlier versions: head.glb has a texture now
 

@@ -19,6 +19,7 @@ class ModelInfo(TypedDict):
     sha256: str
     subjects: dict[str, int]
     modes: int
+    expressions: list[str]
     vertices: int
     faces: int
     landmarks: int
@@ -39,6 +40,7 @@ def model_info(model: HeadModel) -> ModelInfo:
         "sha256": model.sha256,
         "subjects": dict(model.subjects),
         "modes": len(model.modes),
+        "expressions": list(model.expressions.names),
         "vertices": full.count,
         "faces": len(full.faces),
         "landmarks": len(model.landmarks),

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int
 
+from pipeline.eigenheads.expressions import Expressions, no_expressions
 from pipeline.eigenheads.model_file import ModelParts, read_parts
 from pipeline.eigenheads.model_names import model_path
 from pipeline.eigenheads.subdivision import boundary_vertices, refine, row_count
@@ -55,6 +56,8 @@ class HeadModel:
     levels: Mapping[str, Level]  # full, p95, p99, cage
     figures: Mapping[str, float]  # what was measured when the model was built, e.g. generalisation_mm
     scores: Float32[np.ndarray, "N C"]  # coefficients of the training heads; N = 0 where they are not known
+    expressions: Expressions  # none where the model has none
+    posed: range = range(0)  # which of ``modes`` are expressions, their coefficients weights (``with_expressions``)
     _bases: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
 
     def cage(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "V0 3"]:
@@ -68,6 +71,12 @@ class HeadModel:
     def vertices(self, coefficients: Float[np.ndarray, " m"], level: str = "full") -> Float[np.ndarray, "V 3"]:
         """Vertices of a level, float64, head frame, mm. Raises KeyError for an unknown level."""
         return self.levels[level].operator @ self.cage(coefficients)
+
+    def posed_vertices(
+        self, coefficients: Float[np.ndarray, " m"], weights: Mapping[str, float], level: str = "full"
+    ) -> Float[np.ndarray, "V 3"]:
+        """``vertices`` of a head that makes a face: weights of expressions by name. Raises KeyError."""
+        return self.levels[level].operator @ (self.cage(coefficients) + self.expressions.moved(weights))
 
     def basis(
         self, level: str, count: int, vertices: Int[np.ndarray, " S"] | None = None
@@ -120,6 +129,7 @@ def assemble(parts: ModelParts, sha256: str) -> HeadModel:
         levels=levels,
         figures=dict(parts.figures),
         scores=_frozen(np.asarray(parts.scores, np.float32)),
+        expressions=_readable(parts.expressions or no_expressions(count)),
     )
 
 
@@ -137,6 +147,10 @@ def _level(
     )
 
 
+def _readable(expressions: Expressions) -> Expressions:
+    return Expressions(expressions.names, _frozen(np.asarray(expressions.shapes, np.float32)))
+
+
 def _frozen(array: np.ndarray) -> np.ndarray:
     array = array.view()
     array.flags.writeable = False
@@ -151,6 +165,27 @@ def load_model(name_or_path: str | Path = "default") -> HeadModel:
 
 def with_modes(model: HeadModel, count: int) -> HeadModel:
     """The same model with only its first ``count`` modes."""
+    posed = range(min(model.posed.start, count), min(model.posed.stop, count))
     return replace(
-        model, modes=model.modes[:count], sigma=model.sigma[:count], scores=model.scores[:, :count], _bases={}
+        model,
+        modes=model.modes[:count],
+        sigma=model.sigma[:count],
+        scores=model.scores[:, :count],
+        posed=posed,
+        _bases={},
+    )
+
+
+def with_expressions(model: HeadModel) -> HeadModel:
+    """The model with its expressions as further modes, whose coefficients are their weights; as it is without any."""
+    count = len(model.expressions)
+    if not count or len(model.posed):
+        return model
+    shapes = model.expressions.shapes
+    return replace(
+        model,
+        modes=np.concatenate([model.modes, shapes]),
+        sigma=np.concatenate([model.sigma, np.linalg.norm(shapes.reshape(count, -1), axis=1)]),
+        posed=range(len(model.modes), len(model.modes) + count),
+        _bases={},
     )

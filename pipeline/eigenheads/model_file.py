@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from pipeline.eigenheads.expressions import Expressions, no_expressions, packed, unpacked
 from rig.errors import EigenheadError
 
-FORMAT = "eigenhead-model/1"
+FORMAT = "eigenhead-model/2"  # 2: with expressions
+READABLE = ("eigenhead-model/1", FORMAT)
 
 
 class BadModel(EigenheadError):
@@ -45,12 +47,15 @@ class ModelParts:
     decimated: Mapping[str, tuple[Int[np.ndarray, " K"], Int[np.ndarray, "G 3"]]]  # rows of full, faces
     figures: Mapping[str, float] = field(default_factory=dict)
     scores: Float[np.ndarray, "N C"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    expressions: Expressions | None = None
 
 
 def save_model(path: Path, parts: ModelParts) -> None:
     """Write a model file (npz, compressed; float32, rounded to 2^-12 mm so that it packs small)."""
+    expressions = parts.expressions or no_expressions(len(parts.mean))
     meta = {
         "format": FORMAT,
+        "expressions": list(expressions.names),
         "name": parts.name,
         "licence": parts.licence,
         "source": parts.source,
@@ -68,6 +73,7 @@ def save_model(path: Path, parts: ModelParts) -> None:
         "faces": np.asarray(parts.faces, np.int32),
         "face_region": np.packbits(parts.face_region),
         "scores": np.asarray(parts.scores, np.float32),
+        **packed(expressions),
     }
     for name, (rows, faces) in parts.decimated.items():
         arrays[f"{name}_rows"], arrays[f"{name}_faces"] = np.asarray(rows, np.int32), np.asarray(faces, np.int32)
@@ -94,7 +100,7 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
             if "meta" not in file:
                 raise BadModel(path, "it does not carry this project's model format")
             meta = json.loads(file["meta"].tobytes())
-            if meta.get("format") != FORMAT:
+            if meta.get("format") not in READABLE:
                 raise BadModel(path, f"format {meta.get('format')!r}, wanted {FORMAT!r}")
             parts = _parts(meta, file)
     except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
@@ -120,4 +126,5 @@ def _parts(meta: dict, file: Mapping[str, np.ndarray]) -> ModelParts:
         decimated={name: (file[f"{name}_rows"], file[f"{name}_faces"]) for name in ("p95", "p99")},
         figures=meta["figures"],
         scores=file["scores"],
+        expressions=unpacked(meta["expressions"], file, len(mean)) if meta.get("expressions") else None,
     )

@@ -5,6 +5,8 @@ It is taken where the cost falls; lambda then shrinks ten times, else it grows a
 again. The end is where the linear model predicts a fall below ``Limits.tolerance``: costs count squared standard
 deviations, so that a predicted fall of f is a step of sqrt(f) standard deviations of what is estimated.
 
+Where unknowns are bounded, the step is the damped model's minimum within their bounds (``bounded``).
+
 Some costs are uneven (the rim's samples change as the head moves). For these a step may climb back to the worst of the
 last ``Limits.memory`` costs (Grippo, Lampariello and Lucidi 1986); the best value is returned in any case.
 """
@@ -17,6 +19,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from pipeline.estimation.bounded import least_within
 from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Value
 
 DAMPING_LEAST = 1e-7  # after accepted steps; relative to the diagonal, Gauss-Newton to seven digits
@@ -97,6 +100,8 @@ def minimise(
             step = _damped_step(equations, damping, solve)
             if step is not None:
                 predicted = -float(equations.gradient @ step)
+                if problem.room is not None:
+                    step, predicted = _within(equations, damping, step, problem.room(now.value))
                 tried, evaluations = _place(problem, problem.after(now.value, step)), evaluations + 1
                 if tried.cost < max(recent[-limits.memory :]):  # False for the NaN of a value that makes no sense
                     accepted = tried
@@ -131,10 +136,28 @@ def _place(problem: Problem[Value], value: Value) -> _Place[Value]:
 
 def _damped_step(equations: NormalEquations, damping: float, solve: Solve) -> Float[np.ndarray, " p"] | None:
     """The step, or None where the damped matrix is not positive definite."""
+    try:
+        return -solve(_damped(equations, damping), equations.gradient)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _damped(equations: NormalEquations, damping: float) -> Float[np.ndarray, "p p"]:
     damped = equations.matrix.copy()
     diagonal = np.einsum("ii->i", damped)
     diagonal += damping * (diagonal + DIAGONAL_LEAST)
-    try:
-        return -solve(damped, equations.gradient)
-    except np.linalg.LinAlgError:
-        return None
+    return damped
+
+
+def _within(
+    equations: NormalEquations,
+    damping: float,
+    step: Float[np.ndarray, " p"],
+    room: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
+) -> tuple[Float[np.ndarray, " p"], float]:
+    """The step within its room, and the fall of the cost that the damped model predicts for it."""
+    if ((step >= room[0]) & (step <= room[1])).all():
+        return step, -float(equations.gradient @ step)
+    damped = _damped(equations, damping)
+    step = least_within(damped, equations.gradient, *room)
+    return step, -float(2.0 * equations.gradient @ step + step @ damped @ step)

@@ -153,12 +153,14 @@ class Problem(Generic[Value]):
     """A complete problem: all terms, the number of unknowns, and what a step in them does to a value.
 
     ``free``: which of the unknowns move, all by default. ``moved(value, step)`` gets steps of all unknowns.
+    ``room(value)``: the least and the largest step of each free unknown, infinite where nothing bounds it.
     """
 
     terms: tuple[Term[Value], ...]
     unknowns: int
     moved: Callable[[Value, Float[np.ndarray, " p"]], Value]
     free: Bool[np.ndarray, " p"] | None = None
+    room: Callable[[Value], tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]] | None = None
 
     @property
     def size(self) -> int:

@@ -16,6 +16,7 @@ from pipeline.experiments.convergence import convergence
 from pipeline.experiments.cost import cost
 from pipeline.experiments.drift import drift
 from pipeline.experiments.exchanges import exchanges, false_alarms
+from pipeline.experiments.expressions import expressions
 from pipeline.experiments.hidden import hidden
 from pipeline.experiments.levels import levels
 from pipeline.experiments.limit import limit
@@ -151,6 +152,16 @@ def _detail(task: Task) -> Outcome:
         )
 
 
+def _expressions(task: Task) -> Outcome:
+    models = {"default": task.head, "ict": _facekit(task.shared)}
+    for name, model in models.items():
+        if not len(model.expressions):
+            raise InputError(name, ["has no expressions: import it again, or name --shared"])
+    count = {"subjects": task.subjects} if task.subjects else {}
+    with Renderer.create() as renderer:
+        return expressions(models, renderer=renderer, report=task.report, folder=task.folder, **count)
+
+
 def _hidden(task: Task) -> Outcome:
     with Renderer.create() as renderer:
         return hidden(
@@ -209,6 +220,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "span": _span,
     "detail": _detail,
     "hidden": _hidden,
+    "expressions": _expressions,
     "visible": _visible,
     "surfaces": _surfaces,
     "texture": _texture,

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
+from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.head_problem import started_problem
 from pipeline.fitting.noise_model import is_bare, with_misfit
@@ -151,13 +152,24 @@ def coarse_unit(scale_px: float) -> float:
     return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
 
 
+def normal_equations(solved: Solved) -> NormalEquations:
+    """Of the last stage, at the solution."""
+    scale = max(solved.stage.scales_px[-1], solved.evidence.noise.floor_px)
+    whole, there = started_problem(solved.problem, solved.evidence, solved.stage, scale, solved.state)
+    return whole.equations(there)
+
+
 def finish(solved: Solved) -> Fit:
     """The fit with its Laplace covariance: the inverse of the last normal matrix, cameras marginalised."""
     problem, state, stage = solved.problem, solved.state, solved.stage
-    scale = max(stage.scales_px[-1], solved.evidence.noise.floor_px)
-    whole, there = started_problem(problem, solved.evidence, stage, scale, state)
     kept = stage.modes + POSE
-    covariance = np.linalg.inv(whole.equations(there).matrix)[:kept, :kept]
+    equations = normal_equations(solved)
+    posed = np.asarray(problem.model.posed)
+    if len(posed) and posed[-1] < stage.modes:
+        # At a bound a posterior is no Gaussian: it falls exponentially with the slope there, its deviation 1 / slope.
+        held = posed[(state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]
+        equations.matrix[held, held] += equations.gradient[held] ** 2
+    covariance = np.linalg.inv(equations.matrix)[:kept, :kept]
     rim = observed_rim(problem, solved.evidence, state, stage)
     names = problem.views.names
     return Fit(

@@ -24,7 +24,23 @@ def head_problem(
     cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
     rim = RimTerm(problem, evidence, stage, scale_px, reference_px)
     terms: tuple[Term[State], ...] = (rim, *_other_terms(problem, evidence, stage))
-    return Problem(terms, stage.modes + POSE + cameras, lambda state, step: apply_step(state, step, stage))
+    posed = problem.model.posed
+    poses = len(posed) > 0 and posed.stop <= stage.modes
+    return Problem(
+        terms,
+        stage.modes + POSE + cameras,
+        lambda state, step: apply_step(state, step, stage),
+        room=(lambda state: weight_room(state, posed, stage.modes + POSE + cameras)) if poses else None,
+    )
+
+
+def weight_room(state: State, posed: range, unknowns: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Steps that keep the weights of expressions between 0 and 1."""
+    least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
+    weights = state.coefficients[posed.start : posed.stop]
+    weights = np.clip(weights, 0.0, 1.0)
+    least[posed.start : posed.stop], most[posed.start : posed.stop] = -weights, 1.0 - weights
+    return least, most
 
 
 def started_problem(

@@ -16,7 +16,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.eigenheads.gaussian_process import SCALES
 from pipeline.eigenheads.model import HeadModel
@@ -48,10 +48,11 @@ def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_
     if fit.covariance is None or len(fit.coefficients) <= eigenheads:
         return fit
     count = len(fit.coefficients)
-    population = _variance_ratio(fit, slice(0, eigenheads))
-    kernel = _variance_ratio(fit, slice(eigenheads, count))
+    population = _variance_ratio(fit, np.arange(eigenheads))
+    smooth = np.setdiff1d(np.arange(eigenheads, count), model.posed)
+    kernel = _variance_ratio(fit, smooth)
     ratio = np.ones(len(fit.covariance))
-    ratio[:eigenheads], ratio[eigenheads:count] = population, KERNEL_VARIANCE_UNSEEN * kernel
+    ratio[:eigenheads], ratio[smooth] = population, KERNEL_VARIANCE_UNSEEN * kernel
     information = np.linalg.inv(fit.covariance) + np.diag(1.0 / ratio - 1.0)
     relief = relief_mm * math.sqrt(kernel)
     misfit = np.maximum(0.0 if fit.misfit_mm is None else fit.misfit_mm, np.full(len(model.mean), relief))
@@ -61,7 +62,7 @@ def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_
     return replace(fit, covariance=covariance, misfit_mm=misfit, sliding_mm=KERNEL_MM * math.sqrt(kernel))
 
 
-def _variance_ratio(fit: Fit, modes: slice) -> float:
+def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
     """Estimated prior variance of a group of modes, by the unit prior's."""
     assert fit.covariance is not None
     determined = float(np.clip(1.0 - np.diag(fit.covariance)[modes], 0.0, 1.0).sum())

@@ -33,7 +33,7 @@ class ImplausibleResult(EigenheadError):
 
 
 def plausibility_warnings(
-    fit: Fit, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
+    fit: Fit, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int], posed: range = range(0)
 ) -> list[ReportWarning]:
     """What speaks against a result.
 
@@ -41,9 +41,10 @@ def plausibility_warnings(
         fit: coefficients in standard deviations; scale against the model's own size.
         cameras: contour residuals of every camera.
         widths_px: of the pictures, by camera.
+        posed: which of the coefficients are expressions, and no standard deviations.
     """
     return [
-        *_shape(fit.coefficients),
+        *_shape(np.delete(fit.coefficients, np.asarray(posed, int))),
         *_scale(fit.world_from_head.scale),
         *_contours(cameras, widths_px),
     ]

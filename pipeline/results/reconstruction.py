@@ -15,6 +15,7 @@ from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.fitting.fit import Fit
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.bust import Bust
+from pipeline.results.expression import Found, Posable
 from pipeline.results.measurements import Landmark, Measurement
 from pipeline.settings import Settings
 from pipeline.texture.uv_unwrap import Atlas
@@ -69,5 +70,8 @@ class Reconstruction:
     gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
     pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
     atlas: Atlas | None = None  # where a format has a texture and the model a layout
+    expression: tuple[Found, ...] = ()  # the face that the head makes, the strongest part first
+    posed: range = range(0)  # which of the fit's coefficients are weights of expressions
+    posable: Posable | None = None  # where the settings ask for it
     bust: Bust | None = None  # where the settings ask for it and the photographs carry it
     parts: Mapping[str, PartMap] = field(default_factory=dict)  # skin, hair or clothes in a view's pixels, where told

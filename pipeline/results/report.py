@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.dense.part_votes import PART_NAMES
 from pipeline.imaging.silhouette import ViewQuality
 from pipeline.results.bust import Bust
+from pipeline.results.expression import Posable
 from pipeline.results.reconstruction import CameraFigures, Reconstruction
 from pipeline.settings import document_from_settings
 from rig.geometry import Similarity
@@ -68,6 +69,23 @@ class Placed(TypedDict):
     std: list[float] | None
 
 
+class ExpressionReport(TypedDict):
+    """What the face does: the model's name, the same in words, a weight from 0 to 1 and its standard deviation."""
+
+    name: str
+    words: str
+    weight: float
+    std: float | None
+
+
+class MorphsReport(TypedDict):
+    """Of posed.glb: the weights that give the head as photographed, and those of Apple's names that move nothing
+    because the model has no counterpart."""
+
+    weights: dict[str, float]
+    without_counterpart: list[str]
+
+
 class SimilarityReport(TypedDict):
     scale: float
     rotation: list[list[float]]
@@ -99,6 +117,8 @@ class Report(TypedDict):
     cameras: dict[str, CameraReport]
     pictures: dict[str, str]
     coefficients: list[float]
+    expression: list[ExpressionReport]
+    morphs: MorphsReport | None
     world_from_head: SimilarityReport
     landmarks: dict[str, Placed]
     measurements: dict[str, Measured]
@@ -125,7 +145,12 @@ def report_document(result: Reconstruction) -> Report:
         "front": result.front,
         "cameras": {name: _camera(result, name, figures) for name, figures in result.cameras.items()},
         "pictures": dict(result.pictures),  # by camera, the name under which its own is filed
-        "coefficients": result.fit.coefficients,
+        "coefficients": np.delete(result.fit.coefficients, np.asarray(result.posed, int)),
+        "expression": [
+            {"name": each.name, "words": each.words, "weight": each.weight, "std": each.std}
+            for each in result.expression
+        ],
+        "morphs": None if result.posable is None else _morphs(result.posable),
         "world_from_head": similarity_document(result.fit.world_from_head),
         "landmarks": {k: {"position": p.position_mm, "std": p.std_mm} for k, p in result.landmarks.items()},
         "measurements": {k: {"value": m.value_mm, "std": m.std_mm} for k, m in result.measurements.items()},
@@ -150,6 +175,11 @@ def similarity_document(transform: Similarity) -> SimilarityReport:
         "rotation": transform.rotation.tolist(),
         "translation": translation.tolist(),
     }
+
+
+def _morphs(posable: Posable) -> dict[str, object]:
+    used = {name: weight for name, weight in posable.weights.items() if weight}
+    return {"weights": used, "without_counterpart": list(posable.missing)}
 
 
 def _bust(bust: Bust) -> dict[str, object]:

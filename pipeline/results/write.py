@@ -5,6 +5,7 @@
     contact_sheet.png   input, silhouette difference before and after the fit (section 5.4), the head from new views
     turntable.png       the head from the right to the left profile
     head.obj head.mtl head.png, head.usdz, head.stl, head.3mf     on request (settings.outputs.formats)
+    neutral.glb         on request: the head without its expression; posed.glb, with morphs to make others
 
 Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
 """
@@ -21,6 +22,7 @@ from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
+from pipeline.results.write_expression import write_expression
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, refiled
 from rig.formats.glb import write_glb
@@ -42,6 +44,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture) -> None
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
+            *([] if result.posable is None else [pool.submit(write_expression, folder, result, result.posable)]),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
         ]

@@ -76,6 +76,10 @@ def reconstruct(
     ] = None,
     obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
     atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
+    neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
+    morphs: Annotated[
+        bool, typer.Option("--morphs", help="Write posed.glb too, with morph targets under Apple's names.")
+    ] = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
     json_out: Json = False,
@@ -83,7 +87,8 @@ def reconstruct(
     """Reconstruct one capture without the service."""
     from server.cli.reconstruct_local import reconstruct_locally, settings_document
 
-    outputs: dict[str, object] = {name: True for name, asked in {"obj": obj, "atlas": atlas}.items() if asked}
+    flags = {"obj": obj, "atlas": atlas, "neutral": neutral, "morphs": morphs}
+    outputs: dict[str, object] = {name: True for name, asked in flags.items() if asked}
     outputs |= {"surface": surface} if surface else {}
     outputs |= {"formats": formats.split(",")} if formats else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
@@ -172,6 +177,10 @@ def simulate(
         typer.Option(help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, glasses."),
     ] = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
+    expression: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
+    ] = None,
     fault: Annotated[
         list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
     ] = None,
@@ -191,7 +200,6 @@ def simulate(
     given) with which the rig commands and the service work as with a real rig."""
     from dataclasses import replace
 
-    from rig.studio.sensor.faults import fault_from_text
     from rig.studio.sensor.preset import PRESET
 
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
@@ -199,21 +207,35 @@ def simulate(
     preset = replace(preset, hairstyle=tuple(hair.split(",")) if hair else ())
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
-                      faults=fault or [])  # fmt: skip
+                      faults=fault or [], expression=expression or [])  # fmt: skip
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
-    with wrong_usage("--fault"):
-        for text in fault or []:
-            fault_from_text(text)
+    _check_planted(fault or [], expression or [])
     _make_way(out, overwrite)
     from rig.render.renderer import Renderer
     from server.tasks.subjects import simulate_folder
 
     with progress_bar() as report, Renderer.create() as renderer:
         report("simulate", 0.0)
-        truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer)
+        truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
+                                expression=expression or [])  # fmt: skip
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+def _check_planted(faults: list[str], expression: list[str]) -> None:
+    """Faults and expressions that nobody knows are wrong usage."""
+    from rig.studio.sensor.faults import fault_from_text
+
+    with wrong_usage("--fault"):
+        for text in faults:
+            fault_from_text(text)
+    if expression:
+        from pipeline.eigenheads.expressions import weights_from_text
+        from pipeline.eigenheads.model import load_model
+
+        with wrong_usage("--expression"):
+            weights_from_text(expression, load_model().expressions.names)
 
 
 def _make_way(out: Path, overwrite: bool) -> None:
@@ -282,7 +304,8 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible, surfaces, texture or real."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, surfaces, "
+            "texture or real."
         ),
     ],
     folders: Annotated[

@@ -80,6 +80,7 @@ def serve_studio(
     seed: int,
     preset: Preset,
     faults: Sequence[str],
+    expression: Sequence[str] = (),
     fps: float,
     port: int,
     ready: Callable[[OpenStudio], None],
@@ -98,7 +99,7 @@ def serve_studio(
     rng = np.random.default_rng(seed)
     report("draw", 0.0)
     with Renderer.create() as renderer:
-        chosen = subject_of(subject, load_model(), rng)
+        chosen = subject_of(subject, load_model(), rng, expression)
         scene = build_scene(chosen, default_layout(), preset, rng.spawn(1)[0], renderer=renderer)
     truth = folder.with_name(folder.name + ".truth")
     write_truth(truth, SimulatedCapture(Capture({}), scene.rig, scene, ()), seed=seed)

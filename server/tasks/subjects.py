@@ -1,11 +1,15 @@
 """Subjects of the simulated studio, and the capture folders that show them."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from pipeline.eigenheads.correspondence.scans import landmark_file, read_landmarks
+from pipeline.eigenheads.expressions import closed_lids, weights_from_text
 from pipeline.eigenheads.model import HeadModel, load_model
+from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
@@ -16,38 +20,48 @@ from rig.studio.scene.subject import Subject
 from rig.studio.sensor.faults import fault_from_text
 from rig.studio.sensor.preset import Preset
 
+NEUTRAL: Mapping[str, float] = MappingProxyType({})
 
-def drawn_subject(model: HeadModel, rng: np.random.Generator) -> Subject:
+
+def drawn_subject(model: HeadModel, rng: np.random.Generator, weights: Mapping[str, float] = NEUTRAL) -> Subject:
     """A head drawn from the model's population, all modes."""
-    return model_subject(model, rng.standard_normal(len(model.modes)), f"drawn from {model.name}")
+    return model_subject(model, rng.standard_normal(len(model.modes)), f"drawn from {model.name}", weights)
 
 
-def model_subject(model: HeadModel, coefficients: np.ndarray, name: str) -> Subject:
+def model_subject(
+    model: HeadModel, coefficients: np.ndarray, name: str, weights: Mapping[str, float] = NEUTRAL
+) -> Subject:
+    """A head of the model, with the expression that ``weights`` name."""
     full = model.levels["full"]
-    vertices = model.vertices(coefficients)
+    vertices = model.posed_vertices(coefficients, weights)
     landmarks = {name: vertices[index] for name, index in model.landmarks.items()}
-    return Subject(Mesh(vertices, full.faces), landmarks, full.face_region, name)
+    return Subject(Mesh(vertices, full.faces), landmarks, full.face_region, name, closed_lids(weights))
 
 
-def subject_of(text: str, model: HeadModel, rng: np.random.Generator) -> Subject:
+def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression: Sequence[str] = ()) -> Subject:
     """``random``, ``mean``, or a mesh file in the head frame (mm) with its landmarks beside it, where it has some.
+    ``expression``: NAME=WEIGHT of the model's.
 
     Raises InputError."""
+    weights = weights_from_text(expression, model.expressions.names)
     if text == "random":
-        return drawn_subject(model, rng)
+        return drawn_subject(model, rng, weights)
     if text == "mean":
-        return model_subject(model, np.zeros(0), f"mean of {model.name}")
+        return model_subject(model, np.zeros(0), f"mean of {model.name}", weights)
+    if weights:
+        raise InputError("expression", ["only heads of the model make faces: leave out --subject FILE"])
     path = Path(text)
     marks = landmark_file(path)
     return Subject(read_mesh(path), {} if marks is None else read_landmarks(marks), name=path.name)
 
 
 def simulate_folder(
-    out: Path, *, subject: str, seed: int, preset: Preset, faults: list[str], renderer: Renderer
-) -> Path:
+    out: Path, *, subject: str, seed: int, preset: Preset, faults: list[str], renderer: Renderer,
+    expression: Sequence[str] = (),
+) -> Path:  # fmt: skip
     """``eigenhead simulate``: a capture folder at ``out``; returns where the truth is."""
     rng = np.random.default_rng(seed)
-    chosen = subject_of(subject, load_model(), rng)
+    chosen = subject_of(subject, load_model(), rng, expression)
     planted = tuple(fault_from_text(text) for text in faults)
     taken = simulate(chosen, default_layout(), preset, rng, renderer=renderer, faults=planted)
     return simulate_to_folder(out, taken, seed=seed)

@@ -8,6 +8,7 @@ triangles between existing vertices, so that the head hides what is behind it.
 """
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from scipy.spatial.distance import cdist
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.correspondence.surface_fit import fit_surface
 from pipeline.eigenheads.correspondence.warp import landmark_warp
+from pipeline.eigenheads.expressions import Expressions, visible
 from pipeline.eigenheads.landmarks import MIDLINE, NAMES, mirrored
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.model_file import ModelParts, read_parts, rounded
@@ -35,6 +37,8 @@ ICT_NAME = "ict-facekit"
 ICT_LICENCE = "MIT"
 ICT_SOURCE = "ICT-FaceKit Light, https://github.com/ICT-VGL/ICT-FaceKit (FaceXModel)"
 ICT_NOTICE = "Copyright (c) 2020 USC Institute for Creative Technologies. MIT licence; keep this notice with copies."
+ICT_EXPRESSIONS = "_expressions.npz"  # how the compact copy's second file ends
+ICT_EXPRESSION = re.compile(r"(brow|cheek|eye|jaw|mouth|nose)[A-Za-z]+(_[LR])?")
 ICT_VERTICES = 11248  # face, head and neck; sockets, teeth, eyeballs and lashes follow (README of ICT-FaceKit)
 ICT_LANDMARKS_68 = (
     1225, 1888, 1052, 367, 1719, 1722, 2199, 1447, 966, 3661, 4390, 3927, 3924, 2608, 3272, 4088, 3443, 268, 493, 1914,
@@ -82,12 +86,14 @@ class Foreign:
     faces: Int[np.ndarray, "F 3"]
     landmarks: Mapping[str, int]  # those that are known
     subjects: Mapping[str, int]
+    expressions: Expressions | None = None  # displacements in mm
 
 
 def import_model(path: Path, *, name: str | None = None, report: Report | None = None) -> ModelParts:
     """Read a foreign model and make it one of ours (or a model file of ours, renamed). Of a folder that holds one model
     file, that file. Raises CannotImport."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
+    files = [f for f in files if not f.name.endswith(ICT_EXPRESSIONS)]  # read with the identities beside it
     path = files[0] if len(files) == 1 else path
     if path.is_dir():
         foreign = read_ict_repository(path, report=report)
@@ -110,7 +116,19 @@ def read_ict_compact(path: Path) -> Foreign:
     with np.load(path, allow_pickle=False) as file:
         mean, modes, faces = (file[key] for key in ("mean", "modes", "faces"))
         points = file["landmarks68"]
-    return _ict(mean.astype(float), modes, faces, points)
+    return replace(_ict(mean.astype(float), modes, faces, points), expressions=_compact_expressions(path, mean))
+
+
+def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
+    """From the file of expressions beside that of identities (names, shapes in mm on the same vertices)."""
+    beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
+    if not beside.is_file():
+        return None
+    with np.load(beside, allow_pickle=False) as file:
+        names, shapes = tuple(str(name) for name in file["names"]), file["shapes"].astype(np.float32)
+    if shapes.shape != (len(names), *mean.shape) or not np.isfinite(shapes).all():
+        raise CannotImport(beside, f"{len(names)} names, shapes {shapes.shape} and a mean {mean.shape} do not fit")
+    return visible(Expressions(names, shapes))
 
 
 def read_ict_repository(folder: Path, *, report: Report | None = None) -> Foreign:
@@ -132,7 +150,24 @@ def read_ict_repository(folder: Path, *, report: Report | None = None) -> Foreig
             report("reading identity shapes", (k + 1) / len(paths))
     skin = [p for p in polygons if max(p) < ICT_VERTICES]
     faces = np.array([(p[0], p[k], p[k + 1]) for p in skin for k in range(1, len(p) - 1)], np.int32)
-    return _ict(neutral[:ICT_VERTICES] * 10.0, np.array(modes, np.float32), faces, np.array(ICT_LANDMARKS_68))
+    found = _ict(neutral[:ICT_VERTICES] * 10.0, np.array(modes, np.float32), faces, np.array(ICT_LANDMARKS_68))
+    return replace(found, expressions=_repository_expressions(inside, neutral, report))
+
+
+def _repository_expressions(
+    folder: Path, neutral: Float[np.ndarray, "V 3"], report: Report | None
+) -> Expressions | None:
+    """The meshes named for what a face does: browDown_L.obj and so on. Raises CannotImport."""
+    paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
+    shapes = []
+    for k, path in enumerate(paths):
+        vertices, _ = _read_obj(path, polygons=False)
+        if len(vertices) != len(neutral):
+            raise CannotImport(folder, f"{path.name} has {len(vertices)} vertices, the neutral mesh {len(neutral)}")
+        shapes.append((vertices - neutral)[:ICT_VERTICES] * 10.0)
+        if report:
+            report("reading expressions", (k + 1) / len(paths))
+    return visible(Expressions(tuple(p.stem for p in paths), np.array(shapes, np.float32))) if paths else None
 
 
 def _ict(mean: np.ndarray, modes: np.ndarray, faces: np.ndarray, points: np.ndarray) -> Foreign:
@@ -266,7 +301,8 @@ def adopt(foreign: Foreign, *, report: Report | None = None) -> ModelParts:
     )
     components = Components(mean, modes, sigma, np.zeros((0, len(sigma))))
     figures = {"draws_mm": largest_miss(foreign.modes, modes, sigma)}
-    return finish(training, components, face_region(mean, landmarks), figures, report=report)
+    parts = finish(training, components, face_region(mean, landmarks), figures, report=report)
+    return replace(parts, expressions=foreign.expressions)
 
 
 def largest_miss(

@@ -108,13 +108,17 @@ def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dic
     ]
     out = {}
     for name, raw in source.read(wanted):
-        dense = np.zeros((vertices, 3), np.float32)
-        text = gzip.decompress(raw).decode()
-        rows = np.array([line.split() for line in text.splitlines() if line and not line.startswith("#")], float)
-        rows = rows.reshape(-1, 4)  # a few targets are empty
-        dense[rows[:, 0].astype(int)] = rows[:, 1:4]
-        out[PurePosixPath(name).name.removesuffix(".target.gz")] = dense
+        out[PurePosixPath(name).name.removesuffix(".target.gz")] = dense_target(gzip.decompress(raw).decode(), vertices)
     return out
+
+
+def dense_target(text: str, vertices: int) -> Float[np.ndarray, "V 3"]:
+    """The displacement of every vertex (float32) from a target file's lines: vertex, x, y, z."""
+    dense = np.zeros((vertices, 3), np.float32)
+    rows = np.array([line.split() for line in text.splitlines() if line and not line.startswith("#")], float)
+    rows = rows.reshape(-1, 4)  # a few targets are empty
+    dense[rows[:, 0].astype(int)] = rows[:, 1:4]
+    return dense
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,10 +1,11 @@
 """Eyes that are open in the model and closed in the photographs.
 
 Both are told apart by what shows between the lids: the white of an eye has no colour of its own, iris and pupil are
-darker than skin; a closed lid is skin with a thin line of lashes. Closed lids bridge the opening: what lies between
-them, and the margins that stand about it, become the smoothest surface that continues the skin around (biharmonic,
-Botsch and Kobbelt 2004, *An intuitive framework for real-time freeform modeling*), which the dense surface then draws
-to the lids themselves. The eyeball's part of a model lies behind and stays unseen.
+darker than skin; a closed lid is skin with a thin line of lashes. Where the model blinks, that closes the lids; where
+it has no such expression, they bridge the opening: what lies between them, and the margins that stand about it, become
+the smoothest surface that continues the skin around (biharmonic, Botsch and Kobbelt 2004, *An intuitive framework for
+real-time freeform modeling*), which the dense surface then draws to the lids themselves. The eyeball's part of a model
+lies behind and stays unseen.
 """
 
 from collections.abc import Mapping
@@ -49,7 +50,7 @@ class EyeEvidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fissure:
+class Fissure:
     """The slit between the lids on the mean head: its middle, its length, and every vertex's place about it."""
 
     length_mm: float
@@ -63,7 +64,8 @@ class _Fissure:
         return self.front & inside
 
 
-def _fissure(model: HeadModel, side: str) -> _Fissure:
+def eye_fissure(model: HeadModel, side: str) -> Fissure:
+    """Of the ``right`` or ``left`` eye."""
     mean = model.vertices(np.zeros(0))
     outer, inner = (mean[model.landmarks[f"{corner}canthion_{side}"]] for corner in ("exo", "endo"))
     chord = inner - outer
@@ -71,7 +73,7 @@ def _fissure(model: HeadModel, side: str) -> _Fissure:
     above = np.array([-along[1], along[0], 0.0]) * np.sign(along[0])
     off = mean - 0.5 * (outer + inner)
     front = (np.abs(off[:, 2]) < np.linalg.norm(chord)) & (np.abs(off[:, 0]) < np.linalg.norm(chord))
-    return _Fissure(float(np.linalg.norm(chord)), off @ along, off @ above, front)
+    return Fissure(float(np.linalg.norm(chord)), off @ along, off @ above, front)
 
 
 def look_at_eyes(
@@ -91,7 +93,7 @@ def look_at_eyes(
     normals = vertex_normals(vertices, model.levels["full"].faces)
     found = {}
     for side in SIDES:
-        slit = _fissure(model, side)
+        slit = eye_fissure(model, side)
         shown = np.flatnonzero(slit.ellipse(SHOWN_LENGTH * slit.length_mm, SHOWN_HEIGHT * slit.length_mm))
         size = SKIN_SIZE * slit.length_mm
         skin = np.flatnonzero(slit.ellipse(1.5 * size, size, SKIN_BELOW * slit.length_mm))
@@ -149,7 +151,7 @@ def _light_and_chroma(colours: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarr
     return light, (colours[:, 0] - colours[:, 2]) / np.maximum(light, 1e-3)
 
 
-def _lids(slit: _Fissure) -> Int[np.ndarray, " r"]:
+def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
     """Both lids and what lies between them."""
     half_length, half_height = 0.5 * slit.length_mm + MARGIN_MM, BRIDGE_HEIGHT * slit.length_mm
     return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
@@ -169,7 +171,7 @@ def with_plain_lids(
     """
     moved, faces = vertices - shape, model.levels["full"].faces
     for side in SIDES:
-        rows = _lids(_fissure(model, side))
+        rows = _lids(eye_fissure(model, side))
         moved[rows] = _smoothest(moved, vertices, faces, rows)
     return shape + moved
 
@@ -184,7 +186,7 @@ def bridged(vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozen
     """
     out, faces = vertices.copy(), model.levels["full"].faces
     for side in sorted(closed):
-        rows = _lids(_fissure(model, side))
+        rows = _lids(eye_fissure(model, side))
         out[rows] = _smoothest(out, vertices, faces, rows)
     return out
 

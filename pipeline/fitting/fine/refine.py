@@ -11,7 +11,7 @@ Hair bounds and does not pull: a point of hair or clothes says that the skin doe
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,6 +21,7 @@ from pipeline.dense.part_votes import SKIN, UNSEEN
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import Associated, associate, interpolated
+from pipeline.fitting.fine.blink import judged_lids, plain_shape, with_lids
 from pipeline.fitting.fine.ears import with_ears_in_place
 from pipeline.fitting.fine.eyelids import EyeEvidence, bridged, with_plain_lids
 from pipeline.fitting.fine.folds import unfolded
@@ -67,6 +68,7 @@ class Displaced:
     deviation_mm: Float[np.ndarray, " v"]  # along the normal
     observed: Bool[np.ndarray, " v"]  # at a triangle that a point of skin showed
     closed_eyes: frozenset[str] = frozenset()  # of ``right`` and ``left``
+    lids: Mapping[str, float] = field(default_factory=dict)  # how far each eye is closed, where the model blinks
 
 
 def refine_to_surface(
@@ -88,7 +90,8 @@ def refine_to_surface(
         model: with the modes that the fit has.
         surface: what the dense stage knows, world frame.
         settings: lengths and floors.
-        eigenheads: how many of the modes are a population's; the rest are smooth deformations along the normals.
+        eigenheads: how many of the modes are a population's; the rest, expressions apart, are smooth deformations along
+            the normals.
         deviation_mm: what the fit says of every vertex (``vertex_deviation_mm``).
         eyes: what photographs show between the lids (``look_at_eyes``); without it they stay as the model has them.
         patches: the photographs, to be asked once more on the displaced head.
@@ -98,11 +101,13 @@ def refine_to_surface(
         The displaced head and what was decided about the eyes.
     """
     faces = model.levels["full"].faces
+    lids = judged_lids(fit, model, surface, eigenheads, eyes or {})
+    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed and lids.get(side, 1.0) == 1.0)
+    fit = with_lids(fit, model, lids)
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
-    shape = fit.world_from_head.apply(model.vertices(fit.coefficients[:eigenheads]))
-    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed)
+    shape = plain_shape(fit, model, eigenheads)
     base = unfolded(shape, with_plain_lids(fitted, shape, model), faces)
-    base = bridged(base, model, closed)
+    base = bridged(base, model, closed.difference(lids))
     surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
     base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))
     regions = head_regions(model)
@@ -117,7 +122,7 @@ def refine_to_surface(
         look=patches and patches.places,
         report=report,
     )
-    return replace(head, closed_eyes=closed)
+    return replace(head, closed_eyes=closed, lids=lids)
 
 
 def draw_to_surface(

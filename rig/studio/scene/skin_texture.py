@@ -1,5 +1,7 @@
 """Skin colour per vertex: an even tone, blotches, and the features that are laid out from landmarks."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
@@ -15,8 +17,10 @@ def skin_paint(
     tone: tuple[float, float, float],
     stubble: float,
     rng: np.random.Generator,
+    *,
+    closed: Mapping[str, float] | None = None,
 ) -> Float[np.ndarray, "v 4"]:
-    """Linear albedo and strength of the grain, head frame."""
+    """Linear albedo and strength of the grain, head frame. ``closed``: how far the lids are, by side, 0 to 1."""
     paint = np.ones((len(vertices), 4))
     paint[:, :3] = np.array(tone) * (1 + _blotches(vertices, rng) * (0.5, 1.0, 1.0))
     if body.landmarks:
@@ -24,7 +28,7 @@ def skin_paint(
         _beard(paint, vertices, body.landmarks, stubble)
         _mouth(paint, vertices, body.landmarks)
         for side in ("right", "left"):
-            _eye(paint, vertices, body.landmarks, side)
+            _eye(paint, vertices, body.landmarks, side, (closed or {}).get(side, 0.0))
     paint[:, :3] = np.maximum(paint[:, :3], 0.004)
     return paint
 
@@ -80,7 +84,9 @@ def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], 
     paint[:, :3] *= 1 - 0.55 * seam[:, None]
 
 
-def _eye(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks, side: str) -> None:
+def _eye(
+    paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks, side: str, closed: float
+) -> None:
     """Brow and eye."""
     x, y, z = vertices.T
     outer, inner = marks[f"exocanthion_{side}"], marks[f"endocanthion_{side}"]
@@ -95,7 +101,7 @@ def _eye(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], ma
     brow = there * _step(1.0, 0.4, np.abs(y - arch) / width)
     _mix(paint, 0.85 * brow, BROW)
     paint[:, 3] += 3.0 * brow
-    _open_eye(paint, vertices, inner, outer)
+    _open_eye(paint, vertices, inner, outer, closed)
 
 
 def _open_eye(
@@ -103,19 +109,21 @@ def _open_eye(
     vertices: Float[np.ndarray, "v 3"],
     inner: Float[np.ndarray, " 3"],
     outer: Float[np.ndarray, " 3"],
+    closed: float,
 ) -> None:
-    """White, iris and pupil between the lids, and the upper lashes."""
+    """White, iris and pupil between the lids, and the upper lashes; the upper lid comes down to the lower one."""
     x, y, z = vertices.T
     t = np.clip((x - inner[0]) / (outer[0] - inner[0]), 0, 1)
     bow = 4 * t * (1 - t)
-    off = y - (inner[1] + t * (outer[1] - inner[1]) + 1.4 * bow)
+    height = 4.0 * bow * (1.0 - closed)
+    off = y - (inner[1] + t * (outer[1] - inner[1]) + 1.4 * bow) + 4.0 * bow * closed
     here = (t > 0.02) & (t < 0.98) & (z > outer[2] - 14)
-    opening = here * _step(0.6, -0.6, np.abs(off) - 4.0 * bow)
+    opening = here * _step(0.6, -0.6, np.abs(off) - height) * (closed < 1.0)
     _mix(paint, opening, np.array([0.44, 0.40, 0.38]))
     paint[:, 3] *= 1 - 0.8 * opening
     middle = (inner + outer) / 2 + (0, 1.8, 0)
     radius = np.hypot(x - middle[0], y - middle[1])
     _mix(paint, opening * _step(6.0, 5.0, radius), np.array([0.09, 0.06, 0.035]))
     _mix(paint, opening * _step(2.6, 1.8, radius), np.array([0.008, 0.008, 0.008]))
-    lash = here * _step(1.5, 0.5, np.abs(off - 4.2 * bow)) * _step(0.0, 0.15, t) * _step(1.0, 0.9, t)
+    lash = here * _step(1.5, 0.5, np.abs(off - height - 0.2 * bow)) * _step(0.0, 0.15, t) * _step(1.0, 0.9, t)
     paint[:, :3] *= 1 - 0.75 * lash[:, None]

@@ -60,6 +60,7 @@ class Subject:
     landmarks: Landmarks = field(default_factory=dict)
     face_region: Bool[np.ndarray, " v"] | None = None
     name: str = "subject"
+    closed: Mapping[str, float] = field(default_factory=dict)  # eyes by side, 0 open to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ def dress(
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None
     hairs = _hairs(head, body, look, worn, hair_rng)
-    pieces = [_skin(head, body, look, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
+    pieces = [_skin(subject, body, look, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
     pieces += [_hair_piece(hair, style) for hair, style in hairs]
     if worn:
         grain = CLOTH if look.texture else NO_GRAIN
@@ -173,12 +174,13 @@ def dress(
     return Dressed(parts[0], tuple(parts[1:] + strands), gallery, solid, surfaces)
 
 
-def _skin(head: Mesh, body: Anatomy, look: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
+def _skin(subject: Subject, body: Anatomy, look: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
+    head = subject.mesh
     if not look.texture:
         return Piece(
             "head", head.vertices, head.faces, head.vertices, _even(head.vertices, look.skin), NO_GRAIN, one_sided
         )
-    paint = skin_paint(head.vertices, body, look.skin, look.stubble, rng)
+    paint = skin_paint(head.vertices, body, look.skin, look.stubble, rng, closed=subject.closed)
     return Piece(
         "head", head.vertices, head.faces, head.vertices, paint, replace(SKIN, freckles=look.freckles), one_sided
     )

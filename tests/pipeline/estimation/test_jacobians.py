@@ -264,3 +264,19 @@ def test_the_priors_normal_equations_are_differences_of_its_cost() -> None:
         np.testing.assert_allclose(
             here.matrix[:, place], (up.gradient - down.gradient) / (2 * by), rtol=1e-6, atol=1e-8
         )
+
+
+def test_the_prior_of_weights_is_the_tangent_of_its_cost() -> None:
+    """Half the slope of the cost; and no curvature beside the Gaussian's, since the logarithm's is negative."""
+    problem, stage, state = head()
+    state = replace(state, coefficients=np.abs(state.coefficients))
+    problem = replace(problem, model=replace(problem.model, posed=range(3, 6)))
+    term, count, by = PriorTerm(problem, stage), len(head_steps(problem, stage)), 1e-4
+    here = NormalEquations.empty(count)
+    term.at(state).add_to(here)
+    for place in range(stage.modes):
+        step = np.zeros(count)
+        step[place] = by
+        up, down = (term.at(apply_step(state, sign * step, stage)).cost for sign in (1.0, -1.0))
+        np.testing.assert_allclose(here.gradient[place], (up - down) / (4 * by), rtol=1e-5, atol=1e-7)
+    np.testing.assert_array_equal(np.diag(here.matrix)[: stage.modes], 1.0)

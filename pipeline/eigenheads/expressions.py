@@ -1,0 +1,143 @@
+"""Expressions of a head model: displacements that a face makes beside what it is, each with a weight from 0 to 1.
+
+A head is ``mean + sum_m z_m modes_m + sum_e w_e shapes_e``: identity is Gaussian, expressions are blendshapes. Their
+names are their source's; Apple's 52 (https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation)
+are what programs exchange, and ``arkit_parts`` says which of a model's shapes stand for which of them.
+"""
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from rig.errors import InputError
+
+LEAST_MM = 0.1  # a shape that moves the skin by less is none: pupils, the tongue
+SPARSE_MM = 0.004  # what is left out of a file: what float16 loses of a centimetre
+
+BLINKS = {"eyeBlinkRight": "right", "eyeBlinkLeft": "left", "eye-right-closure": "right", "eye-left-closure": "left"}
+_SIDED = (
+    "browDown", "browOuterUp", "cheekSquint", "eyeBlink", "eyeLookDown", "eyeLookIn", "eyeLookOut", "eyeLookUp",
+    "eyeSquint", "eyeWide", "mouthDimple", "mouthFrown", "mouthLowerDown", "mouthPress", "mouthSmile", "mouthStretch",
+    "mouthUpperUp", "noseSneer",
+)  # fmt: skip
+_WHOLE = (
+    "browInnerUp", "cheekPuff", "jawForward", "jawLeft", "jawOpen", "jawRight", "mouthClose", "mouthFunnel",
+    "mouthLeft", "mouthPucker", "mouthRight", "mouthRollLower", "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper",
+    "tongueOut",
+)  # fmt: skip
+ARKIT = tuple(sorted([*_WHOLE, *(f"{name}{side}" for name in _SIDED for side in ("Left", "Right"))]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expressions:
+    """E shapes on the cage, head frame. Arrays are read-only once they belong to a model."""
+
+    names: tuple[str, ...]
+    shapes: Float32[np.ndarray, "E V0 3"]  # mm at weight 1
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def moved(self, weights: Mapping[str, float]) -> Float[np.ndarray, "V0 3"]:
+        """The displacement of the cage (mm) for weights by name. Raises KeyError for a name that is not there."""
+        out = np.zeros(self.shapes.shape[1:])
+        for name, weight in weights.items():
+            if name not in self.names:
+                raise KeyError(name)
+            out += weight * self.shapes[self.names.index(name)]
+        return out
+
+
+def no_expressions(vertices: int) -> Expressions:
+    """Of a model that has none."""
+    return Expressions((), np.zeros((0, vertices, 3), np.float32))
+
+
+def visible(expressions: Expressions) -> Expressions:
+    """Those that move the skin."""
+    kept = np.linalg.norm(expressions.shapes, axis=2).max(axis=1) >= LEAST_MM if len(expressions) else np.zeros(0, bool)
+    names = tuple(name for name, keep in zip(expressions.names, kept, strict=True) if keep)
+    return Expressions(names, expressions.shapes[kept])
+
+
+def plain_name(name: str) -> str:
+    """A name in Apple's manner: ``mouthSmile_L`` is ``mouthSmileLeft``."""
+    return re.sub(r"_([LR])$", lambda side: "Left" if side[1] == "L" else "Right", name)
+
+
+def words(name: str) -> str:
+    """A name as people say it: ``mouthSmile_L`` is ``mouth smile left``."""
+    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", plain_name(name))
+    return re.sub(r"[-_ ]+", " ", spaced).strip().lower()
+
+
+def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
+    """For each of Apple's names, in their order: which of the shapes together stand for it; none where none does.
+
+    A shape of that name, or the two sides of one that Apple does not part (ICT-FaceKit's ``cheekPuff_L`` and ``_R``).
+    """
+    known = {plain_name(name): k for k, name in enumerate(names)}
+    found = {}
+    for name in ARKIT:
+        sides = [known[f"{name}{side}"] for side in ("Left", "Right") if f"{name}{side}" in known]
+        found[name] = (known[name],) if name in known else tuple(sides) if len(sides) == 2 else ()
+    return found
+
+
+def weights_from_text(given: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
+    """``NAME=WEIGHT`` with names of the model, in its own manner or Apple's. Raises InputError naming every fault."""
+    known = {plain_name(name): name for name in names} | {name: name for name in names}
+    found, faults = {}, []
+    for text in given:
+        name, _, amount = text.partition("=")
+        try:
+            weight = float(amount)
+        except ValueError:
+            weight = np.nan
+        if not 0.0 <= weight <= 1.0:
+            faults.append(f"{text}: give NAME=WEIGHT, the weight from 0 to 1")
+        elif name not in known:
+            near = difflib.get_close_matches(name, known, 3)
+            faults.append(f"{name}: the model has no such expression; " + (f"near are {', '.join(near)}" if near else
+                          "`eigenhead model info` lists them"))  # fmt: skip
+        else:
+            found[known[name]] = weight
+    if faults:
+        raise InputError("expression", faults)
+    return found
+
+
+def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
+    """How far the eyes (``right``, ``left``) are closed by blinking, 0 to 1."""
+    found = dict.fromkeys(("right", "left"), 0.0)
+    for name, weight in weights.items():
+        side = BLINKS.get(plain_name(name))
+        if side:
+            found[side] = min(1.0, found[side] + weight)
+    return found
+
+
+def packed(expressions: Expressions) -> dict[str, np.ndarray]:
+    """As a model file keeps them: the moved vertices of each shape, float16 (0.004 mm of a centimetre)."""
+    moved = np.abs(expressions.shapes).max(axis=2) > SPARSE_MM
+    return {
+        "expression_counts": moved.sum(axis=1).astype(np.int32),
+        "expression_vertices": np.nonzero(moved)[1].astype(np.uint32),
+        "expression_moves": expressions.shapes[moved].astype(np.float16),
+    }
+
+
+def unpacked(names: list[str], arrays: Mapping[str, np.ndarray], vertices: int) -> Expressions:
+    """What ``packed`` made. Raises ValueError where the arrays contradict each other."""
+    counts, rows, moves = (arrays[f"expression_{part}"] for part in ("counts", "vertices", "moves"))
+    if len(counts) != len(names) or counts.sum() != len(rows) or moves.shape != (len(rows), 3):
+        raise ValueError("its expressions' arrays do not fit each other")
+    if (len(rows) and rows.max() >= vertices) or not np.isfinite(moves).all():
+        raise ValueError("an expression moves a vertex that is not there, or nowhere")
+    shapes = np.zeros((len(names), vertices, 3), np.float32)
+    shapes[np.repeat(np.arange(len(names)), counts), rows] = moves
+    return Expressions(tuple(names), shapes)

@@ -1,0 +1,107 @@
+"""How far lids are closed, as the dense surface tells it.
+
+Patches of a few millimetres do not follow a lid, so that the photographs' own fit leaves lids open; and what shows
+between them (``eyelids``) misjudges eyes without a white. So each eye's blink is tried at a few weights, and the lids
+whose surface lies nearest to the points about the eye, robustly, are the ones that are there.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.dense.part_votes import UNSEEN
+from pipeline.eigenheads.expressions import BLINKS, plain_name
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.fine.association import associate
+from pipeline.fitting.fine.eyelids import EyeEvidence, Fissure, eye_fissure, with_plain_lids
+from pipeline.fitting.fine.surface_points import SurfacePoints
+from pipeline.fitting.fit import Fit
+from rig.mesh import vertex_normals
+
+HALF, OTHERS = 0.5, (0.25, 0.75, 1.0)
+NEAR = 0.6  # of the fissure's length: points about the eye
+REACH_MM, AGREEMENT, ROBUST_MM = 6.0, 0.3, 0.3
+LEAST_POINTS = 200
+GAIN = 0.97  # of the misfit of open lids that half closed ones must stay under: 0.89 and 0.94 of closed ones, 1.03 and
+# more of open ones
+SHUT = 0.5  # lids that far down over an eye that shows nothing are closed
+
+
+def blinks_of(model: HeadModel) -> dict[str, int]:
+    """The coefficient that closes each eye (``right``, ``left``), where the model's modes have one."""
+    found: dict[str, int] = {}
+    for name, place in zip(model.expressions.names, model.posed, strict=False):
+        if plain_name(name) in BLINKS:
+            found.setdefault(BLINKS[plain_name(name)], place)
+    return found
+
+
+def judged_lids(
+    fit: Fit, model: HeadModel, surface: SurfacePoints, eigenheads: int, eyes: Mapping[str, EyeEvidence]
+) -> dict[str, float]:
+    """How far each eye is closed, 0 to 1, of those that the model can close.
+
+    Args:
+        fit: of the photographs.
+        model: with the modes that the fit has.
+        surface: the dense points, world frame.
+        eigenheads: how many of the modes are a population's.
+        eyes: what shows between the lids; an eye that shows none and whose lids are half down is closed.
+    """
+    found = {}
+    for side, place in blinks_of(model).items():
+        share = _told(fit, model, surface, eigenheads, eye_fissure(model, side), place)
+        shown = eyes.get(side)
+        found[side] = 1.0 if shown is not None and shown.closed and share >= SHUT else share
+    return found
+
+
+def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
+    """The fit with its eyes that far closed."""
+    coefficients, places = fit.coefficients.copy(), blinks_of(model)
+    for side, share in lids.items():
+        coefficients[places[side]] = share
+    return replace(fit, coefficients=coefficients)
+
+
+def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray, "v 3"]:
+    """The fitted head (full level, world) as eigenheads and expressions alone have it."""
+    plain = fit.coefficients.copy()
+    plain[np.setdiff1d(np.arange(eigenheads, len(plain)), model.posed)] = 0.0
+    return fit.world_from_head.apply(model.vertices(plain))
+
+
+def _told(fit: Fit, model: HeadModel, surface: SurfacePoints, eigenheads: int, slit: Fissure, place: int) -> float:
+    """The weight whose lids lie nearest; the fit's own where too few points tell, or none is nearer."""
+
+    def lids(weight: float) -> Float[np.ndarray, "v 3"]:
+        coefficients = fit.coefficients.copy()
+        coefficients[place] = weight
+        tried = replace(fit, coefficients=coefficients)
+        fitted = fit.world_from_head.apply(model.vertices(coefficients))
+        return with_plain_lids(fitted, plain_shape(tried, model, eigenheads), model)
+
+    own, open_lids = float(fit.coefficients[place]), lids(0.0)
+    middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
+    off = np.linalg.norm(surface.points - middle, axis=1)
+    about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != UNSEEN))
+    if len(about.points) < LEAST_POINTS:
+        return own
+    still = _misfit(open_lids, model, about)
+    misfits = {HALF: _misfit(lids(HALF), model, about)}
+    if misfits[HALF] >= GAIN * still:  # lids that are down at all are nearer half way
+        return own
+    misfits |= {weight: _misfit(lids(weight), model, about) for weight in OTHERS}
+    return min(misfits, key=lambda weight: misfits[weight])
+
+
+def _misfit(base: Float[np.ndarray, "v 3"], model: HeadModel, points: SurfacePoints) -> float:
+    """Mean of Geman and McClure's loss of the points' distances; a point without a place counts whole."""
+    faces = model.levels["full"].faces
+    given = (points.points, points.normals, base, vertex_normals(base, faces), faces)
+    found = associate(*given, reach_mm=REACH_MM, least_agreement=AGREEMENT)
+    loss = np.ones(len(points.points))
+    loss[found.row] = found.distance_mm**2 / (found.distance_mm**2 + ROBUST_MM**2)
+    return float(loss.mean())

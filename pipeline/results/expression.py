@@ -1,0 +1,93 @@
+"""What face a fitted head makes, the same head without it, and its shapes under Apple's names for animation."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.eigenheads.expressions import ARKIT, arkit_parts, closed_lids, words
+from pipeline.eigenheads.model import HeadModel
+from pipeline.fitting.fit import Fit
+from rig.geometry import Similarity
+from rig.mesh import Mesh
+
+TOLD = 0.05  # a smaller weight is nothing to speak of
+LEAST_SIGMA = 2.0  # nor one that its own deviation explains
+CLOSED = 0.8  # lids that are so far closed show no eye
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """An expression of a head: its name in the model, its weight from 0 to 1, and the weight's standard deviation
+    (None where the fit has none)."""
+
+    name: str
+    weight: float
+    std: float | None
+
+    @property
+    def words(self) -> str:
+        return words(self.name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posable:
+    """A neutral head and what it can do. ``missing``: Apple's names that the model has no counterpart for; their morphs
+    move nothing."""
+
+    neutral_world: Mesh
+    morphs: Mapping[str, Float[np.ndarray, "v 3"]]  # mm, head frame, at weight 1
+    weights: Mapping[str, float]  # by morph: those of the head as photographed
+    missing: tuple[str, ...]
+
+
+def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
+    """Every expression of the fit's model; nothing where it has none."""
+    given = fit.coefficients[model.posed.start : model.posed.stop] if len(model.posed) else ()
+    return dict(zip(model.expressions.names, (float(w) for w in given), strict=False))
+
+
+def found_expressions(model: HeadModel, fit: Fit) -> tuple[Found, ...]:
+    """What the head does, the strongest first."""
+    weights = fitted_weights(model, fit)
+    spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]
+    found = []
+    for k, (name, weight) in enumerate(weights.items()):
+        std = None if spread is None else float(spread[k])
+        if weight >= TOLD and weight > LEAST_SIGMA * (std or 0.0):
+            found.append(Found(name, weight, std))
+    return tuple(sorted(found, key=lambda each: -each.weight))
+
+
+def shut_eyes(model: HeadModel, fit: Fit) -> frozenset[str]:
+    """Eyes whose fitted lids are closed."""
+    return frozenset(side for side, share in closed_lids(fitted_weights(model, fit)).items() if share >= CLOSED)
+
+
+def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Mesh:
+    """The head without its expressions: what no blendshape made stays."""
+    moved = model.levels["full"].operator @ model.expressions.moved({each.name: each.weight for each in found})
+    back = place.scale * moved @ place.rotation.T
+    return Mesh(mesh_world.vertices - back, mesh_world.faces, mesh_world.colours)
+
+
+def posable_head(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Posable:
+    """The neutral head with Apple's 52 morphs, and one of its own for whatever of the found expression they leave out,
+    so that the morphs' weights give the head as photographed."""
+    operator, names = model.levels["full"].operator, model.expressions.names
+    given = {each.name: each.weight for each in found}
+    morphs, weights, left = {}, {}, dict(given)
+    parts = arkit_parts(names)
+    for name, rows in parts.items():
+        shape = model.expressions.shapes[list(rows)].sum(axis=0) if rows else np.zeros_like(model.mean)
+        morphs[name] = place.scale * (operator @ shape)
+        weights[name] = float(np.mean([given.get(names[row], 0.0) for row in rows])) if rows else 0.0
+        for row in rows:
+            left[names[row]] = given.get(names[row], 0.0) - weights[name]
+    for name, weight in left.items():
+        if abs(weight) > 1e-6:
+            morphs[name] = place.scale * (operator @ model.expressions.shapes[names.index(name)])
+            weights[name] = weight
+    missing = tuple(name for name in ARKIT if not parts[name])
+    return Posable(neutral_mesh(model, place, mesh_world, found), morphs, weights, missing)

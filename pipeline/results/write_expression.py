@@ -1,0 +1,26 @@
+"""``neutral.glb`` and ``posed.glb`` of a result: the head without its expression, and with morphs to make others."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.results.expression import Posable
+from pipeline.results.reconstruction import Reconstruction
+from rig.atomic_write import write_atomically
+from rig.formats.glb import glb_bytes
+from rig.formats.morph_glb import with_morphs
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh
+
+
+def write_expression(folder: Path, result: Reconstruction, posable: Posable) -> None:
+    """The files that the settings ask for; colours are the photographed head's, vertex by vertex."""
+    place, outputs = result.fit.world_from_head, result.settings.outputs
+    head_from_world = RigidTransform(place.rotation, place.translation).inverse()
+    neutral = Mesh(head_from_world.apply(posable.neutral_world.vertices), posable.neutral_world.faces, result.colours)
+    glb = glb_bytes(neutral, normals=neutral.normals(), colours=np.asarray(result.colours))
+    if outputs.neutral:
+        write_atomically(folder / "neutral.glb", glb)
+    if outputs.morphs:
+        morphed = with_morphs(glb, neutral.vertices, neutral.faces, posable.morphs, posable.weights)
+        write_atomically(folder / "posed.glb", morphed)

@@ -1,0 +1,93 @@
+"""Morph targets in a glTF binary: sparse accessors, for a face moves in one place at a time.
+
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#morph-targets. Names stand in ``extras.targetNames``, where
+three.js, Blender and others look for them.
+"""
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.mesh import vertex_normals
+
+LEAST_MM = 0.005  # a vertex that moves by less stays
+LEAST_TURN = 1e-3  # of a normal
+
+
+def with_morphs(
+    glb: bytes,
+    vertices: Float[np.ndarray, "v 3"],
+    faces: np.ndarray,
+    morphs: Mapping[str, Float[np.ndarray, "v 3"]],
+    weights: Mapping[str, float],
+) -> bytes:
+    """A GLB of this project with morph targets.
+
+    Args:
+        glb: of one mesh with one primitive, whose vertices are the given ones in their order, in metres.
+        vertices: mm, as the GLB has them at rest.
+        faces: its triangles.
+        morphs: displacements by name, mm, at weight 1.
+        weights: by name, those that the mesh is shown with.
+    """
+    document, payload = _opened(glb)
+    primitive = document["meshes"][0]["primitives"][0]
+    normals, targets = vertex_normals(vertices, faces), []
+    for displacement in morphs.values():
+        turned = vertex_normals(vertices + displacement, faces) - normals
+        targets.append(
+            {
+                "POSITION": _sparse(document, payload, displacement / 1000.0, LEAST_MM / 1000.0, bounds=True),
+                "NORMAL": _sparse(document, payload, turned, LEAST_TURN, bounds=False),
+            }
+        )
+    primitive["targets"] = targets
+    document["meshes"][0]["weights"] = [float(weights.get(name, 0.0)) for name in morphs]
+    document["meshes"][0]["extras"] = {"targetNames": list(morphs)}
+    return _closed(document, payload)
+
+
+def _sparse(
+    document: dict[str, Any], payload: bytearray, values: Float[np.ndarray, "v 3"], least: float, *, bounds: bool
+) -> int:
+    """Appends an accessor of what is not nearly zero; its number."""
+    rows = np.flatnonzero(np.abs(values).max(axis=1) > least)
+    moved = values[rows].astype("<f4")
+    accessor: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": "VEC3"}
+    if len(rows):
+        accessor["sparse"] = {
+            "count": len(rows),
+            "indices": {"bufferView": _view(document, payload, rows.astype("<u4")), "componentType": 5125},
+            "values": {"bufferView": _view(document, payload, moved)},
+        }
+    if bounds:
+        still = [np.zeros((1, 3), "<f4")] if len(rows) < len(values) else []
+        whole = np.concatenate([moved, *still])
+        accessor |= {"min": whole.min(axis=0).tolist(), "max": whole.max(axis=0).tolist()}
+    document["accessors"].append(accessor)
+    return len(document["accessors"]) - 1
+
+
+def _view(document: dict[str, Any], payload: bytearray, array: np.ndarray) -> int:
+    payload.extend(b"\0" * (-len(payload) % 4))
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(payload), "byteLength": array.nbytes})
+    payload.extend(array.tobytes())
+    return len(document["bufferViews"]) - 1
+
+
+def _opened(glb: bytes) -> tuple[dict[str, Any], bytearray]:
+    (length,) = struct.unpack_from("<I", glb, 12)
+    return json.loads(glb[20 : 20 + length]), bytearray(glb[28 + length :])
+
+
+def _closed(document: dict[str, Any], payload: Sequence[int] | bytearray) -> bytes:
+    data = bytes(payload) + b"\0" * (-len(payload) % 4)
+    document["buffers"] = [{"byteLength": len(data)}]
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    header = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
+    return header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data

@@ -1,0 +1,61 @@
+"""What a face does, the head without it, and morphs whose weights give it back."""
+
+import numpy as np
+import pytest
+
+from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
+from pipeline.fitting.fine.blink import with_lids
+from pipeline.fitting.fit import Fit
+from pipeline.results.expression import found_expressions, neutral_mesh, posable_head, shut_eyes
+from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import Mesh
+
+PLACE = Similarity(1.1, rotation_from_vector(np.array([0.2, -0.1, 0.3])), np.array([5.0, 60.0, -20.0]))
+WEIGHTS = {"mouthSmileLeft": 0.6, "mouth-corner-puller": 0.3, "jawOpen": 0.02}
+
+
+@pytest.fixture(scope="module")
+def posed() -> tuple[HeadModel, Fit, Mesh]:
+    model = with_expressions(with_modes(load_model(), 4))
+    z = np.zeros(len(model.modes))
+    z[:4] = 0.5
+    for name, weight in WEIGHTS.items():
+        z[model.posed.start + model.expressions.names.index(name)] = weight
+    fit = Fit("contour", z, PLACE, 1, "converged", covariance=0.1**2 * np.eye(len(z) + 7))
+    return model, fit, Mesh(PLACE.apply(model.vertices(z)), model.levels["full"].faces)
+
+
+def test_a_report_names_what_is_strong_and_sure(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+    model, fit, _ = posed
+    found = found_expressions(model, fit)
+    assert [(each.words, round(each.weight, 6)) for each in found] == [
+        ("mouth smile left", 0.6),
+        ("mouth corner puller", 0.3),
+    ]
+    assert found[0].std == pytest.approx(0.1)
+
+
+def test_closed_eyes_blink(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+    model, fit, _ = posed
+    assert shut_eyes(model, fit) == frozenset()
+    shut = with_lids(fit, model, {"right": 1.0, "left": 0.0})
+    found = found_expressions(model, shut)
+    assert (found[0].name, found[0].weight) == ("eyeBlinkRight", 1.0)
+    assert shut_eyes(model, shut) == {"right"}
+
+
+def test_without_its_expression_a_head_is_neutral(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+    model, fit, mesh = posed
+    neutral = neutral_mesh(model, PLACE, mesh, found_expressions(model, fit))
+    told = {"jawOpen": WEIGHTS["jawOpen"]}  # what is not told is not taken back
+    truth = PLACE.apply(model.posed_vertices(fit.coefficients[:4], told))
+    np.testing.assert_allclose(neutral.vertices, truth, atol=1e-3)
+
+
+def test_the_morphs_give_the_photographed_head_back(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+    model, fit, mesh = posed
+    head = posable_head(model, PLACE, mesh, found_expressions(model, fit))
+    assert len(head.morphs) == 53  # Apple's, and the puller that has no counterpart among them
+    assert head.missing == ("tongueOut",)
+    moved = sum(weight * head.morphs[name] for name, weight in head.weights.items())
+    np.testing.assert_allclose(head.neutral_world.vertices + moved @ PLACE.rotation.T, mesh.vertices, atol=1e-3)
