@@ -158,7 +158,8 @@ def face_pixels(camera: Camera, mesh: Mesh, region: Bool[np.ndarray, " v"]) -> B
     depth, seen = rasterise(
         project_points(camera, mesh.vertices), camera_depths(camera, mesh.vertices), mesh.faces, k.height, k.width
     )
-    inside = ((seen >= 0) & region[mesh.faces].all(axis=1)[seen]).astype(np.uint8)
+    whole = np.asarray(region[mesh.faces].all(axis=1))
+    inside = ((seen >= 0) & whole[seen]).astype(np.uint8)
     filled = np.where(np.isfinite(depth), depth, 1e6).astype(np.float32)
     around = np.ones((3, 3), np.uint8)
     step = cv2.dilate(filled, around) - cv2.erode(filled, around) > HIDES_MM

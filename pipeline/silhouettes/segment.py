@@ -113,7 +113,7 @@ def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouet
 
 def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
     """The silhouette of a view that was cut along its edges; where windows disagreed its outline is weak."""
-    alpha, holes = _without_specks(share)
+    alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
     undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
     rim = mask & ~eroded(mask, 1)

@@ -75,8 +75,8 @@ def place_of(cursor: str) -> Place:
         raise no_cursor() from error
     numbers = [part for part in (value, total) if not isinstance(part, str)]
     whole = all(isinstance(part, int) and not isinstance(part, bool) and abs(part) < 2**62 for part in numbers)
-    texts = isinstance(identity, str) and "\0" not in f"{value}{identity}" and not isinstance(total, str)
-    if not (whole and texts) or total < 0:
+    texts = isinstance(identity, str) and "\0" not in f"{value}{identity}"
+    if not (whole and texts) or not isinstance(total, int) or total < 0:
         raise no_cursor()
     return Place(value, identity, total)
 

@@ -172,8 +172,8 @@ def main() -> None:
     chosen = parser.parse_args()
     with ExitStack() as stack:
         folder = chosen.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        extra = {"database_url": stack.enter_context(running_postgres())} if chosen.postgres else {}
-        settings = ServiceSettings(data=folder / "data", jobs_per_key=10**6, **extra)  # type: ignore[arg-type]
+        extra: dict[str, Any] = {"database_url": stack.enter_context(running_postgres())} if chosen.postgres else {}
+        settings = ServiceSettings(data=folder / "data", jobs_per_key=10**6, **extra)
         if not (folder / "data").is_dir():
             filled(settings, chosen.captures, chosen.jobs)
         began = time.monotonic()

@@ -7,7 +7,7 @@ from tests.support.textured_wedge import wedge_rig
 
 
 def test_views_are_spread_from_the_front_one_on() -> None:
-    rig = wedge_rig(np.linspace(-60, 60, 13))
+    rig = wedge_rig(np.linspace(-60, 60, 13).tolist())
     front, *others = spread_views(rig, 3)
     assert front == rig.front_camera()
     assert sorted(others) == ["cam00", "cam12"]  # both ends of the arc

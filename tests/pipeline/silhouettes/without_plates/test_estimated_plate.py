@@ -44,10 +44,11 @@ def test_a_smooth_background_is_guessed_where_the_border_is() -> None:
 
 
 def test_texture_makes_the_guess_uncertain() -> None:
-    calm, rough = (
-        estimated_background(image, *(lambda s, e: (s, e > 6))(*coarse_of(image, away)))
-        for image, _, away in (photograph(0.0), photograph(12.0))
-    )
+    guesses = []
+    for image, _, away in (photograph(0.0), photograph(12.0)):
+        small, from_edge = coarse_of(image, away)
+        guesses.append(estimated_background(image, small, from_edge > 6))
+    calm, rough = guesses
     assert np.median(rough.noise) > 3 * np.median(calm.noise)
 
 
