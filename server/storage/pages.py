@@ -73,12 +73,15 @@ def place_of(cursor: str) -> Place:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
     except (ValueError, RecursionError, TypeError) as error:
         raise no_cursor() from error
-    numbers = [part for part in (value, total) if not isinstance(part, str)]
-    whole = all(isinstance(part, int) and not isinstance(part, bool) and abs(part) < 2**62 for part in numbers)
-    texts = isinstance(identity, str) and "\0" not in f"{value}{identity}"
-    if not (whole and texts) or not isinstance(total, int) or total < 0:
+    if not (_is_whole(total) and total >= 0 and (isinstance(value, str) or _is_whole(value))):
+        raise no_cursor()
+    if not isinstance(identity, str) or "\0" in f"{value}{identity}":
         raise no_cursor()
     return Place(value, identity, total)
+
+
+def _is_whole(part: object) -> bool:
+    return isinstance(part, int) and not isinstance(part, bool) and abs(part) < 2**62
 
 
 def no_cursor() -> InputError:

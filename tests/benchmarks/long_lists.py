@@ -177,7 +177,7 @@ def main() -> None:
         if not (folder / "data").is_dir():
             filled(settings, chosen.captures, chosen.jobs)
         began = time.monotonic()
-        with running_service(settings.data, worker=False, silent_s="100000", **extra) as service:
+        with running_service(settings.data, worker=False, terminal=None, silent_s="100000", **extra) as service:
             started = round(time.monotonic() - began, 1)
             figures = measured(service.url, chosen.captures)
     database = "postgresql" if chosen.postgres else "sqlite"

@@ -153,7 +153,7 @@ export default {
       const of = (state) => c.jobs.filter((j) => j.state === state), heads = of("succeeded").length, running = of("running"), failed = of("failed").length;
       const told = [running.length && { text: `${Math.round(100 * (running[0].progress || 0))} %`, kind: "accent" }, of("queued").length && { text: of("queued").length === 1 ? "queued" : `${of("queued").length} queued`, kind: "" },
         heads && { text: heads === 1 ? "head" : `${heads} heads`, kind: "good" }, failed && { text: failed === 1 ? "failed" : `${failed} failed`, kind: "fault" }].filter(Boolean);
-      return told.length ? told : [{ text: "new", kind: "" }];
+      return told.length ? told : [{ text: c.jobs.length ? "cancelled" : "new", kind: "" }];
     },
     jobKind(j) { return { succeeded: "good", running: "accent", failed: "fault" }[j.state] || ""; },
     failed() { if (this.outlines) { this.outlines = false; window.eigenheadSay("fault", "No silhouettes: a camera of this capture has neither a usable clean plate nor a mask."); } },

@@ -118,7 +118,14 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
         return None
     job = found[0]
     told = job.error.detail if job.error is not None else job.notice
-    return JobStrip(id=job.id, state=job.state, stage=job.stage, progress=job.progress, eta_s=job.eta_s, detail=told)
+    return {
+        "id": job.id,
+        "state": job.state,
+        "stage": job.stage,
+        "progress": job.progress,
+        "eta_s": job.eta_s,
+        "detail": told,
+    }
 
 
 def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
