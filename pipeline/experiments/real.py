@@ -60,7 +60,7 @@ def real(
     for one in captures:
         rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=report)})
     figures = {
-        f"{row['name']}_{key}": value
+        f"{row['name']}_{key}": float(value)
         for row in rows
         for key, value in row.items()
         if isinstance(value, float | int) and not isinstance(value, bool)

@@ -80,7 +80,7 @@ def _keypoints(image: UInt8[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarra
     """Pixels of the full image, and descriptors."""
     scale = min(1.0, WIDTH_MOST / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    found, descriptors = cv2.SIFT_create(nfeatures=KEYPOINTS_MOST).detectAndCompute(
+    found, descriptors = cv2.SIFT.create(nfeatures=KEYPOINTS_MOST).detectAndCompute(
         cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None
     )
     at = np.array([point.pt for point in found]).reshape(-1, 2)

@@ -77,7 +77,7 @@ def _cut(
     kinds[inner], kinds[outer] = cv2.GC_FGD, cv2.GC_BGD
     cv2.setRNGSeed(0)  # of this thread: the colours' first clusters are drawn
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(image), kinds, None, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(np.ascontiguousarray(image), kinds, (0, 0, 1, 1), *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
     return (kinds == cv2.GC_FGD) | (kinds == cv2.GC_PR_FGD)
 
 

@@ -101,7 +101,7 @@ def search_masks(
     found: dict[str, CoarseMask] = {}
     for step in range(ROUNDS):
         report(step / ROUNDS)
-        common = sum((histogram(images[name][own.subject]) for name, own in samples.items()), np.float32(0))
+        common = np.sum([histogram(images[name][own.subject]) for name, own in samples.items()], axis=0)
         local = step >= (BORDER_ROUNDS if bounded else LOCAL_ROUNDS)
         odds = {}
         for name, image in images.items():
