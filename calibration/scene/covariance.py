@@ -8,7 +8,7 @@ estimated (few views: its principal point, taken to be the picture's middle; a l
 that is carried through the solution ("consider" covariance: Tapley et al., Statistical Orbit Determination, 2004, 6.3).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -40,12 +40,14 @@ OUTLIER_SIGMAS = 4.0
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
     """``blocks``: per camera 6 x 6 of left perturbations (rad, mm), which hold what the lens's uncertainty adds;
-    ``pose_sigma_px``: their size at the subject; ``focal_sigma_px`` per camera; ``noise_px`` of a keypoint, an axis."""
+    ``pose_sigma_px``: their size at the subject; ``focal_sigma_px`` per camera; ``noise_px`` of a keypoint, an axis.
+    ``misfit``: of ``lens_misfit``; what is above 1 widens all of them."""
 
     blocks: Float[np.ndarray, "c 6 6"]
     pose_sigma_px: Float[np.ndarray, " c"]
     focal_sigma_px: Float[np.ndarray, " c"]
     noise_px: float
+    misfit: float
 
 
 def uncertainty(structure: Structure) -> Uncertainty:
@@ -76,7 +78,9 @@ def uncertainty(structure: Structure) -> Uncertainty:
     joint = (projection @ poses @ projection.T).reshape(len(rig), 6, len(rig), 6)
     blocks = np.stack([0.5 * (joint[i, :, i] + joint[i, :, i].T) for i in range(len(rig))])
     focal = np.sqrt(np.array([full[i, 0, i, 0] for i in range(len(rig))]))
-    return Uncertainty(blocks, image_sigma(rig, full), focal, noise)
+    misfit = lens_misfit(structure, noise)
+    wider = max(1.0, misfit)
+    return Uncertainty(wider * blocks, wider**0.5 * image_sigma(rig, full), wider**0.5 * focal, noise, misfit)
 
 
 def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
@@ -89,19 +93,49 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
 
 def reduced_camera_system(structure: Structure, noise_px: float) -> Float[np.ndarray, "p p"]:
     """``S`` of the module's docstring, for keypoints of ``noise_px`` an axis, without those that are wrong."""
+    return _reduced(structure, noise_px)[0]
+
+
+def lens_misfit(structure: Structure, noise_px: float) -> float:
+    """By how much more than chance a lens of each camera's own would explain the points: the fall of chi-squared by
+    one Gauss-Newton step, by the number of values that it would free. 1 where all cameras have the same lens.
+
+    A score test (Rao 1948): residuals themselves hardly show it, because the poses make up for a wrong lens."""
+    if not structure.one_lens or len(structure.rig) < 2:
+        return 1.0
+    falls = []
+    for one in (True, False):
+        given = replace(structure, one_lens=one)
+        system, gradient = _reduced(given, noise_px)
+        places = camera_places(given)
+        free = np.unique(np.hstack([places[:, : structure.estimated], places[:, LENS:]]))
+        motions = np.zeros((len(gradient), 7))
+        motions[places[:, LENS:]] = world_motions(given.rig, scale=True).reshape(len(given.rig), 6, 7)
+        step = _inverse(system[np.ix_(free, free)], motions[free]) @ gradient[free]
+        falls.append(float(gradient[free] @ step))
+    return (falls[1] - falls[0]) / (structure.estimated * (len(structure.rig) - 1))
+
+
+def _reduced(structure: Structure, noise_px: float) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+    """The reduced system, and half the gradient of chi-squared by the same unknowns."""
     places = camera_places(structure)
     size, count = int(places.max()) + 1, len(structure.points)
     u, v = np.zeros((size, size)), np.zeros((count, 3, 3))
     rows, columns, values = [], [], []
-    good = (np.abs(structure.residuals()) < OUTLIER_SIGMAS * noise_px).all(axis=1)
+    misses = structure.residuals() / noise_px
+    slope, pull = np.zeros(size), np.zeros((count, 3))
+    good = (np.abs(misses) < OUTLIER_SIGMAS).all(axis=1)
     for index, camera in enumerate(structure.rig):
-        seen = structure.point_of[good & (structure.camera_of == index)]
+        own = good & (structure.camera_of == index)
+        seen = structure.point_of[own]
         points = structure.points[seen]
         by_lens = intrinsics_jacobian(camera, points) @ LENS_FROM_NINE
         by_camera = np.concatenate([by_lens, pose_jacobian(camera, points)], axis=2) / noise_px
         by_point = camera.project_with_jacobian(points)[1] / noise_px
         u[np.ix_(places[index], places[index])] += np.einsum("nki,nkj->ij", by_camera, by_camera)
         np.add.at(v, seen, np.einsum("nki,nkj->nij", by_point, by_point))
+        slope[places[index]] += np.einsum("nki,nk->i", by_camera, misses[own])
+        np.add.at(pull, seen, np.einsum("nki,nk->ni", by_point, misses[own]))
         shape = (len(seen), LENS + 6, 3)
         values.append(np.einsum("nki,nkj->nij", by_camera, by_point).ravel())
         rows.append(np.broadcast_to(places[index][None, :, None], shape).ravel())
@@ -111,7 +145,8 @@ def reduced_camera_system(structure: Structure, noise_px: float) -> Float[np.nda
     inverse[held] = np.linalg.inv(v[held])
     at = np.concatenate(rows), np.concatenate(columns)
     w = scipy.sparse.coo_array((np.concatenate(values), at), shape=(size, 3 * count)).tocsr()
-    return u - np.asarray((w @ scipy.sparse.block_diag(list(inverse), format="csr") @ w.T).todense())
+    system = u - np.asarray((w @ scipy.sparse.block_diag(list(inverse), format="csr") @ w.T).todense())
+    return system, slope - w @ np.einsum("nij,nj->ni", inverse, pull).ravel()
 
 
 def _inverse(matrix: Float[np.ndarray, "p p"], motions: Float[np.ndarray, "p 7"]) -> Float[np.ndarray, "p p"]:

@@ -28,6 +28,9 @@ from rig.rig import Rig
 Report = Callable[[str, float], None]
 
 JOINED_LEAST = 0.5  # share of the views; where fewer join, there are two scenes or none
+MISFIT_MOST = (
+    3.0  # of one lens for all; 1 where there is one, and to 2 where keypoints have more outliers than a Gaussian
+)
 LOOSE_PX = 1.0  # at the subject; a camera that is known no better than this is said so
 
 
@@ -91,6 +94,11 @@ def placed(
         for name, px in zip(here.rig.names, spread.pose_sigma_px, strict=True)
         if px > LOOSE_PX
     ]
+    if spread.misfit > MISFIT_MOST:
+        warnings.append(
+            f"the lenses differ: one of each camera's own would explain the points {spread.misfit:.1f} times better "
+            "than chance, and covariances are widened by that; a fixed rig's lenses are better calibrated with a board"
+        )
     if len(here.rig) > CAMERAS_MOST:
         warnings.append(f"{len(here.rig)} cameras joined; a capture may have {CAMERAS_MOST} at most")
     return SceneCalibration(

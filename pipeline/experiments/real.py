@@ -77,8 +77,7 @@ def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings:
     sound = [name for name in near if silhouettes[name].quality.usable]
     if len(sound) <= USED:
         raise InputError(given.name, [f"{len(sound)} views of use on the front side; more than {USED} are needed"])
-    whole = [name for name in sound if not silhouettes[name].quality.cut_off]
-    used = spread_views(given.rig.subset(whole if len(whole) > USED else sound), USED)
+    used = choose(given, sound, silhouettes)
     rig = given.rig.subset(used)
     found = {name: silhouettes[name] for name in rig.names}
 
@@ -114,6 +113,15 @@ def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings:
         "psnr_db_of": psnr,
         "warnings": [f"{told.code}: {told.message}" for told in done.warnings],
     }
+
+
+def choose(given: RealCapture, sound: list[str], silhouettes: Mapping[str, Silhouette]) -> list[str]:
+    """The eleven: spread, where there are enough none that somebody drew an outline of, and none that cuts the subject
+    off."""
+    undrawn = [name for name in sound if name not in given.drawn]
+    whole = [name for name in undrawn if not silhouettes[name].quality.cut_off]
+    enough = next((names for names in (whole, undrawn) if len(names) >= USED), sound)
+    return spread_views(given.rig.subset(enough), USED)
 
 
 def views_in_front(rig: Rig, front: str | None) -> list[str]:

@@ -26,7 +26,6 @@ from pipeline.silhouettes.cross_view import count_rejecting_cameras
 from pipeline.silhouettes.foreground import Decision, decide, doubtful, reconsider
 from pipeline.silhouettes.matting import Matte, solve_matte
 from pipeline.silhouettes.view_consistency import judge_agreement
-from pipeline.silhouettes.without_plates.decide import decide_without_plates
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.rig import Rig
@@ -87,6 +86,8 @@ def segment(
 def _without_plates(
     capture: Capture, rig: Rig, settings: SegmentationSettings, report: Callable[[str, float], None]
 ) -> dict[str, Silhouette]:
+    from pipeline.silhouettes.without_plates.decide import decide_without_plates  # packages that few captures need
+
     found = decide_without_plates(
         capture.images, rig, settings, report=lambda share: report("segmentation", 0.8 * share)
     )

@@ -63,7 +63,8 @@ def _calibrate(root: Path, image_pixels: int, report: Report) -> None:
     try:
         calibrate_photographs(root, root, front=None, report=report)
     except CalibrationRefused as refusal:
-        raise InputError("capture", list(refusal.reasons)) from refusal
+        told = f"{NO_RIG}, and its photographs alone do not tell the cameras"
+        raise InputError("capture", [told, *refusal.reasons]) from refusal
 
 
 def ingest_folder(

@@ -28,15 +28,13 @@ PIECE_LEAST = 100  # px of outline
 
 @dataclass(frozen=True, slots=True)
 class Bands:
-    """How far inside and outside the given outline the edge is looked for, px of the images that are cut, and how far
-    inside it the subject's first colours are taken: a mask is too wide more often than too narrow."""
+    """How far inside and outside the given outline the edge is looked for, px of the images that are cut."""
 
     inside: int
     outside: int
-    shy: int
 
 
-BANDS = (Bands(14, 8, 6), Bands(8, 6, 2))
+BANDS = (Bands(14, 8), Bands(8, 6))
 """Of the first cut, whose masks are of the coarse level, and of the second."""
 
 
@@ -46,7 +44,6 @@ def cut_along(
     """Share of the windows that hold a pixel for the subject, weighted towards their middles."""
     height, width = mask.shape
     inner, outer = eroded(mask, bands.inside), ~dilated(mask, bands.outside)
-    likely = eroded(mask, bands.shy)
     side = min(WINDOW, height, width)
     row, column = np.mgrid[:side, :side] - (side - 1) / 2
     weight = np.exp(-(row**2 + column**2) / (2 * (side / 4) ** 2)).astype(np.float32)
@@ -58,7 +55,7 @@ def cut_along(
         for x, y in outline[::STEP, 0]:
             left, top = int(np.clip(x - side // 2, 0, width - side)), int(np.clip(y - side // 2, 0, height - side))
             part = (slice(top, top + side), slice(left, left + side))
-            found = _cut(image[part], likely[part], inner[part], outer[part])
+            found = _cut(image[part], mask[part], inner[part], outer[part])
             if found is not None:
                 votes[part] += weight * found
                 total[part] += weight
@@ -69,14 +66,14 @@ def cut_along(
 
 def _cut(
     image: UInt8[np.ndarray, "h w 3"],
-    likely: Bool[np.ndarray, "h w"],
+    mask: Bool[np.ndarray, "h w"],
     inner: Bool[np.ndarray, "h w"],
     outer: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"] | None:
     """One window; None where it is not sure of enough on both sides."""
     if min(np.count_nonzero(inner), np.count_nonzero(outer)) < SAMPLES_LEAST:
         return None
-    kinds = np.where(likely, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    kinds = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     kinds[inner], kinds[outer] = cv2.GC_FGD, cv2.GC_BGD
     cv2.setRNGSeed(0)  # of this thread: the colours' first clusters are drawn
     models = np.zeros((1, 65)), np.zeros((1, 65))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.gauge import moved
-from calibration.scene.covariance import LENS, camera_places, reduced_camera_system, uncertainty
+from calibration.scene.covariance import LENS, camera_places, lens_misfit, reduced_camera_system, uncertainty
 from calibration.scene.structure import Structure
 from rig.camera import Camera, Distortion
 from rig.rig import Rig
@@ -71,3 +71,22 @@ def test_the_blocks_are_covariances_in_the_subjects_gauge() -> None:
     for block in found.blocks:
         assert np.linalg.eigvalsh(block).min() > 0
     assert (found.pose_sigma_px > 0.05).all()
+
+
+@pytest.mark.parametrize(("bend", "least", "most"), [(0.0, 0.3, 2.2), (0.3, 4.0, np.inf)])
+def test_lenses_that_differ_are_noticed_and_widen_what_is_claimed(bend: float, least: float, most: float) -> None:
+    """Fifteen values more: chi-squared by its number is 1 with a deviation of sqrt(2 / 15) = 0.37; three of them.
+    Every second camera saw through a lens that bends more; the structure has one."""
+    given = structure(one_lens=True, points=600)
+    pixels = given.pixels.copy()
+    for index, camera in enumerate(given.rig):
+        own = given.camera_of == index
+        k = camera.intrinsics
+        wide = replace(camera, intrinsics=replace(k, distortion=Distortion(k1=bend)))
+        shift = wide if index % 2 else camera
+        pixels[own] += shift.project(given.points[given.point_of[own]])
+        pixels[own] -= camera.project(given.points[given.point_of[own]])
+    given = replace(given, pixels=pixels)
+    assert least < lens_misfit(given, NOISE_PX) < most
+    alone = uncertainty(replace(given, pixels=structure(one_lens=True, points=600).pixels))
+    assert (uncertainty(given).pose_sigma_px >= 0.99 * alone.pose_sigma_px).all()

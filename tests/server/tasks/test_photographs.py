@@ -17,6 +17,7 @@ def quiet(stage: str, share: float) -> None:
     pass
 
 
+@pytest.mark.slow
 def test_photographs_alone_become_a_capture_and_are_kept(tmp_path: Path) -> None:
     photos, kept = write_photographs(tmp_path / "photos", wedge_rig()), tmp_path / "out"
     told: list[str] = []

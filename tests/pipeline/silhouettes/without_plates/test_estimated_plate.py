@@ -44,12 +44,12 @@ def test_a_smooth_background_is_guessed_where_the_border_is() -> None:
 
 
 def test_texture_makes_the_guess_uncertain() -> None:
-    guesses = []
-    for image, _, away in (photograph(0.0), photograph(12.0)):
+    noise = {}
+    for texture in (0.0, 12.0):
+        image, _, away = photograph(texture)
         small, from_edge = coarse_of(image, away)
-        guesses.append(estimated_background(image, small, from_edge > 6))
-    calm, rough = guesses
-    assert np.median(rough.noise) > 3 * np.median(calm.noise)
+        noise[texture] = np.median(estimated_background(image, small, from_edge > 6).noise)
+    assert noise[12.0] > 3 * noise[0.0]
 
 
 def test_the_matting_finds_the_edge_to_a_fraction_of_a_pixel() -> None:

@@ -1,4 +1,4 @@
-"""A disc before a cloth with a pattern, from a mask that is too wide."""
+"""A disc before a cloth with folds, from a mask that is too wide."""
 
 import cv2
 import numpy as np
@@ -8,11 +8,11 @@ from pipeline.silhouettes.without_plates.local_cut import BANDS, cut_along
 
 
 def scene() -> tuple[np.ndarray, np.ndarray]:
-    """Image and true mask: a disc of radius 90 and its shading, before squares of 16 px."""
+    """Image and true mask: a disc of radius 90 and its shading, before a cloth of 9 levels' scatter."""
     rng = np.random.default_rng(0)
     row, column = np.mgrid[:300, :400]
     mask = np.hypot(column - 200, row - 150) < 90
-    cloth = np.where(((row // 16) + (column // 16)) % 2 == 0, 70.0, 105.0)
+    cloth = 85 + 100 * cv2.GaussianBlur(rng.normal(size=(300, 400)), (0, 0), 3)
     own = 170 - 30 * (np.hypot(column - 200, row - 150) / 90) ** 2
     image = np.where(mask, own, cloth)[:, :, None] * np.array([1.0, 0.95, 0.9]) + rng.normal(0, 4, (300, 400, 3))
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.8), 0, 255).astype(np.uint8), mask
