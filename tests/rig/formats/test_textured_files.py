@@ -5,6 +5,7 @@ import json
 import struct
 import zipfile
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -42,8 +43,9 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     data = glb_bytes(MESH, normals=NORMALS, skin=Skin(UV, image(suffix), mime), extras=extras)
     loaded = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh", process=False)
     assert isinstance(loaded, trimesh.Trimesh)
+    visual: Any = loaded.visual
     np.testing.assert_allclose(loaded.vertices * 1000, MESH.vertices, atol=1e-4)
-    np.testing.assert_allclose(loaded.visual.uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
+    np.testing.assert_allclose(visual.uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
     told = document(data)
     assert told["asset"]["extras"] == extras
     assert told["images"][0]["mimeType"] == mime
@@ -59,9 +61,10 @@ def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
     (tmp_path / "head.png").write_bytes(image(".png"))
     loaded = trimesh.load(tmp_path / "head.obj", force="mesh", process=False)
     assert isinstance(loaded, trimesh.Trimesh)
+    visual: Any = loaded.visual
     np.testing.assert_allclose(loaded.triangles, MESH.vertices[MESH.faces], atol=1e-3)
-    np.testing.assert_allclose(loaded.visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-5)
-    assert loaded.visual.material.image.size == (64, 64)
+    np.testing.assert_allclose(visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-5)
+    assert visual.material.image.size == (64, 64)
     assert data.count(b"\nvn ") == len(MESH.vertices)
 
 
@@ -73,8 +76,9 @@ def test_trimesh_reads_texture_coordinates_of_a_ply_and_we_its_mesh(tmp_path: Pa
     (tmp_path / "head.png").write_bytes(image(".png"))
     loaded = trimesh.load(tmp_path / "head.ply", force="mesh", process=False)
     assert isinstance(loaded, trimesh.Trimesh)
-    assert loaded.visual.kind == "texture"
-    np.testing.assert_allclose(loaded.visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-6)
+    visual: Any = loaded.visual
+    assert visual.kind == "texture"
+    np.testing.assert_allclose(visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-6)
     mesh, _ = read_head_ply(tmp_path / "head.ply")
     np.testing.assert_array_equal(mesh.faces, MESH.faces)
 
@@ -98,8 +102,9 @@ def test_stl_and_3mf_hold_the_closed_mesh() -> None:
 
 
 def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
-    pxr = pytest.importorskip("pxr.Usd")
-    from pxr import UsdGeom, UsdShade
+    pxr: Any = pytest.importorskip("pxr.Usd")
+    UsdGeom: Any = pytest.importorskip("pxr.UsdGeom")
+    UsdShade: Any = pytest.importorskip("pxr.UsdShade")
 
     given = {"normals": NORMALS, "uv": UV, "faces_uv": MESH.faces, "image": image(".jpg"), "suffix": ".jpg"}
     data = usdz_bytes(MESH, **given)
