@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -148,7 +149,7 @@ def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig,
     if atlas is not None:
         encoded(atlas, "jpeg")
     times.append((time.perf_counter(), time.process_time()))
-    (wall, cpu), (more_wall, more_cpu) = np.diff(np.array(times), axis=0).tolist()
+    (wall, cpu), (more_wall, more_cpu) = ((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(times))
     return {"vertices_s": wall, "texture_adds_s": more_wall - wall, "texture_adds_cpu_s": more_cpu - cpu}
 
 
@@ -162,7 +163,7 @@ def face_pixels(camera: Camera, mesh: Mesh, region: Bool[np.ndarray, " v"]) -> B
     inside = ((seen >= 0) & whole[seen]).astype(np.uint8)
     filled = np.where(np.isfinite(depth), depth, 1e6).astype(np.float32)
     around = np.ones((3, 3), np.uint8)
-    step = cv2.dilate(filled, around) - cv2.erode(filled, around) > HIDES_MM
+    step = np.asarray(cv2.dilate(filled, around)) - np.asarray(cv2.erode(filled, around)) > HIDES_MM
     wide = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
     return (cv2.erode(inside, wide) > 0) & (cv2.dilate(step.astype(np.uint8), wide) == 0)
 

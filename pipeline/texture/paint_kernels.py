@@ -102,7 +102,7 @@ def gather(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def correction_of(corners: tuple[int, int, int], c: int, k: int, channel: int, choice: Choice) -> np.float32:
+def correction_of(corners: tuple[int, int, int], c: int, k: int, channel: int, choice: Choice) -> np.floating:
     """Of view k at corner c, or at the first other corner that takes it."""
     for turn in range(3):
         v = corners[(c + turn) % 3]

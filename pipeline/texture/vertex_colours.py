@@ -6,9 +6,9 @@ lies before it; its weight is the dot product of normal and viewing direction; i
 
 The default departs from it, because real cameras differ and real edges are blurred: margins at contours and occluding
 edges (``pipeline.texture.visibility``), photographs sharpened where there is detail, gain and offset of each camera
-(``pipeline.imaging.colour_balance``), sharper weights so that detail is not averaged away, a mean in linear light that
-gives little to what is brighter than the other views say (a highlight moves with the camera), and a smooth fill where
-no camera looks.
+(``pipeline.imaging.colour_balance``), a mean in linear light that gives little to what differs from the other views in
+any channel, be it brighter (a highlight moves with the camera) or darker (a shadow that only it sees), less weight for
+cameras that had to be raised or lowered much, and a smooth fill where no camera looks.
 """
 
 from collections.abc import Mapping, Sequence

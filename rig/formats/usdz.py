@@ -1,12 +1,12 @@
 """USDZ of a textured mesh, through OpenUSD (the extra ``usd``)."""
 
+import importlib
 import tempfile
 import zipfile
 import zlib
-from importlib import import_module
 from io import BytesIO
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -62,13 +62,15 @@ def usdz_bytes(
         return _package({"head.usdc": layer.read_bytes(), texture: image})
 
 
+def _module(name: str) -> Any:
+    """A module of OpenUSD, whose stubs name only half of what is there."""
+    return importlib.import_module(f"pxr.{name}")
+
+
 def _write_layer(
     path: Path, mesh: Mesh, normals: np.ndarray, uv: np.ndarray, faces_uv: np.ndarray, texture: str
 ) -> None:
-    # Any: its modules' names come from C++ at import, which no checker sees.
-    Gf, Sdf, Usd, UsdGeom, UsdShade, Vt = (
-        cast("Any", import_module(f"pxr.{name}")) for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt")
-    )
+    Gf, Sdf, Usd, UsdGeom, UsdShade, Vt = map(_module, ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt"))
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)

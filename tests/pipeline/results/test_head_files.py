@@ -5,7 +5,7 @@ import struct
 import subprocess
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_the_glb_has_the_texture_upright_and_says_what_it_is(result: Reconstruct
     assert {"version", "unit", "inputs_sha256", "settings_sha256"} < set(extras)
     loaded = trimesh.load(tmp_path / "head.glb", force="mesh", process=False)
     assert isinstance(loaded, trimesh.Trimesh)
-    visual = cast("Any", loaded.visual)  # a TextureVisuals
+    visual: Any = loaded.visual
     picture = np.asarray(visual.material.baseColorTexture.convert("RGB")).astype(int)
     at = np.clip((visual.uv * (1, -1) + (0, 1)) * len(picture), 0, len(picture) - 1).astype(int)
     seen = picture[at[:, 1], at[:, 0]]

@@ -4,9 +4,8 @@ import io
 import json
 import struct
 import zipfile
-from importlib import import_module
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -44,19 +43,15 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     data = glb_bytes(MESH, normals=NORMALS, skin=Skin(UV, image(suffix), mime), extras=extras)
     loaded = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh", process=False)
     assert isinstance(loaded, trimesh.Trimesh)
+    visual: Any = loaded.visual
     np.testing.assert_allclose(loaded.vertices * 1000, MESH.vertices, atol=1e-4)
-    np.testing.assert_allclose(textured(loaded).uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
+    np.testing.assert_allclose(visual.uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
     told = document(data)
     assert told["asset"]["extras"] == extras
     assert told["images"][0]["mimeType"] == mime
     assert ("EXT_texture_webp" in told.get("extensionsRequired", [])) == (suffix == ".webp")
     assert "COLOR_0" not in told["meshes"][0]["primitives"][0]["attributes"]
     assert 0 < told["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] < 1
-
-
-def textured(mesh: trimesh.Trimesh) -> Any:
-    """A TextureVisuals, which trimesh's types do not tell from one of colours."""
-    return mesh.visual
 
 
 def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
@@ -66,9 +61,10 @@ def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
     (tmp_path / "head.png").write_bytes(image(".png"))
     loaded = trimesh.load(tmp_path / "head.obj", force="mesh", process=False)
     assert isinstance(loaded, trimesh.Trimesh)
+    visual: Any = loaded.visual
     np.testing.assert_allclose(loaded.triangles, MESH.vertices[MESH.faces], atol=1e-3)
-    np.testing.assert_allclose(textured(loaded).uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-5)
-    assert textured(loaded).material.image.size == (64, 64)
+    np.testing.assert_allclose(visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-5)
+    assert visual.material.image.size == (64, 64)
     assert data.count(b"\nvn ") == len(MESH.vertices)
 
 
@@ -80,8 +76,9 @@ def test_trimesh_reads_texture_coordinates_of_a_ply_and_we_its_mesh(tmp_path: Pa
     (tmp_path / "head.png").write_bytes(image(".png"))
     loaded = trimesh.load(tmp_path / "head.ply", force="mesh", process=False)
     assert isinstance(loaded, trimesh.Trimesh)
-    assert textured(loaded).kind == "texture"
-    np.testing.assert_allclose(textured(loaded).uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-6)
+    visual: Any = loaded.visual
+    assert visual.kind == "texture"
+    np.testing.assert_allclose(visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-6)
     mesh, _ = read_head_ply(tmp_path / "head.ply")
     np.testing.assert_array_equal(mesh.faces, MESH.faces)
 
@@ -105,8 +102,9 @@ def test_stl_and_3mf_hold_the_closed_mesh() -> None:
 
 
 def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
-    pxr = pytest.importorskip("pxr.Usd")
-    geometry, shade = (cast("Any", import_module(f"pxr.{name}")) for name in ("UsdGeom", "UsdShade"))
+    pxr: Any = pytest.importorskip("pxr.Usd")
+    UsdGeom: Any = pytest.importorskip("pxr.UsdGeom")
+    UsdShade: Any = pytest.importorskip("pxr.UsdShade")
 
     given = {"normals": NORMALS, "uv": UV, "faces_uv": MESH.faces, "image": image(".jpg"), "suffix": ".jpg"}
     data = usdz_bytes(MESH, **given)
@@ -118,14 +116,14 @@ def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
             start = entry.header_offset + 30 + len(entry.filename) + len(entry.extra)
             assert (entry.compress_type, start % 64) == (zipfile.ZIP_STORED, 0)
     stage = pxr.Stage.Open(str(path))
-    assert (geometry.GetStageUpAxis(stage), geometry.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
-    shape = geometry.Mesh(stage.GetPrimAtPath("/head/mesh"))
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/head/mesh"))
     np.testing.assert_allclose(np.array(shape.GetPointsAttr().Get()) * 1000, MESH.vertices, atol=1e-4)
-    coordinates = geometry.PrimvarsAPI(shape).GetPrimvar("st")
+    coordinates = UsdGeom.PrimvarsAPI(shape).GetPrimvar("st")
     np.testing.assert_allclose(
         np.array(coordinates.ComputeFlattened()), (UV * (1, -1) + (0, 1))[MESH.faces].reshape(-1, 2), atol=1e-6
     )
-    material, _ = shade.MaterialBindingAPI(shape.GetPrim()).ComputeBoundMaterial()
+    material, _ = UsdShade.MaterialBindingAPI(shape.GetPrim()).ComputeBoundMaterial()
     assert material.GetPath() == "/head/skin"
-    picture = shade.Shader(stage.GetPrimAtPath("/head/skin/texture"))
+    picture = UsdShade.Shader(stage.GetPrimAtPath("/head/skin/texture"))
     assert picture.GetInput("file").Get().resolvedPath.endswith("[texture.jpg]")
