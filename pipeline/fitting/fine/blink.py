@@ -15,7 +15,7 @@ from pipeline.dense.part_votes import UNSEEN
 from pipeline.eigenheads.expressions import BLINKS, plain_name
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fine.association import associate
-from pipeline.fitting.fine.eyelids import EyeEvidence, Fissure, eye_fissure, with_plain_lids
+from pipeline.fitting.fine.eyelids import EyeEvidence, Fissure, eye_fissure
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
 from rig.mesh import vertex_normals
@@ -39,30 +39,43 @@ def blinks_of(model: HeadModel) -> dict[str, int]:
 
 
 def judged_lids(
-    fit: Fit, model: HeadModel, surface: SurfacePoints, eigenheads: int, eyes: Mapping[str, EyeEvidence]
+    fit: Fit,
+    model: HeadModel,
+    base: Float[np.ndarray, "v 3"],
+    surface: SurfacePoints,
+    eyes: Mapping[str, EyeEvidence],
 ) -> dict[str, float]:
     """How far each eye is closed, 0 to 1, of those that the model can close.
 
     Args:
         fit: of the photographs.
         model: with the modes that the fit has.
+        base: the fit's head with plain lids (``with_plain_lids``), full level, world.
         surface: the dense points, world frame.
-        eigenheads: how many of the modes are a population's.
         eyes: what shows between the lids; an eye that shows none and whose lids are half down is closed.
     """
-    places = blinks_of(model)
-    if not places:
-        return {}
-    fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
-    base, found = with_plain_lids(fitted, plain_shape(fit, model, eigenheads), model), {}
-    for side, place in places.items():
-        own = float(fit.coefficients[place])
-        blink = model.levels["full"].operator @ model.modes[place].astype(float)
-        moved = fit.world_from_head.scale * blink @ fit.world_from_head.rotation.T
+    found = {}
+    for side, place in blinks_of(model).items():
+        own, moved = float(fit.coefficients[place]), _moved(fit, model, place)
         share = _told(base - own * moved, moved, own, model, surface, eye_fissure(model, side))
         shown = eyes.get(side)
         found[side] = 1.0 if shown is not None and shown.closed and share >= SHUT else share
     return found
+
+
+def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
+    """What closes the fit's eyes that far, full level, world, mm."""
+    shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
+    for side, share in lids.items():
+        if (more := share - float(fit.coefficients[places[side]])) != 0.0:
+            shift += more * _moved(fit, model, places[side])
+    return shift
+
+
+def _moved(fit: Fit, model: HeadModel, place: int) -> Float[np.ndarray, "v 3"]:
+    """An expression at weight 1, full level, world."""
+    moved = model.levels["full"].operator @ model.modes[place].astype(float)
+    return fit.world_from_head.scale * moved @ fit.world_from_head.rotation.T
 
 
 def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
