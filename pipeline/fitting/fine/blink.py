@@ -124,7 +124,10 @@ def _patch(
     """The head about an eye: its vertices, and its triangles between them."""
     inside = np.linalg.norm(vertices - middle, axis=1) < radius_mm
     faces = model.levels["full"].faces
-    return np.flatnonzero(inside), (np.cumsum(inside) - 1)[faces[inside[faces].all(axis=1)]]
+    places = np.cumsum(inside, dtype=np.int32) - np.int32(
+        1
+    )  # the type of the head's own: no loop is compiled for another
+    return np.flatnonzero(inside), places[faces[inside[faces].all(axis=1)]]
 
 
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
