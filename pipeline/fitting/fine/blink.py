@@ -124,9 +124,7 @@ def _patch(
     """The head about an eye: its vertices, and its triangles between them."""
     inside = np.linalg.norm(vertices - middle, axis=1) < radius_mm
     faces = model.levels["full"].faces
-    places = np.cumsum(inside, dtype=np.int32) - np.int32(
-        1
-    )  # the type of the head's own: no loop is compiled for another
+    places = np.cumsum(inside, dtype=np.int32) - np.int32(1)  # as the head's own faces: loops are compiled for these
     return np.flatnonzero(inside), places[faces[inside[faces].all(axis=1)]]
 
 
