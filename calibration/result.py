@@ -17,10 +17,14 @@ from calibration.quality.checks import (
     Check,
 )
 from calibration.quality.outliers import Dropped
+from calibration.quality.verdict import CameraEvidence, Verdict, Word, judge
 from rig.atomic_write import write_atomically
+from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.formats.cameras_json import CamerasDocument, document_from_rig
 from rig.rig import Rig
+
+CELLS = (4, 3)  # of a picture, across and down
 
 
 class CalibrationRefused(EigenheadError):
@@ -39,6 +43,8 @@ class CameraFigures(TypedDict):
     corners: int
     pose_sigma_px: float
     focal_sigma_px: float
+    focal_share: float
+    covered: float
 
 
 class Figures(TypedDict):
@@ -76,6 +82,8 @@ class OffsetsDocument(TypedDict):
 class CalibrationDocument(TypedDict):
     """``calibration.json``."""
 
+    verdict: Word
+    missing: list[str]
     figures: Figures
     front: str
     checks: list[CheckDocument]
@@ -124,6 +132,8 @@ class Calibration:
                 "corners": int(sum(len(miss) for miss in own)),
                 "pose_sigma_px": self.pose_sigma_px[camera.name],
                 "focal_sigma_px": float(self.intrinsics_sigma[camera.name][0]),
+                "focal_share": float(self.intrinsics_sigma[camera.name][0]) / camera.intrinsics.fx,
+                "covered": self._covered(camera),
             }
         return {
             "rms_px": _rms(everything),
@@ -132,6 +142,22 @@ class Calibration:
             "sync_px": self.sync_px,
             "cameras": cameras,
         }
+
+    def _covered(self, camera: Camera) -> float:
+        """Share of the picture's cells that hold a corner."""
+        size = (camera.intrinsics.width, camera.intrinsics.height)
+        pixels = np.concatenate([seen for (name, _), (_, seen, _) in self.misses.items() if name == camera.name])
+        cells = np.clip((pixels / size * CELLS).astype(int), 0, np.array(CELLS) - 1)
+        return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
+
+    def verdict(self) -> Verdict:
+        """Whether it is worth using, and what it lacks."""
+        cameras = self.figures()["cameras"]
+        evidence = {
+            name: CameraEvidence(c["views"], c["focal_share"], c["pose_sigma_px"], c["covered"])
+            for name, c in cameras.items()
+        }
+        return judge(evidence, self.checks)
 
     def document(self) -> CalibrationDocument:
         """Everything but the residuals, as JSON."""
@@ -150,7 +176,10 @@ class Calibration:
             name: {of: value for of, value in zip(INTRINSICS, values.tolist(), strict=True)}
             for name, values in self.intrinsics_sigma.items()
         }
+        verdict = self.verdict()
         return {
+            "verdict": verdict.word,
+            "missing": list(verdict.missing),
             "figures": self.figures(),
             "front": self.front,
             "checks": [

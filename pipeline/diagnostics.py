@@ -11,16 +11,21 @@ WARNING_CODES = (
     "eyes-closed",
     "features",
     "mask-contradicted",
+    "mask-doubtful",
     "mask-loose",
     "no-bust",
     "no-texture",
+    "no-texture-layout",
+    "old-setting",
     "picture-duplicated",
     "plates-exchanged",
+    "scale-assumed",
     "scale-implausible",
     "shape-implausible",
     "unknown-key",
     "view",
     "view-left-out",
+    "views-many",
 )
 """Codes that a result's warnings may have; docs/operator.md says what each means and what to do."""
 

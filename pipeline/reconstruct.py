@@ -45,11 +45,11 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import usable_views
-from pipeline.texture.atlas import paint_atlas
-from pipeline.texture.uv_unwrap import unwrap
+from pipeline.texture.head_texture import find_layout, paint_head
 from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
 from rig.errors import EigenheadError
+from rig.formats.usdz import check_usd
 from rig.geometry import Similarity
 from rig.mesh import Mesh, vertex_normals
 from rig.render.renderer import Renderer
@@ -93,6 +93,8 @@ def reconstruct(
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
     warning is one that the settings do not let pass, and Cancelled when ``report`` does.
     """
+    if "usdz" in settings.outputs.written:
+        check_usd()
     started = time.perf_counter()
     clock = Clock(report)
     clock("segmentation")
@@ -131,16 +133,14 @@ def reconstruct(
             mesh, quality = Mesh(finer.vertices, full.faces), finer.deviation_mm
     clock("texture")
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture)
+    layout, texture_warnings = find_layout(model, settings)
+    around = None if layout is None else layout.around
+    coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture, around=around)
+    atlas = paint_head(layout, mesh, coloured, full.face_region, settings)
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
         skin = None if finer is None else part_of(mesh, finer.observed)
         bust, bust_warnings = find_bust(maps, votes, bias, capture, silhouettes, rig, mesh, skin, settings, clock)
-    atlas = None
-    if settings.outputs.atlas:
-        clock("atlas")
-        layout = unwrap(model.vertices(np.zeros(0)), full.faces)
-        atlas = paint_atlas(layout, mesh, normals, coloured, capture, silhouettes, rig, depths, settings.texture)
     clock("evidence")
     before = start_masks(model, start, rig)
     fitted_masks = {name: np.isfinite(depth) for name, depth in depths.items()}
@@ -158,6 +158,7 @@ def reconstruct(
         *warnings,
         *eye_warnings(closed),
         *coloured.warnings,
+        *texture_warnings,
         *bust_warnings,
     )
     refuse(told, settings.fail_on)

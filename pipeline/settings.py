@@ -158,18 +158,33 @@ class DenseSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class SelectionSettings:
+    """Which photograph the detail comes from; costs are by that of a view which sees nothing of a place."""
+
+    disagreement: float = 0.06  # of the colour's code: a view that differs so much from the others ...
+    outlier: float = 2.0  # ... has half of this cost
+    smoothness: float = 0.15  # cost of a seam along an edge where views differ by ``disagreement``
+    levelling: float = 10.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
+    views_most: int = 4  # a place's detail is the mean of so many views ...
+    noise_factor: float = 4.0  # ... that differ from the chosen one by no more than this, by the median over the head
+    sweeps: int = 8  # of belief propagation
+
+
+@dataclass(frozen=True, slots=True)
 class TextureSettings:
     """Section 4.5. Chosen by the colour error over the visible face of captures rendered by another program."""
 
     blend: Literal["default", "reference"] = "default"  # reference: the paper's weighted mean
-    sharpness: float = 2.0  # exponent of normal . viewing direction; the paper's weight has 1, 2 to 8 are within 0.3 dB
+    sharpness: float = 1.0  # exponent of normal . viewing direction, as the paper's weight; 2 is 1 dB worse in a view
+    # that was kept back: what shines or is shaded in few views is then that of all
     balance: bool = True  # gain and offset of each camera
     contour_margin_px: float = 2.0  # nothing is sampled nearer to the background: 3 sigma of a 0.7 px defocus
-    hidden_mm: float = 1.0  # a nearer surface hides a vertex beyond this: a fit's own error, and no nose is thinner
+    hidden_mm: float = 1.5  # a nearer surface hides a vertex beyond this: a fit's own error, and no nose is thinner
     least_facing: float = 0.15  # cosine: at a flatter angle than 81 degrees a pixel smears over 6 mm
     footprint_px: float = 0.45  # sigma of the sampling window; 0.7 loses 0.3 dB of detail, 0.4 lets 1.5 dB more noise
     sharpening: float = 1.0  # unsharp mask of 1 px where there is detail: 1.2, 2.2 and 0.8 dB on three true heads
-    highlight: float = 0.12  # excess over the median of the views, by its level, at which a view counts half
+    outlier: float = 0.12  # difference from the median of the views, by its level, at which a view counts half
+    selection: SelectionSettings = field(default_factory=SelectionSettings)
 
 
 SPACING_RANGE_MM = (0.5, 3.0)  # finer is below the photographs' pixels, coarser has no lids
@@ -182,15 +197,33 @@ class BustSettings:
     spacing_mm: float = 1.5  # of its vertices, 0.5 to 3: three pixels of the usual rig
 
 
+FORMATS = ("glb", "ply", "obj", "usdz", "stl", "3mf")
+TEXTURE_SIZES = (1024, 2048, 4096, 8192)
+
+
 @dataclass(frozen=True, slots=True)
 class OutputSettings:
     """Which surfaces are made, and files beside those that every result has."""
 
     surface: Literal["head", "bust", "both"] = "both"  # the model's head, all that the cameras see, or both
-    obj: bool = False  # head.obj, with vertex colours
+    formats: tuple[str, ...] = ("glb", "ply")  # of the head, of FORMATS; head.ply is always written
+    image: Literal["jpeg", "webp", "png"] = "jpeg"  # of head.glb's texture
+    texture_size: int | None = None  # texels; None: a texel is about a pixel at the face
+    ply_texture: bool = False  # head.ply names head.png and has texture coordinates
     neutral: bool = False  # neutral.glb, the head without its expression
     morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names
-    atlas: bool = False  # head_atlas.glb, whose texture keeps the photographs' resolution
+    obj: bool = False  # of earlier versions: "obj" among the formats
+    atlas: bool = False  # of earlier versions: head.glb has a texture now
+
+    @property
+    def written(self) -> tuple[str, ...]:
+        """The formats, those of earlier settings included."""
+        return (*self.formats, *(["obj"] if self.obj and "obj" not in self.formats else []))
+
+    @property
+    def textured(self) -> bool:
+        """Whether any file has a texture."""
+        return self.surface != "bust" and (self.ply_texture or bool({"glb", "obj", "usdz"} & set(self.written)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +256,11 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
     least, most = SPACING_RANGE_MM
     if not least <= settings.bust.spacing_mm <= most:
         faults.append(f"bust.spacing_mm is {settings.bust.spacing_mm:g}, wanted {least:g} to {most:g}")
+    strange = [name for name in settings.outputs.formats if name not in FORMATS]
+    faults += [f"outputs.formats: {name!r:.80} is none of {', '.join(FORMATS)}" for name in strange]
+    size = settings.outputs.texture_size
+    if size is not None and size not in TEXTURE_SIZES:
+        faults.append(f"outputs.texture_size is {size}, wanted {', '.join(map(str, TEXTURE_SIZES))} or null")
     if faults:
         raise InputError(subject, faults)
     return settings

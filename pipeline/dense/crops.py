@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from pipeline.dense.crop_kernels import fill_lens_map
-from pipeline.imaging.grey import LUMINANCE, noise_level
+from pipeline.imaging.grey import LUMINANCE, blur_growth, noise_left, noise_level
 from pipeline.imaging.projection import packed_lens
 from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera, Intrinsics
@@ -22,6 +22,7 @@ LEVELS = 4  # full, half, quarter, eighth
 MARGIN_PX = 12  # about the subject: windows and the defocused edge
 UNSEEN_PX = -1e6  # signed distance beyond the photograph's edge: the subject may go on there
 UNSEEN_MOST_PX = -1e4  # what is left of that after any mixing with what is seen
+HALVED_NOISE = 0.4  # what a blur by BLUR_PX and a mean of 2 x 2 pixels leave of white noise
 BLUR_PX = 0.5  # before every halving, and of the full size: what is left is fit for bilinear reading
 
 
@@ -92,10 +93,11 @@ def _crop(
     mask = np.where(distance > UNSEEN_MOST_PX, np.clip(0.5 - distance, 0.0, 1.0), 0.0).astype(np.float32)
     grey = colour.astype(np.float32) @ LUMINANCE
     noise = noise_level(image.astype(np.float32) @ LUMINANCE)
-    levels = [Level(pinhole, _smooth(grey), distance, noise)]
+    blur = BLUR_PX * blur_growth(noise)
+    levels = [Level(pinhole, _smooth(grey, blur), distance, noise_left(noise, blur))]
     for _ in range(1, LEVELS):
-        grey, distance = _half(_smooth(grey)), 0.5 * _half(distance)
-        noise = max(0.5 * noise, 0.1)
+        grey, distance = _half(_smooth(grey, BLUR_PX)), 0.5 * _half(distance)
+        noise = max(HALVED_NOISE * noise, 0.1)
         pinhole = replace(pinhole, intrinsics=pinhole.intrinsics.scaled(0.5))
         levels.append(Level(pinhole, grey, distance, noise))
     assert levels[-1].grey.shape == (k.height >> (LEVELS - 1), k.width >> (LEVELS - 1))
@@ -133,8 +135,8 @@ def lens_map(camera: Camera, pinhole: Camera) -> tuple[Float32[np.ndarray, "h w"
     return x, y
 
 
-def _smooth(grey: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    return cv2.GaussianBlur(grey, (0, 0), BLUR_PX)
+def _smooth(grey: Float32[np.ndarray, "h w"], sigma_px: float) -> Float32[np.ndarray, "h w"]:
+    return cv2.GaussianBlur(grey, (0, 0), sigma_px)
 
 
 def _half(values: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
+from pipeline.imaging.grey import noise_left, noise_level
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
 from rig.mesh import Mesh
@@ -26,7 +27,7 @@ LEAST_FACING = 0.5  # cosine: flatter skin shines
 HIDDEN_MM = 4.0  # a nearer surface hides a vertex beyond this: a cell's own slope
 DARKEST = 0.01  # linear: added before ratios are taken, so that noise of dark cells makes no colours
 DETAIL_FLOOR = 0.01  # of a cell's mean: fine structure that noise and rounding make
-DETAIL_BLUR_CELLS = 1.2
+DETAIL_BLUR_PX, DETAIL_BLUR_CELLS = 0.8, 1.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,7 +246,9 @@ def grey_of(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
 def _detail(image: UInt8[np.ndarray, "h w 3"], size: int) -> Float32[np.ndarray, "r c"]:
     """Log of the fine structure's standard deviation within and around each cell, against its mean."""
     grey = 255.0 * grey_of(image)
-    fine = cv2.GaussianBlur(grey, (0, 0), 0.8) - cv2.GaussianBlur(grey, (0, 0), 0.6 * size)
+    fine = cv2.GaussianBlur(grey, (0, 0), DETAIL_BLUR_PX) - cv2.GaussianBlur(grey, (0, 0), 0.6 * size)
+    noise = noise_left(noise_level(grey), DETAIL_BLUR_PX)
     square, mean = _means(fine * fine, size), _means(grey, size)
     square, mean = (cv2.GaussianBlur(each, (0, 0), DETAIL_BLUR_CELLS) for each in (square, mean))
-    return np.log(np.sqrt(square) / (mean + 8.0) + DETAIL_FLOOR).astype(np.float32)
+    signal = np.sqrt(np.maximum(square - noise * noise, 0.0))
+    return np.log(signal / (mean + 8.0) + DETAIL_FLOOR).astype(np.float32)

@@ -113,7 +113,7 @@ def weights_from_text(given: Sequence[str], names: tuple[str, ...]) -> dict[str,
 
 def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
     """How far the eyes (``right``, ``left``) are closed by blinking, 0 to 1."""
-    found: dict[str, float] = {"right": 0.0, "left": 0.0}
+    found: dict[str, float] = dict.fromkeys(("right", "left"), 0.0)
     for name, weight in weights.items():
         side = BLINKS.get(plain_name(name))
         if side:

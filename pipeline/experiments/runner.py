@@ -25,6 +25,7 @@ from pipeline.experiments.posterior_check import posterior_check
 from pipeline.experiments.repeat import repeat
 from pipeline.experiments.robustness import robustness
 from pipeline.experiments.surfaces import surfaces
+from pipeline.experiments.texture import texture
 from pipeline.experiments.views import views
 from pipeline.experiments.visible import visible
 from rig.atomic_write import write_atomically
@@ -180,6 +181,12 @@ def _visible(task: Task) -> Outcome:
         return visible(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
 
 
+def _texture(task: Task) -> Outcome:
+    count = {"subjects": task.subjects} if task.subjects else {}
+    with Renderer.create() as renderer:
+        return texture(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
+
+
 def _surfaces(task: Task) -> Outcome:
     found = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
     with Renderer.create() as renderer:
@@ -216,6 +223,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "expressions": _expressions,
     "visible": _visible,
     "surfaces": _surfaces,
+    "texture": _texture,
 }
 
 

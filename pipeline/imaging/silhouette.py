@@ -13,7 +13,8 @@ CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a be
 
 @dataclass(frozen=True, slots=True)
 class ViewQuality:
-    """How far a view's silhouette is to be trusted: ``usable`` or not, and every reason against it."""
+    """How far a view's silhouette is to be trusted: ``usable`` or not, and every reason against it; ``doubts`` are
+    those that a clean plate or a mask would settle, where there was neither."""
 
     usable: bool = True
     contrast: float = float("inf")  # subject against background, in standard deviations of the noise
@@ -22,6 +23,7 @@ class ViewQuality:
     holes: int = 0
     warnings: tuple[str, ...] = ()
     figures: Mapping[str, float | list[float]] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

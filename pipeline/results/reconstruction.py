@@ -69,7 +69,7 @@ class Reconstruction:
     detail: Detail = field(default_factory=lambda: Detail("span", "not stated"))
     gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
     pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
-    atlas: Atlas | None = None  # where the settings ask for it
+    atlas: Atlas | None = None  # where a format has a texture and the model a layout
     expression: tuple[Found, ...] = ()  # the face that the head makes, the strongest part first
     posed: range = range(0)  # which of the fit's coefficients are weights of expressions
     posable: Posable | None = None  # where the settings ask for it

@@ -78,9 +78,9 @@ def decide(
     chi2, odds = np.where(shadow, left, chi2), np.where(shadow, -MOST_ODDS / 2, odds).astype(np.float32)
     probability = smooth_odds(odds, coarse, background, settings)
     raw = probability > 0.5
-    away, mixture = _mixture(image, coarse, background)
+    away, mixture = find_mixtures(image, coarse, background)
     paint = spread(coarse, eroded(raw, 1) * away / (1 + mixture**2), 2.0)
-    clear = _apart(paint, background.coarse, variance) > CONCLUSIVE
+    clear = colours_apart(paint, background.coarse, variance) > CONCLUSIVE
     other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance, settings)
     clear &= ~dilated(other, 1)
     plain = (
@@ -88,7 +88,7 @@ def decide(
         if background.inliers.any()
         else clear & False
     )
-    mask, detached_component_areas = _subject_only(raw, plain, settings)
+    mask, detached_component_areas = whole_subject(raw, plain, settings)
     mixed = (mixture > 1) & (away > (2 * background.noise @ CHANNEL_SUM / 3) ** 2)
     own_odds = _own_odds(coarse, raw, paint, chi2, variance, settings)
     own_odds = np.where(other, np.maximum(own_odds, 0.5 * unexplained - settings.evidence), own_odds)
@@ -110,7 +110,7 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: Se
     told = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MOST_ODDS, MOST_ODDS)
     odds = np.where(dissent >= 0, told, decision.odds).astype(np.float32)
     probability = smooth_odds(odds, decision.coarse, decision.background, settings)
-    mask, detached_component_areas = _subject_only(probability > 0.5, decision.plain, settings)
+    mask, detached_component_areas = whole_subject(probability > 0.5, decision.plain, settings)
     return replace(
         decision, odds=odds, probability=probability, mask=mask, detached_component_areas=detached_component_areas
     )
@@ -126,7 +126,7 @@ def _own_odds(
 ) -> Float32[np.ndarray, "h w"]:
     """Log odds of the subject's own colours against the plate: of that nearby, in the shade that suits the pixel best,
     or of all that it shows."""
-    nearby = 0.5 * (chi2 - _apart(paint, image, variance) ** 2) - PAINT_ODDS
+    nearby = 0.5 * (chi2 - colours_apart(paint, image, variance) ** 2) - PAINT_ODDS
     bins = (image / (256 / PALETTE)).astype(np.int32).clip(0, PALETTE - 1)
     counts = np.zeros((PALETTE,) * 3, np.float32)
     np.add.at(counts, tuple(bins[eroded(mask, 1)].T), 1.0)
@@ -138,7 +138,7 @@ def _own_odds(
     return np.maximum(nearby, 0.5 * chi2 - settings.evidence + gain)
 
 
-def _mixture(
+def find_mixtures(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], background: Background
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Squared difference to the plate (mean of the channels), and how far a coarse pixel is a mixture of subject and
@@ -165,7 +165,7 @@ def _against_plate(
     return (difference**2 / variance) @ CHANNEL_SUM, variance
 
 
-def _apart(
+def colours_apart(
     colour: Float32[np.ndarray, "h w 3"], other: Float32[np.ndarray, "h w 3"], variance: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
     """How far (standard deviations) a colour is from another, in the shade that brings it nearest."""
@@ -205,7 +205,7 @@ def _closed(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return eroded(dilated(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
 
 
-def _subject_only(
+def whole_subject(
     mask: Bool[np.ndarray, "h w"],
     plain: Bool[np.ndarray, "h w"],
     settings: SegmentationSettings,

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.imaging.contour_distance import distance_to_level
+from pipeline.imaging.masks import dilated, eroded
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
 from pipeline.parallel_for import thread_count
 from pipeline.settings import SegmentationSettings
@@ -25,12 +26,18 @@ from pipeline.silhouettes.cross_view import count_rejecting_cameras
 from pipeline.silhouettes.foreground import Decision, decide, doubtful, reconsider
 from pipeline.silhouettes.matting import Matte, solve_matte
 from pipeline.silhouettes.view_consistency import judge_agreement
+from pipeline.silhouettes.without_plates.decide import decide_without_plates
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.rig import Rig
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise, and smaller holes: whites of eyes before a grey wall
+SOLID_HOLE = 0.995  # mean coarse probability: 1.000 in false holes of noisy captures, at most 0.99 in gaps of hair
+UNDECIDED = 0.3  # from one half: share of a cut's windows that is neither yes nor no
+UNDECIDED_PX = 15  # side of a window ...
+UNDECIDED_FILLED = 0.6  # ... and its part that is undecided where the outline is a guess
+WEAK = "of the contour hardly differs from the background"
 NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
@@ -38,7 +45,10 @@ LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot;
 def segment(
     capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Callable[[str, float], None]
 ) -> dict[str, Silhouette]:
-    """The silhouette of every camera of the rig. Raises InputError where a camera has neither plate nor mask."""
+    """The silhouette of every camera of the rig; without any plate or mask the subject is found from the photographs.
+    Raises InputError where only some cameras have neither."""
+    if not capture.backgrounds and not capture.masks:
+        return _without_plates(capture, rig, settings, report)
     blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
     if blind:
         raise InputError(
@@ -74,6 +84,45 @@ def segment(
     return agreed
 
 
+def _without_plates(
+    capture: Capture, rig: Rig, settings: SegmentationSettings, report: Callable[[str, float], None]
+) -> dict[str, Silhouette]:
+    found = decide_without_plates(
+        capture.images, rig, settings, report=lambda share: report("segmentation", 0.8 * share)
+    )
+    with ThreadPoolExecutor(thread_count()) as pool:
+        jobs = {n: pool.submit(_refined, capture.images[n], one, settings) for n, one in found.decisions.items()}
+        jobs |= {n: pool.submit(_as_cut, share, settings) for n, share in found.shares.items()}
+        silhouettes = {name: _doubted(jobs[name].result(), settings) for name in rig.names}
+    agreed = judge_agreement(silhouettes, rig, settings)
+    report("segmentation", 1.0)
+    return agreed
+
+
+def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouette:
+    """What is said of a weak outline where there was no plate: another remedy than a change of the backdrop."""
+    quality, weak = silhouette.quality, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0)))
+    if weak <= settings.weak_share_warned:
+        return silhouette
+    text = f"found without a clean plate, and {weak:.0%} of its outline is a guess: give its clean plate or mask"
+    kept = tuple(told for told in quality.warnings if WEAK not in told)
+    if weak > settings.weak_share_unusable:
+        return replace(silhouette, quality=replace(quality, warnings=(*kept, f"{text}; the view is left out")))
+    return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
+
+
+def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
+    """The silhouette of a view that was cut along its edges; where windows disagreed its outline is weak."""
+    alpha, holes = _without_specks(share, np.zeros_like(share))
+    mask = alpha > 0.5
+    undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
+    rim = mask & ~eroded(mask, 1)
+    broad = cv2.blur(undecided.astype(np.float32), (UNDECIDED_PX, UNDECIDED_PX)) > UNDECIDED_FILLED
+    weak = float(broad[rim].mean()) if rim.any() else 1.0
+    figures = {"cut": 1.0, "weak_share": round(weak, 4)}
+    return Silhouette(mask, distance_to_level(alpha), _quality(mask, (1, holes), float("inf"), weak, figures, settings))
+
+
 def _operators(mask: Bool[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
     return replace(silhouette_from_mask(mask), quality=_mask_quality(mask, settings))
 
@@ -93,7 +142,8 @@ def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings
 
 def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings) -> Silhouette:
     alpha = np.zeros(decision.background.plates.shape[1:3], np.float32)
-    alpha[matte.box], holes = _without_specks(matte.alpha)
+    coarse = cv2.resize(decision.probability.astype(np.float32), alpha.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    alpha[matte.box], holes = _without_specks(matte.alpha, coarse[matte.box])
     distance = distance_to_level(alpha)
     weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
     contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
@@ -110,15 +160,22 @@ def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings
     return Silhouette(mask, distance, _quality(mask, (1, holes), contrast, weak, figures, settings))
 
 
-def _without_specks(alpha: Float32[np.ndarray, "h w"]) -> tuple[Float32[np.ndarray, "h w"], int]:
-    """Alpha of the subject's own component without holes of noise, and how many holes are left."""
+def _without_specks(
+    alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, "h w"], int]:
+    """Alpha of the subject's own component without holes of noise, and how many holes are left.
+
+    Noise is what is small, and what the ``coarse`` probability, whose pixels average the sensor's noise away, calls
+    subject all over: shaded skin before a backdrop of its colour. A gap in hair of that size is seen there, too.
+    """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)
     if len(areas) > 2:
         main = int(np.argmax(areas[1:])) + 1
         alpha = np.where(mask & (labels != main), np.float32(0.49), alpha)
     labels, areas = _labelled(alpha <= 0.5, 8)
-    small = areas < max(NOISE_HOLE, STRANGER_SHARE * np.count_nonzero(mask))
+    solid = np.bincount(labels.ravel(), coarse.ravel(), len(areas)) > SOLID_HOLE * areas
+    small = solid | (areas < max(NOISE_HOLE, STRANGER_SHARE * np.count_nonzero(mask)))
     small[0] = False
     if small.any():
         alpha = np.where(small[labels], np.float32(0.51), alpha)
@@ -162,7 +219,7 @@ def _quality(
         text += " since the plate, or do the clothes match the backdrop?"
         (fatal if apart > settings.other_pieces_unusable else warnings).append(text)
     if weak > settings.weak_share_warned:
-        text = f"{weak:.0%} of the contour hardly differs from the background: change the backdrop or the clothes"
+        text = f"{weak:.0%} {WEAK}: change the backdrop or the clothes"
         (fatal if weak > settings.weak_share_unusable else warnings).append(text)
     share = np.count_nonzero(mask) / mask.size
     if share < settings.least_area or share > 0.95:

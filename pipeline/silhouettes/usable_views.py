@@ -90,4 +90,5 @@ def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
     for name, silhouette in silhouettes.items():
         code = "view" if silhouette.quality.usable else "view-left-out"
         found += [ReportWarning(code, f"{name}: {text}") for text in silhouette.quality.warnings]
+        found += [ReportWarning("mask-doubtful", f"{name}: {text}") for text in silhouette.quality.doubts]
     return found

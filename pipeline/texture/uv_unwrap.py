@@ -30,8 +30,8 @@ SIDE_SHARE = 2 / 3  # of the cut that is one of the square's sides; the rest is 
 class NoLayout(EigenheadError):
     def __init__(self) -> None:
         super().__init__(
-            "no texture atlas can be laid out for this model, whose surface is not one piece with one open border at "
-            "the neck; ask for vertex colours alone (settings.outputs.atlas = false)"
+            "no texture can be laid out for this model, whose surface is not one piece with one open border at the "
+            "neck: its head has vertex colours alone"
         )
 
 

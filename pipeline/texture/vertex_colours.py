@@ -24,8 +24,13 @@ from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.parallel_for import thread_count
 from pipeline.settings import TextureSettings
+from pipeline.texture.decision import Decision, pack_pictures
 from pipeline.texture.inpaint import fill_unknown
+from pipeline.texture.neighbourhood import Neighbourhood
+from pipeline.texture.paint_kernels import Pictures
+from pipeline.texture.seam_levelling import level_views
 from pipeline.texture.vertex_colours_kernels import blend_views
+from pipeline.texture.view_selection import add_alike, select_views
 from pipeline.texture.visibility import Sight, see_points, sharpened
 from rig.camera import Camera
 from rig.capture import Capture
@@ -37,6 +42,8 @@ REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hid
 GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
+
+GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
 
 Rgb = tuple[float, float, float]
 
@@ -50,6 +57,7 @@ class Texture:
     gains: Mapping[str, Rgb] = field(default_factory=dict)  # linear, by camera
     offsets: Mapping[str, Rgb] = field(default_factory=dict)
     filled: int = 0
+    decision: Decision | None = None  # where it was asked for
     warnings: tuple[ReportWarning, ...] = ()
 
 
@@ -61,46 +69,78 @@ def texture(
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
     settings: TextureSettings,
+    *,
+    around: Neighbourhood | None = None,
 ) -> Texture:
-    """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them."""
+    """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them. With
+    ``around``, the mesh's edges, a view is also chosen for every vertex."""
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
         return _reference(mesh_world, normals, capture, silhouettes, views, depths)
     if not len(views):
         return _untextured(len(normals))
 
-    def look(camera: Camera) -> Sight:
+    def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
         given = image, silhouettes[name], depths[name]
-        return see_points(camera, *given, mesh_world.vertices, normals, settings)
+        return see_points(camera, *given, mesh_world.vertices, normals, settings), image
 
     with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
-        sights = list(pool.map(look, views))
+        found = list(pool.map(look, views))
+    weights, colours = _stacked([sight for sight, _ in found])
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
-        gains, offsets = balance(*_stacked(sights))
-    linear, seen = blend(sights, gains, offsets, settings.highlight)
+        gains, offsets = balance(weights, colours)
+    weights *= believed(gains)[:, None]
+    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    agreed, seen = blend_views(weights, balanced, settings.outlier)
     if not seen.any():
         return _untextured(len(seen))
-    colours = np.rint(255 * srgb_from_linear(fill_unknown(linear, seen > 0, mesh_world.faces))).astype(np.uint8)
+    decision = None
+    if around is not None:
+        images = [image for _, image in found]
+        masks = {name: silhouettes[name].mask for name in views.names}
+        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world, settings.footprint_px)
+        decision = decide(views, weights, balanced, agreed, gains, pictures, around, settings)
+    shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
-    return Texture(colours, seen, by_camera, _by_name(views, offsets), filled, _gain_warnings(by_camera))
+    told = _gain_warnings(by_camera)
+    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, told)
+
+
+def believed(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
+    """Share that a camera's word has left: what had to be made much brighter brings its noise along, and a dim view is
+    often a shadowed one."""
+    return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
+
+
+def decide(
+    views: Rig,
+    weights: Float32[np.ndarray, "k v"],
+    balanced: Float32[np.ndarray, "k v 3"],
+    agreed: Float[np.ndarray, "v 3"],
+    gains: Float[np.ndarray, "k 3"],
+    pictures: Pictures,
+    around: Neighbourhood,
+    settings: TextureSettings,
+) -> Decision:
+    """A view for each vertex, and what levels the seams between them."""
+    chosen = settings.selection
+    codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
+    level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
+    fields = level_views(weights, codes, level_to, around, chosen.levelling)
+    detail = codes + fields[:, :, :3]
+    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around, chosen)
+    slots, shares = add_alike(labels, options, quality, detail, weights, around, chosen)
+    corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
+    return Decision(views, slots, shares, corrections, weights, pictures)
 
 
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
     """The cameras that may colour a head."""
     return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
-
-
-def blend(
-    sights: Sequence[Sight], gains: Float[np.ndarray, "k 3"], offsets: Float[np.ndarray, "k 3"], highlight: float
-) -> tuple[Float[np.ndarray, "v 3"], UInt8[np.ndarray, " v"]]:
-    """Linear colour of each point and the number of views that gave it."""
-    weights, colours = _stacked(sights)
-    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    return blend_views(weights, balanced, highlight)
 
 
 def _stacked(sights: Sequence[Sight]) -> tuple[Float32[np.ndarray, "k v"], Float32[np.ndarray, "k v 3"]]:
@@ -134,22 +174,35 @@ def _reference(
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> Texture:
     """Section 4.5 to the letter, in the images' own codes; vertices that no camera sees are filled."""
+    colours, weights, views = reference_colours(mesh.vertices, normals, capture, silhouettes, rig, depths)
+    known = weights > 0
+    if not known.any():
+        return _untextured(len(normals))
+    colours = fill_unknown(colours, known, mesh.faces)
+    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+
+
+def reference_colours(
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
+    """The paper's codes of points of a surface, the weight behind each (0: nobody sees it) and the number of images."""
     total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
     views = np.zeros(len(normals), np.uint8)
     for camera in rig:
-        pixels = camera.project(mesh.vertices)
-        seen = _visible(camera, mesh.vertices, pixels, depths[camera.name], silhouettes[camera.name])
-        towards = camera.centre_world - mesh.vertices
+        pixels = camera.project(points)
+        seen = _visible(camera, points, pixels, depths[camera.name], silhouettes[camera.name])
+        towards = camera.centre_world - points
         facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
         weight = np.where(seen, np.clip(facing, 0.0, None), 0.0)
         total += weight[:, None] * _sampled(capture.images[camera.name], pixels)
         weights += weight
         views += weight > 0
-    known = weights > 0
-    if not known.any():
-        return _untextured(len(normals))
-    colours = fill_unknown(total / np.where(known, weights, 1.0)[:, None], known, mesh.faces)
-    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+    return total / np.where(weights > 0, weights, 1.0)[:, None], weights, views
 
 
 def _visible(

@@ -5,6 +5,9 @@ images/<camera>.png|jpg|jpeg|tif|webp, RAW, DNG or HEIC
 background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
 features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
+
+Without background/ and masks/ altogether the subject is found from the photographs. Without images/ the pictures lie
+beside cameras.json; a folder of a camera's name may hold its one picture, whatever that is called.
 """
 
 import hashlib
@@ -63,13 +66,14 @@ def capture_root(folder: Path) -> Path:
 def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
     """The images of a folder for a known rig; appends every fault to ``faults``."""
     jobs: list[tuple[str, str, Path]] = []
+    pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in ("masks", "background"))
     for camera in rig:
-        image = _image_file(folder / "images", camera.name, faults)
+        image = _image_file(pictures, camera.name, faults) or _only_picture(pictures / camera.name, faults)
         mask = _image_file(folder / "masks", camera.name, faults)
         plates = _plate_files(folder / "background", camera.name, faults)
         if image is None:
-            faults.append(f"images/{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)")
-        if not plates and mask is None:
+            faults.append(f"{_inside(folder, pictures)}{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)")
+        if not plates and mask is None and not alone:
             faults.append(
                 f"background/{camera.name}.png is missing: a clean plate, or masks/{camera.name}.png, is needed"
             )
@@ -98,6 +102,24 @@ def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
         digests["features.json"] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
     return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
+
+
+def picture_folder(folder: Path) -> Path:
+    """Where a capture folder's photographs lie."""
+    return folder / "images" if (folder / "images").is_dir() else folder
+
+
+def _inside(folder: Path, pictures: Path) -> str:
+    return "" if pictures == folder else f"{pictures.name}/"
+
+
+def _only_picture(folder: Path, faults: list[str]) -> Path | None:
+    """The picture in a camera's own folder."""
+    found = _listed(folder)
+    if len(found) > 1:
+        told = f"{folder.name}/ holds {len(found)} pictures; a capture is one shot: leave one of them"
+        faults.append(f"{told}, and give all to calibrate --from scene")
+    return found[0] if found else None
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:

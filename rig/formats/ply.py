@@ -24,6 +24,9 @@ PLY_VERTEX = np.dtype(
 PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
+PLY_TEXTURED_FACE = np.dtype([*PLY_FACE.descr, ("numbers", "u1"), ("texcoord", "<f4", 6)])
+
+
 PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
@@ -35,10 +38,12 @@ def ply_bytes(
     quality: Float[np.ndarray, " v"],
     views: UInt8[np.ndarray, " v"],
     part: UInt8[np.ndarray, " v"] | None = None,
+    corner_uv: Float[np.ndarray, "f 3 2"] | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
     """Binary little-endian PLY. ``quality`` is the standard deviation (mm), ``views`` how many images coloured it,
-    ``part`` what a vertex belongs to (a property more, where it is given)."""
+    ``part`` what a vertex belongs to (a property more, where it is given). ``corner_uv``: texture coordinates of the
+    faces' corners, v downwards; as MeshLab has them, ``texcoord`` is a list of six with v upwards."""
     kind = PLY_VERTEX if part is None else np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):
@@ -49,8 +54,10 @@ def ply_bytes(
     vertices["quality"], vertices["views"] = quality, views
     if part is not None:
         vertices["part"] = part
-    faces = np.empty(len(mesh.faces), PLY_FACE)
+    faces = np.empty(len(mesh.faces), PLY_FACE if corner_uv is None else PLY_TEXTURED_FACE)
     faces["count"], faces["corners"] = 3, mesh.faces
+    if corner_uv is not None:
+        faces["numbers"], faces["texcoord"] = 6, (corner_uv * (1, -1) + (0, 1)).reshape(-1, 6)
     properties = [f"property {PLY_TYPES[kind[name].str]} {name}" for name in kind.names or ()]
     header = [
         "ply",
@@ -60,6 +67,7 @@ def ply_bytes(
         *properties,
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
+        *([] if corner_uv is None else ["property list uchar float texcoord"]),
         "end_header",
         "",
     ]
@@ -85,11 +93,12 @@ def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
     ours = end and "format binary_little_endian 1.0" in lines and names == list(PLY_VERTEX.names or ())
     if not ours or len(counts) != 2:
         raise InputError(path.name, ["is no head.ply of ours"])
-    wanted = counts[0] * PLY_VERTEX.itemsize + counts[1] * PLY_FACE.itemsize
+    face = PLY_TEXTURED_FACE if "property list uchar float texcoord" in lines else PLY_FACE
+    wanted = counts[0] * PLY_VERTEX.itemsize + counts[1] * face.itemsize
     if len(body) != wanted:
         raise InputError(path.name, [f"has {len(body)} bytes of vertices and faces where {wanted} are said"])
     vertices = np.frombuffer(body, PLY_VERTEX, counts[0])
-    faces = np.frombuffer(body, PLY_FACE, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
+    faces = np.frombuffer(body, face, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
     places = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)
     colours = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
     return Mesh(places, faces.astype(np.int32), colours), vertices["quality"].astype(float)

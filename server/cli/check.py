@@ -14,6 +14,7 @@ from rig.formats.capture_folder import capture_root, read_capture
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
 from server.tasks.ingest import check_capture
+from server.tasks.photographs import SCALE, photographs_alone
 from server.tasks.prepare import prepare_kernels
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class Checked(TypedDict):
     front: str | None
     faults: list[str]
     warnings: list[Warned]
+    will: list[str]
 
 
 def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Checked:
@@ -44,9 +46,12 @@ def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Ch
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
-    found = Checked(capture=str(capture), cameras=[], front=None, faults=[], warnings=[])
+    found = Checked(capture=str(capture), cameras=[], front=None, faults=[], warnings=[], will=[])
     try:
         with folder_of(capture) as folder:
+            if photographs_alone(folder):
+                found["cameras"], found["will"] = _told_by_photographs(folder)
+                return found
             content = check_capture(capture_root(folder), service_settings().image_pixels, report)
             found["cameras"] = [camera.name for camera in content.cameras]
             found["front"] = content.front
@@ -56,6 +61,25 @@ def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Ch
     except EigenheadError as error:
         found["faults"] = [str(error)]
     return found
+
+
+def _told_by_photographs(folder: Path) -> tuple[list[str], list[str]]:
+    """Names of the photographs of a folder that has no cameras, and what a reconstruction will do with them. Raises
+    InputError for photographs, or a scale.json, that cannot be used."""
+    from calibration.scene.photographs import find_photographs
+    from rig.formats.scale_json import read_scale
+
+    root = capture_root(folder)
+    names = find_photographs(root).names
+    known = (root / SCALE).is_file()
+    if known:
+        read_scale(root / SCALE, names)
+    scale = (
+        "scale.json tells the scale" if known else "the scale will be ASSUMED from a head's mean size: add scale.json"
+    )
+    given = [kind for kind in ("masks", "background") if (root / kind).is_dir()]
+    masks = f"{given[0]}/ tells the subject" if given else "the subject will be found from the photographs"
+    return list(names), [f"no cameras.json: {len(names)} photographs will be calibrated from the scene", scale, masks]
 
 
 def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[Warned]:
@@ -77,6 +101,8 @@ def lines(found: Checked) -> list[str]:
     """The same for people."""
     told = [f"fault    {fault}" for fault in found["faults"]]
     told += [f"warning  {warning['code']}: {warning['message']}" for warning in found["warnings"]]
+    told += [f"will     {step}" for step in found["will"]]
     verdict = "cannot be reconstructed" if found["faults"] else "can be reconstructed"
-    seen = f"{len(found['cameras'])} cameras, front {found['front']}; " if found["cameras"] else ""
+    seen = f"{len(found['cameras'])} cameras, " if found["cameras"] else ""
+    seen += f"front {found['front']}; " if found["front"] else ""
     return [f"{found['capture']}: {seen}{verdict}", *told]

@@ -48,6 +48,17 @@ def _of_output(name: str) -> Callable[[str | None], str | None]:
     return one_of(choices)
 
 
+def _formats(value: str | None) -> str | None:
+    """A callback: names of ``FORMATS`` with commas between."""
+    from pipeline.settings import FORMATS
+
+    names = [] if value is None else [name.strip() for name in value.split(",")]
+    strange = [name for name in names if name not in FORMATS]
+    if strange:
+        raise typer.BadParameter(f"{strange[0]!r} is none of {', '.join(FORMATS)}")
+    return ",".join(names) or None
+
+
 @app.command(epilog="Example: eigenhead reconstruct shots/anna.tar.gz --out heads/anna --method contour")
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
@@ -59,8 +70,12 @@ def reconstruct(
         str | None, typer.Option(help="span, kernel, photo or fine.", callback=_of_setting("detail"))
     ] = None,
     surface: Annotated[str | None, typer.Option(help="head, bust or both.", callback=_of_output("surface"))] = None,
-    obj: Annotated[bool, typer.Option("--obj", help="Write head.obj too, with vertex colours.")] = False,
-    atlas: Annotated[bool, typer.Option("--atlas", help="Write head_atlas.glb too, with a texture image.")] = False,
+    formats: Annotated[
+        str | None,
+        typer.Option(help="Of the head: glb, ply, obj, usdz, stl, 3mf, with commas between.", callback=_formats),
+    ] = None,
+    obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
+    atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
     morphs: Annotated[
         bool, typer.Option("--morphs", help="Write posed.glb too, with morph targets under Apple's names.")
@@ -75,6 +90,7 @@ def reconstruct(
     flags = {"obj": obj, "atlas": atlas, "neutral": neutral, "morphs": morphs}
     outputs: dict[str, object] = {name: True for name, asked in flags.items() if asked}
     outputs |= {"surface": surface} if surface else {}
+    outputs |= {"formats": formats.split(",")} if formats else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
@@ -288,17 +304,24 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible "
-            "or surfaces."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, surfaces, "
+            "texture or real."
         ),
     ],
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="real: captures, or photographs alone, of more views than are used.")
+    ] = None,
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
     subjects: Annotated[int | None, typer.Option(help="How many, instead of the experiment's own.", min=1)] = None,
     simplex: Annotated[
         int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
     ] = None,
-    captures: Annotated[bool, typer.Option(help="hidden, visible: the captures of --shared, too.")] = False,
+    captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
     openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
+    front: Annotated[str | None, typer.Option(help="real: the view that the subject faces.")] = None,
+    outlines: Annotated[
+        Path | None, typer.Option(help="real: outlines drawn by hand, outlines.json.", exists=True, dir_okay=False)
+    ] = None,
     shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
     out: Annotated[
         Path | None, typer.Option(help="Keeps rows there, so that a stopped run goes on; and the table and pictures.")
@@ -306,6 +329,11 @@ def experiments(
     json_out: Json = False,
 ) -> None:
     """Repeat the paper's experiments, and ours."""
+    if name == "real":
+        _experiment_real(folders or [], model, front, outlines, out, json_out)
+        return
+    if folders:
+        raise typer.BadParameter("only real takes folders", param_hint="FOLDERS")
     from pipeline.experiments.runner import run_experiment
 
     with progress_bar() as report:
@@ -320,4 +348,18 @@ def experiments(
             folder=out,
             report=report,
         )
+    answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
+
+
+def _experiment_real(
+    folders: list[Path], model: str, front: str | None, outlines: Path | None, out: Path | None, json_out: bool
+) -> None:
+    from server.cli.real import judge_folders
+
+    missing = [str(folder) for folder in folders if not folder.is_dir()]
+    if missing or not folders:
+        told = f"{', '.join(missing)}: no such folder" if missing else "name the folders of the photographs"
+        raise typer.BadParameter(told, param_hint="FOLDERS")
+    with progress_bar() as report:
+        found = judge_folders(folders, model=model, front=front, outlines=outlines, kept=out, report=report)
     answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])

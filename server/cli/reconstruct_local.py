@@ -5,6 +5,8 @@ import tempfile
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,21 +45,25 @@ def settings_document(path: Path | None, **given: str | Mapping[str, object] | N
 def reconstruct_locally(
     capture: Path, out: Path, *, model: str | None, settings: Mapping[str, object], report: Report
 ) -> "ReportDocument":
-    """Reconstructs a capture folder or archive into ``out`` and returns report.json. What can be wrong with settings,
+    """Reconstructs a capture folder or archive into ``out`` and returns report.json; cameras and masks that had to be
+    found are kept in ``out``, whatever comes after. What can be wrong with settings,
     capture and ``out`` is found before anything heavy is loaded."""
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
     with _result_folder(out) as fresh, folder_of(capture) as folder:
-        _reconstruct_folder(folder, fresh, model=model, chosen=chosen, report=report)
+        _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)
         document = json.loads((fresh / "report.json").read_text(encoding="utf-8"))
     return document
 
 
-def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "Settings", report: Report) -> None:
-    from rig.formats.capture_folder import read_capture
+def _reconstruct_folder(
+    folder: Path, out: Path, *, kept: Path, model: str | None, chosen: "Settings", report: Report
+) -> None:
+    from server.tasks.photographs import keep_masks, read_or_calibrate
 
-    shot, rig = read_capture(folder)
+    prepared = read_or_calibrate(folder, kept, front=chosen.front, report=report)
+    shot, rig = prepared.capture, prepared.rig
     prepare_kernels(report, chosen)
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
@@ -75,7 +81,9 @@ def _reconstruct_folder(folder: Path, out: Path, *, model: str | None, chosen: "
     tell("read", 0.0)
     head_model = load_model(model or "default")
     with Renderer.create() as renderer:
-        done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell)
+        segment = partial(keep_masks, kept)
+        done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=segment)
+    done = replace(done, warnings=(*prepared.warnings, *done.warnings))
     tell("write", 0.0)
     write_result(out, done, shot)
     durations.learn(chosen, progress.finish())

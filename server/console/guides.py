@@ -3,20 +3,25 @@
 Pure functions of a rig and pixels; lens distortion is kept, so that a guide is a curve.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.alignment.feature_points import locate_features
 from pipeline.alignment.procrustes import procrustes
 from pipeline.multiview.triangulation import NoPoint, triangulate
+from pipeline.settings import CLICK_NOISE_PX
 from rig.camera import Camera
 from rig.rig import Rig
 from server.tasks.child import Bench, Report
 
 Pixels = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]  # point, camera
+Landmarks = Mapping[str, Float[np.ndarray, " 3"]]  # head frame, mm
+Picks = tuple[tuple[str, tuple[float, ...]], ...]  # camera, pixel
 
 REACH_MM = 220.0  # a guide covers so much of the ray before and behind the rig's centre: heads stand there
 SAMPLES = 45
@@ -35,40 +40,97 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
 
 
 class Helps(TypedDict):
-    """By point and camera: the curves of the other views' rays, where the triangulated point is seen, how far off (px)
-    what was picked is, and where the model's landmarks would be."""
+    """By point and camera: the curves of the other views' rays (of the shown point), where the triangulated point is
+    seen, how far off (px) what was picked is, and where the model's landmarks would be; ``contradictions``: what a job
+    would leave out, by point."""
 
     guides: dict[str, dict[str, list[list[list[float]]]]]
     reprojected: dict[str, dict[str, list[float]]]
     off_px: dict[str, dict[str, float]]
     predicted: dict[str, dict[str, list[float]]]
+    contradictions: dict[str, str]
 
 
-def helps(rig: Rig, points: Pixels, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> Helps:
-    guides: dict[str, dict[str, list[list[list[float]]]]] = {}
-    reprojected: dict[str, dict[str, list[float]]] = {}
-    off: dict[str, dict[str, float]] = {}
-    located: dict[str, np.ndarray] = {}
-    for name, views in points.items():
-        guides[name] = {
-            target: [
-                guide(rig, source, pixel, target).round(2).tolist()
-                for source, pixel in views.items()
-                if source != target
-            ]
-            for target in rig.names
+@dataclass(frozen=True, slots=True)
+class Located:
+    """What follows from one point's picks; ``position`` (mm) is None where its rays meet nowhere."""
+
+    position: Float[np.ndarray, " 3"] | None
+    reprojected: dict[str, list[float]]
+    off_px: dict[str, float]
+    contradiction: str | None
+
+
+class Guides:
+    """Helps for the picks in one rig's pictures. What a change leaves alone is not computed again: a click costs one
+    point, and the curves of the one that is shown, however many there are."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._located: dict[str, tuple[Picks, Located]] = {}
+        self._curves: dict[tuple[str, tuple[float, ...], str], list[list[float]]] = {}
+        self._predicted: tuple[object, dict[str, dict[str, list[float]]]] = (None, {})
+
+    def helps(self, points: Pixels, landmarks: Landmarks, shown: Collection[str]) -> Helps:
+        """``shown``: the points of which curves are wanted."""
+        located = {name: self._of(name, views) for name, views in points.items()}
+        places = {name: found.position for name, found in located.items() if found.position is not None}
+        self._curves = {key: curve for key, curve in self._curves.items() if key[:2] in _picks(points, shown)}
+        return {
+            "guides": {name: self._guides(points[name]) for name in shown if name in points},
+            "reprojected": {name: found.reprojected for name, found in located.items() if found.reprojected},
+            "off_px": {name: found.off_px for name, found in located.items() if found.off_px},
+            "predicted": self._predict(places, landmarks),
+            "contradictions": {n: found.contradiction for n, found in located.items() if found.contradiction},
         }
-        with suppress(NoPoint):
-            found = triangulate(views, rig, noise_px=1.0)
-            located[name] = found.position_world
-            reprojected[name] = _seen(rig, found.position_world)
-            off[name] = {camera: round(float(np.linalg.norm(r)), 2) for camera, r in found.residuals_px.items()}
-    return {
-        "guides": guides,
-        "reprojected": reprojected,
-        "off_px": off,
-        "predicted": predicted(rig, located, landmarks),
-    }
+
+    def _of(self, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
+        key = tuple((camera, tuple(pixel)) for camera, pixel in views.items())
+        known, found = self._located.get(name, (None, None))
+        if found is None or known != key:
+            found = locate(self._rig, name, views)
+            self._located[name] = (key, found)
+        return found
+
+    def _guides(self, views: Mapping[str, Float[np.ndarray, " 2"]]) -> dict[str, list[list[list[float]]]]:
+        return {
+            target: [self._curve(source, pixel, target) for source, pixel in views.items() if source != target]
+            for target in self._rig.names
+        }
+
+    def _curve(self, source: str, pixel: Float[np.ndarray, " 2"], target: str) -> list[list[float]]:
+        key = (source, tuple(pixel), target)
+        if key not in self._curves:
+            self._curves[key] = guide(self._rig, source, pixel, target).round(2).tolist()
+        return self._curves[key]
+
+    def _predict(
+        self, places: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Landmarks
+    ) -> dict[str, dict[str, list[float]]]:
+        key = (len(landmarks), {name: tuple(place) for name, place in places.items()})
+        if self._predicted[0] != key:
+            self._predicted = (key, predicted(self._rig, places, landmarks))
+        return self._predicted[1]
+
+
+def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
+    """Triangulates one point, and asks what a job would leave out of it."""
+    try:
+        found = triangulate(views, rig, noise_px=CLICK_NOISE_PX)
+    except NoPoint:
+        return Located(None, {}, {}, None)
+    remarks = locate_features({name: views}, rig, noise_px=CLICK_NOISE_PX).remarks
+    off = {camera: round(float(np.linalg.norm(r)), 2) for camera, r in found.residuals_px.items()}
+    return Located(found.position_world, _seen(rig, found.position_world), off, "; ".join(remarks) or None)
+
+
+def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
+    """Helps for all points, from nothing."""
+    return Guides(rig).helps(points, landmarks, list(points))
+
+
+def _picks(points: Pixels, shown: Collection[str]) -> set[tuple[str, tuple[float, ...]]]:
+    return {(camera, tuple(pixel)) for name in shown for camera, pixel in points.get(name, {}).items()}
 
 
 def predicted(

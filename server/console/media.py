@@ -21,13 +21,14 @@ from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
 from server.console.look_through import camera_views, rig_of, straightened
 from server.console.page import as_problem
+from server.console.portrait import write_portrait
 from server.console.silhouettes import draw
 from server.errors import Conflict, NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import CaptureRecord
 from server.wire.multipart import receive_board_pictures, receive_capture
-from server.wire.send_file import send_file
+from server.wire.send_file import send_archive, send_file
 
 THUMBNAIL_WIDTH = 480
 THUMBNAIL_QUALITY = 82
@@ -76,6 +77,12 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     if not path.is_file():
         make_thumbnail(service.store.folder("captures", capture_id) / "files" / name, path)
     return FileResponse(path, headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/front")
+def front(who: Reader, capture_id: str) -> Response:
+    """The same of the front camera."""
+    return thumbnail(who, capture_id, who[0].store.capture(capture_id).front)
 
 
 @pages.get("/console/captures/{capture_id}/checks")
@@ -141,6 +148,17 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
     return _floats(comparison.ply_property(path, name))
 
 
+@pages.get("/console/jobs/{job_id}/portrait.jpg")
+def portrait(who: Reader, job_id: str) -> Response:
+    """A small picture of the head, drawn at the first look; it goes with the job."""
+    result = _result_folder(who[0], job_id)
+    kept = result.parent / "portrait.jpg"
+    if not kept.is_file():
+        with _drawing:
+            write_portrait(result, kept)
+    return FileResponse(kept, headers=FOREVER)
+
+
 @pages.get("/console/jobs/{job_id}/cameras")
 def cameras(who: Reader, job_id: str) -> Response:
     """The cameras that took the pictures, in the head's frame; none where the capture was removed, or the result has no
@@ -180,6 +198,12 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
     other_job = service.jobs.get(other)
     same = other_job.capture_id == job.capture_id
     return _floats(comparison.to_surface(mine, _result_folder(service, other) / "head.ply", align=not same))
+
+
+@pages.get("/console/jobs/{job_id}/all.zip")
+def all_files(who: Reader, request: Request, job_id: str) -> Response:
+    """Every file of the result in one archive."""
+    return send_archive(request, _result_folder(who[0], job_id), who[0].jobs.files(job_id))
 
 
 @pages.get("/console/jobs/{job_id}/{name}")

@@ -1,13 +1,14 @@
 """What all pages share: a component that shows a state document, actions that run in threads, and their messages."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import Any, TypedDict
 
 import anyio
 import anyio.to_thread
+import structlog
 from nicegui import app as pages
 from nicegui import ui
 from nicegui.element import Element
@@ -18,6 +19,7 @@ from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
 from server.console.theme import Frame, page_frame
 from server.errors import Gone
+from server.services.bulk import each
 from server.services.health import readiness
 from server.services.keys import Caller
 from server.services.service import Service
@@ -28,7 +30,10 @@ REFRESH_S = 0.5
 STATUS_S = 2.0
 FIRST_LOOK_S = 1.0  # so long a page waits to be sent with its state in it, which saves it a turn over the socket
 KEEP_S = 3600.0  # of a value that is shared by all pages
+KEEP_TIMES = 9.0  # a value is kept so many times as long as it took to make
 MAKE = Callable[[], Any]
+
+log = structlog.get_logger()
 
 _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a capture holds one for seconds
 
@@ -47,9 +52,10 @@ class Action:
 
 @dataclass
 class Cache:
-    """Values that all open pages share, so that they agree, and ten pages cost what one does."""
+    """Values that all open pages share, so that they agree, and ten pages cost what one does. What takes long to make
+    is kept the longer, so that making it takes a tenth of the time at most."""
 
-    _values: dict[Any, tuple[float, Any]] = field(default_factory=dict)
+    _values: dict[Any, tuple[float, float, Any]] = field(default_factory=dict)
     _locks: dict[Any, Lock] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -58,21 +64,25 @@ class Cache:
         with self._lock:
             own = self._locks.setdefault(key, Lock())
         with own:
-            made, value = self._values.get(key, (0.0, None))
-            if time.monotonic() - made > age_s or key not in self._values:
+            made, took, value = self._values.get(key, (0.0, 0.0, None))
+            began = time.monotonic()
+            if began - made > max(age_s, KEEP_TIMES * took) or key not in self._values:
                 value = make()
-                self._values[key] = (time.monotonic(), value)
+                self._values[key] = (time.monotonic(), time.monotonic() - began, value)
                 self._drop_old()
             return value
 
-    def forget(self, key: Any) -> None:
-        self._values.pop(key, None)
+    def forget(self, *kinds: str) -> None:
+        """Values whose key is, or begins with, one of ``kinds``."""
+        for key in list(self._values):
+            if (key[0] if isinstance(key, tuple) else key) in kinds:
+                self._values.pop(key, None)
 
     def _drop_old(self) -> None:
         """What no page has asked for anew: reports of jobs, mostly."""
         with self._lock:
             before = time.monotonic() - KEEP_S
-            for key in [key for key, (made, _) in self._values.items() if made < before]:
+            for key in [key for key, (made, _, _) in self._values.items() if made < before]:
                 self._values.pop(key, None)
                 self._locks.pop(key, None)
 
@@ -187,6 +197,18 @@ def remove_later(identity: str, remove: Callable[[], None], title: str, scope: s
     shared.clear()
 
 
+def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: str, scope: str) -> None:
+    """Many things at once, taken back at once."""
+
+    def remove_each() -> None:
+        done = each(ids, remove)
+        for one in done.refused:
+            log.warning("not removed", id=one.id, error=one.detail)
+
+    removals.add(f"{ids[0]} and all", remove_each, title, scope, also=ids)
+    shared.clear()
+
+
 def as_problem(error: Exception) -> Problem:
     if isinstance(error, WorkFailed) and error.kind != "bug":
         return Problem(500, error.kind, error.message, error.faults)
@@ -212,8 +234,10 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
 
 
 class Status(TypedDict):
-    """What the frame shows of the service; ``faults``: what to do, by what is wrong."""
+    """What the frame shows of the service; ``faults``: what to do, by what is wrong; ``starting``: what is not there
+    yet."""
 
+    starting: list[str]
     faults: dict[str, str]
     jobs: int
     disk: str
@@ -227,10 +251,17 @@ def status_of(service: Service, caller: Caller) -> Status | None:
 
     def make() -> Status:
         checks = readiness(service)
-        wrong = {name: check.detail for name, check in checks.items() if not check.ok}
-        jobs = service.jobs.active()
+        wrong = {name: check.detail for name, check in checks.items() if not check.ok and not check.starting}
+        starting = [name for name, check in checks.items() if check.starting]
+        counts = service.jobs.counts()
         disk = checks["disk"].detail.partition(" free")[0] + " free"
-        return {"faults": wrong, "jobs": len(jobs), "disk": disk, "local": False}
+        return {
+            "faults": wrong,
+            "starting": starting,
+            "jobs": counts["queued"] + counts["running"],
+            "disk": disk,
+            "local": False,
+        }
 
     shown: Status = shared.get("status", STATUS_S / 2, make)
     return {**shown, "local": caller.key == "local"}

@@ -4,7 +4,7 @@ The wait is kept in the process: if the service dies meanwhile, the thing is the
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import structlog
@@ -16,11 +16,12 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """``scope`` is what a key needs that takes it back."""
+    """``scope`` is what a key needs that takes it back; ``ids``: all that goes."""
 
     title: str
     scope: str
     timer: threading.Timer
+    ids: frozenset[str]
 
 
 @dataclass
@@ -32,14 +33,15 @@ class Removals:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def __contains__(self, identity: object) -> bool:
-        return identity in self._waiting
+        return any(identity in removal.ids for removal in [*self._waiting.values()])
 
-    def add(self, identity: str, remove: Callable[[], None], title: str, scope: str) -> None:
+    def add(self, identity: str, remove: Callable[[], None], title: str, scope: str, also: Iterable[str] = ()) -> None:
+        """``also``: further ids that go, and are taken back, with it."""
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True
         with self._lock:
             if identity not in self._waiting:
-                self._waiting[identity] = Removal(title, scope, timer)
+                self._waiting[identity] = Removal(title, scope, timer, frozenset([identity, *also]))
                 timer.start()
 
     def undo(self, identity: str) -> bool:

@@ -10,12 +10,16 @@ from nicegui.element import Element
 ACCENT = "#6cb2ff"
 PAGES = (
     ("rig", "/", "Rig"),
+    ("subjects", "/subjects", "Subjects"),
     ("captures", "/captures", "Captures"),
     ("features", "/features", "Features"),
     ("jobs", "/jobs", "Jobs"),
     ("result", "/result", "Result"),
     ("calibration", "/calibration", "Calibration"),
 )
+
+# Before anything is drawn: a page that turns from dark to light while it loads dazzles.
+LOOK = 'document.documentElement.dataset.look = localStorage.getItem("eigenhead-look") || "dark"'
 
 Answer = Callable[[Any], Awaitable[Any]]
 
@@ -41,7 +45,8 @@ class Frame(Element, component="static/frame.js"):
 
 def install() -> None:
     ui.add_head_html('<link rel="stylesheet" href="/console/static/theme.css">', shared=True)
-    ui.add_head_html('<meta name="color-scheme" content="dark">', shared=True)
+    ui.add_head_html('<meta name="color-scheme" content="dark light">', shared=True)
+    ui.add_head_html(f"<script>{LOOK}</script>", shared=True)
 
 
 @contextmanager

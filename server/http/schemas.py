@@ -98,7 +98,7 @@ class NewJob(Received):
                 {
                     "capture_id": EXAMPLE_ID,
                     "name": "Anna, fine",
-                    "settings": {"detail": "fine", "outputs": {"atlas": True}},
+                    "settings": {"detail": "fine", "outputs": {"formats": ["glb", "obj"]}},
                 }
             ]
         }
@@ -180,20 +180,12 @@ class CaptureOut(Answer):
     faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
 
 
-class CaptureList(Answer):
-    captures: list[CaptureOut]
-
-
 class SessionOut(Answer):
     id: str
     created: Moment
     label: str
     consent: str
     captures: list[str]
-
-
-class SessionList(Answer):
-    sessions: list[SessionOut]
 
 
 class JobError(Answer):
@@ -234,14 +226,11 @@ class JobOut(Answer):
     restart_of: str | None
     queue: str | None
     priority: int
+    ahead: int | None = Field(None, description="jobs of its queue that go before a queued one")
     created: Moment | None
     started: Moment | None
     finished: Moment | None
     files: dict[str, FileOut]
-
-
-class JobList(Answer):
-    jobs: list[JobOut]
 
 
 class ModelOut(Answer):
@@ -329,6 +318,7 @@ class UseCalibration(Received):
     model_config = ConfigDict(json_schema_extra={"examples": [{"calibration_id": EXAMPLE_ID}]})
 
     calibration_id: Id
+    poor: bool = Field(False, description="use it although its verdict is poor")
 
 
 class CalibrationOut(Answer):
@@ -338,7 +328,12 @@ class CalibrationOut(Answer):
     label: str
     pictures: dict[str, int] = Field(description="number of pictures by camera")
     state: State
+    stage: str | None = None
+    progress: float = Field(0.0, ge=0, le=1)
+    eta_s: float | None = None
     error: JobError | None
+    verdict: Literal["good", "usable", "poor"] | None = Field(None, description="null: not judged")
+    missing: list[str] = Field([], description="what would make the verdict better, most urgent first")
     figures: JsonObject
     checks: list[JsonObject]
     warnings: list[str]

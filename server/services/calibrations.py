@@ -17,7 +17,8 @@ from rig.atomic_write import write_atomically
 from server.errors import Conflict, NotFound
 from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES, failure
 from server.services.records import Calibration
-from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord
+from server.storage.events import EventLog
+from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
 from server.storage.store import Store, StoredFile, is_id, move_durably, new_id
 
 WORKFLOW = "calibrate"
@@ -26,8 +27,8 @@ WORKFLOW = "calibrate"
 class Calibrations:
     """The calibrations of a service. Methods block."""
 
-    def __init__(self, store: Store, client: DBOSClient, queue: str) -> None:
-        self._store, self._client, self._queue = store, client, queue
+    def __init__(self, store: Store, client: DBOSClient, queue: str, events: EventLog) -> None:
+        self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> Calibration:
         """Accepts ``folder`` (board.toml and images/) and queues the work."""
@@ -64,10 +65,22 @@ class Calibrations:
         found: CalibrationOutcome | None = row.output if row is not None and state == "succeeded" else None
         error = failure(row) if row is not None and state == "failed" else None
         if found is None:
-            return Calibration(**asdict(record), state=state, error=error, in_use=False)
+            told = self._events.latest([identity]).get(identity) if state == "running" else None
+            document: EventDocument = {} if told is None else told.document
+            return Calibration(
+                **asdict(record),
+                state=state,
+                stage=document.get("stage"),
+                progress=document.get("progress", 0.0),
+                eta_s=document.get("eta_s"),
+                error=error,
+            )
         return Calibration(
             **asdict(record),
             state=state,
+            progress=1.0,
+            verdict=found.get("verdict"),
+            missing=tuple(found.get("missing", ())),
             figures=found["figures"],
             checks=tuple(found["checks"]),
             warnings=tuple(found["warnings"]),
@@ -99,7 +112,18 @@ class Calibrations:
         if self.get(identity).state not in FINISHED:
             raise Conflict("calibration-active", "The calibration is under way; wait for its end.")
         self._store.remove(self._store.folder("calibrations", identity))
+        self._events.remove([identity])
         self._client.delete_workflow(identity)
+
+    def check_usable(self, identity: str) -> None:
+        """Raises Conflict for a calibration that is poor, naming what it lacks."""
+        found = self.get(identity)
+        if found.verdict == "poor":
+            detail = (
+                "This calibration is poor: heads made with it would be wrong. Take the shots that are missing and "
+                "calibrate again, or use it all the same."
+            )
+            raise Conflict("calibration-poor", detail, found.missing)
 
     def in_use(self) -> str | None:
         """sha256 of the calibration in use."""

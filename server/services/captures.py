@@ -1,7 +1,8 @@
 """Captures: taken with the rig or made of an archive, found, given feature points, changed, removed."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,13 +15,16 @@ from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs, refuse_board
-from server.services.rigs import SHOT_BYTES, RigBackend
+from server.services.records import Found
+from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.settings import ServiceSettings
+from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.child import Children
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
+SAMPLE_SEED = 11
 TEXT_MOST = 500  # characters of a label and the like
 
 
@@ -48,10 +52,16 @@ class Captures:
     """The captures of a service. Methods block."""
 
     def __init__(
-        self, store: Store, jobs: Jobs, rig: RigBackend, children: Children, settings: ServiceSettings
+        self,
+        store: Store,
+        jobs: Jobs,
+        rig: RigBackend,
+        children: Children,
+        settings: ServiceSettings,
+        library: Library,
     ) -> None:
         self._store, self._jobs, self._rig, self._children = store, jobs, rig, children
-        self._settings = settings
+        self._settings, self._library = settings, library
 
     def take(self, about: About, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
         """Triggers the rig now. ``board``: pictures of the calibration board. Raises Unavailable, and DiskFull."""
@@ -66,6 +76,23 @@ class Captures:
                 judged = {} if board else {"measured": "checks" in shot}
                 content = ingest(folder=str(capture / "files"), image_pixels=self._settings.image_pixels, **judged)
             return self._add(capture, "rig", content, about, shot)
+
+    def sample(self) -> CaptureRecord:
+        """A shot of the simulated studio, also where the rig is a real one. It shows nobody, so that nobody is asked
+        for consent. Raises Unavailable, and DiskFull."""
+        self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
+        studio = SimulatedRig(self._store.data / "rig" / "none")
+        try:
+            with self._store.incoming() as folder:
+                capture = folder / "capture"
+                shot = studio.capture(capture, seed=SAMPLE_SEED)
+                with self._children.one() as child:
+                    content = child.remote(ingest_folder)(
+                        folder=str(capture / "files"), image_pixels=self._settings.image_pixels, measured=False
+                    )
+                return self._add(capture, "rig", content, About(label="Sample, simulated studio"), shot, asked=False)
+        finally:
+            studio.close()
 
     def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
         """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
@@ -88,15 +115,21 @@ class Captures:
         s = self._settings
         return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
 
-    def find(self, *, session: str | None = None, limit: int = 100, before: str | None = None) -> list[CaptureRecord]:
-        """Newest first; ``before``: only those older than this id."""
+    def page(self, query: CaptureQuery, limit: int = 100, cursor: str | None = None) -> Found[CaptureRecord]:
+        """Raises InputError for a cursor of another list."""
+        page = self._library.captures(query, limit, cursor)
+        return Found(tuple(self.of(page.ids)), page.next, page.total)
+
+    def of(self, ids: Sequence[str]) -> list[CaptureRecord]:
+        """The captures with these ids, in their order, those of them that there are."""
         found = []
-        for record in self._store.captures():
-            if (before is None or record.id < before) and (session is None or record.session == session):
-                found.append(record)
-            if len(found) == limit:
-                break
+        for identity in ids:
+            with suppress(NotFound):  # removed since the index was asked, or damaged
+                found.append(self._store.capture(identity))
         return found
+
+    def newest(self) -> CaptureRecord | None:
+        return next(iter(self.page(CaptureQuery(), limit=1).items), None)
 
     def edit(self, identity: str, given: Mapping[str, str | None]) -> CaptureRecord:
         """Another label, expression or session; what is not given stays. Raises NotFound."""
@@ -166,6 +199,7 @@ class Captures:
         with or without a session. Raises NotFound, and Unavailable while a worker still writes."""
         self._store.capture(identity)
         erase_captures(self._store, self._jobs, [identity])
+        self._library.scrub()
 
     def _check_consent(self, session: str | None) -> None:
         """Raises NotFound; Conflict where the service asks for consent and the session has no note of it."""
@@ -184,8 +218,10 @@ class Captures:
         content: CaptureContent,
         about: About,
         shot: Mapping[str, object] | None = None,
+        *,
+        asked: bool = True,
     ) -> CaptureRecord:
-        if not content.board:
+        if asked and not content.board:
             self._check_consent(about.session)
         faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
         self._store.put_checks(folder, all_checks(shot, content))

@@ -9,7 +9,6 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import Settings, document_from_settings
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
-from server.services.jobs import STATES, WORKFLOW
 from server.services.service import Check, Service
 from server.storage.database import alive_workers
 from server.storage.records import JsonObject
@@ -52,7 +51,11 @@ def _workers(service: Service) -> Check:
             count = connection.scalar(sa.select(sa.func.count()).where(alive)) or 0
     except SQLAlchemyError:
         return Check(ok=False, detail="unknown: the database does not answer")
-    return Check(ok=count > 0, detail=f"{count} alive" if count else "none alive: start one with `eigenhead worker`")
+    if count:
+        return Check(ok=True, detail=f"{count} alive")
+    if service.jobs.worker_may_start():
+        return Check(ok=False, detail="being started: it loads for some seconds", starting=True)
+    return Check(ok=False, detail="none alive: start one with `eigenhead worker`")
 
 
 def check_egl(service: Service) -> None:
@@ -65,7 +68,9 @@ def check_egl(service: Service) -> None:
 
 
 def _egl(service: Service) -> Check:
-    return service.known.get("egl") or Check(ok=False, detail="being started; ask again in a few seconds")
+    return service.known.get("egl") or Check(
+        ok=False, detail="being started; ask again in a few seconds", starting=True
+    )
 
 
 def _rig(service: Service) -> Check:
@@ -82,7 +87,7 @@ def _records(service: Service) -> Check:
 
 def exposition(service: Service) -> bytes:
     """The metrics of this moment, in Prometheus' text format."""
-    jobs = _jobs_by_state(service)
+    jobs = service.jobs.counts()
     captures, damaged = len(service.store.ids("captures")), len(service.store.set_aside())
     return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)
 
@@ -104,7 +109,7 @@ class Info:
 
 
 def about(service: Service) -> Info:
-    jobs, limits = _jobs_by_state(service), service.settings
+    jobs, limits = service.jobs.counts(), service.settings
     return Info(
         version("eigenhead"),
         len(os.sched_getaffinity(0)),
@@ -117,10 +122,3 @@ def about(service: Service) -> Info:
         limits.jobs_per_key,
         document_from_settings(Settings()),
     )
-
-
-def _jobs_by_state(service: Service) -> dict[str, int]:
-    jobs = dict.fromkeys(set(STATES.values()), 0)
-    for row in service.jobs.client.list_workflows(name=WORKFLOW, load_input=False, load_output=False):
-        jobs[STATES[row.status]] += 1
-    return jobs

@@ -6,9 +6,9 @@ input, its state the workflow's status. Progress comes from the event log, files
 
 import hashlib
 import json
-from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
@@ -16,17 +16,18 @@ from typing import cast
 import sqlalchemy as sa
 import structlog
 from dbos import DBOS, DBOSClient, EnqueueOptions, WorkflowStatus
-from sqlalchemy.exc import IntegrityError
 
-from pipeline.settings import settings_from_document
 from rig.errors import EigenheadError, InputError
 from server.errors import URN, Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
-from server.services.records import Failure, Job
+from server.services.records import Failure, Found, Job
+from server.services.work import Work
 from server.settings import ServiceSettings
-from server.storage.database import alive_workers, job_index, workers
+from server.storage.database import alive_workers, workers
 from server.storage.events import EventLog, JobEvent
+from server.storage.job_index import JobIndex, JobQuery
+from server.storage.library import Library
 from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
 from server.storage.store import Store, StoredFile, is_id, new_id
 
@@ -44,37 +45,10 @@ STATES = {
     "CANCELLED": "cancelled",
 }
 STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
+WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where all cores are busy
 FINISHED = ("succeeded", "failed", "cancelled")
 
 log = structlog.get_logger()
-
-
-@dataclass(frozen=True, slots=True)
-class Work:
-    """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None; what
-    people call it, and who is told of its end beside the service's webhooks."""
-
-    model: str | None = None
-    settings: Mapping[str, object] | None = None
-    name: str = ""
-    webhook: JobWebhook | None = None
-
-    def check(self) -> None:
-        """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""
-        from pipeline.eigenheads.model_names import list_models
-
-        known, settings_fault = list_models(), None
-        try:
-            settings_from_document(self.settings or {})
-        except InputError as error:
-            settings_fault = error
-        if self.model is not None and self.model != "default" and self.model not in known:
-            fault = f"{self.model!r:.80} is not at hand; there are: {', '.join(['default', *known])}"
-            if settings_fault is None:
-                raise InputError("model", [fault])
-            raise InputError("request", [f"model: {fault}", *(f"settings: {f}" for f in settings_fault.faults)])
-        if settings_fault is not None:
-            raise settings_fault
 
 
 class JobFailed(EigenheadError):
@@ -96,12 +70,14 @@ def migrate(settings: ServiceSettings) -> None:
 class Jobs:
     """The jobs of one service. Every method blocks on the database: call it from a thread."""
 
-    def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine) -> None:
-        self._settings, self._store, self._engine = settings, store, engine
-        self.events = EventLog(engine)
+    def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine, library: Library) -> None:
+        self._settings, self._store, self._engine, self._library = settings, store, engine, library
+        self.events, self.index = EventLog(engine), JobIndex(engine, WORKFLOW)
         self.client = DBOSClient(
             system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
         )
+        self.index.complete(self._requests)
+        self._began = time.monotonic()
 
     def close(self) -> None:
         self.client.destroy()
@@ -143,8 +119,7 @@ class Jobs:
         """Queues a reconstruction of every capture of a session. Raises as ``submit`` does."""
         wanted.check()  # a session without captures asks no job to
         self._store.session(session)
-        heads = [c.id for c in self._store.captures() if c.session == session and not c.board]
-        return [self.submit(capture, wanted, key=key, priority=priority) for capture in heads]
+        return [self.submit(capture, wanted, key=key, priority=priority) for capture in self._library.heads_of(session)]
 
     def _enqueue(
         self,
@@ -167,18 +142,18 @@ class Jobs:
                 "priority": priority,
                 "attributes": {"capture": request["capture_id"], "session": session, "key": key},
             }
-            self._index(job_id, request["capture_id"], session)
+            self.index.add(job_id, request, session)
             self.client.enqueue(options, request)
             first = self._status(job_id)
             assert first is not None
         if _request(first) != json.loads(json.dumps(request)):
             detail = "This Idempotency-Key was used for another request; use a new key for a new job."
             raise Conflict("idempotency-conflict", detail)
-        return self._job(first)
+        return self._jobs([first])[0]
 
     def get(self, job_id: str) -> Job:
         """Raises NotFound."""
-        return self._job(self._known(job_id))
+        return self._jobs([self._known(job_id)])[0]
 
     def webhook(self, job_id: str) -> JobWebhook | None:
         """The job's own, if it was given one. Raises NotFound."""
@@ -197,15 +172,38 @@ class Jobs:
         offset: int = 0,
     ) -> list[Job]:
         """Newest first."""
-        ids = self._indexed(capture, session)
+        ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
         status = STATUSES[state] if state else None
         rows = self.client.list_workflows(
             name=WORKFLOW, workflow_ids=ids, status=status, limit=limit, offset=offset, sort_desc=True
         )
-        latest = self.events.latest([row.workflow_id for row in rows])
-        return [self._job(row, latest.get(row.workflow_id)) for row in rows]
+        return self._jobs(rows)
+
+    def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
+        """A word that names a state is looked for as that. Raises InputError for a cursor of another list."""
+        page = self.index.page(_by_state(query), limit, cursor)
+        return Found(tuple(self.of(page.ids)), page.next, page.total)
+
+    def of(self, ids: Sequence[str]) -> list[Job]:
+        """The jobs with these ids, in their order, those of them that there are."""
+        if not ids:
+            return []
+        known = {row.workflow_id: row for row in self.client.list_workflows(name=WORKFLOW, workflow_ids=list(ids))}
+        return self._jobs([known[job_id] for job_id in ids if job_id in known])
+
+    def counts(self) -> dict[str, int]:
+        """Jobs by state."""
+        counts = dict.fromkeys(dict.fromkeys(STATES.values()), 0)
+        for status, count in self.index.counts().items():
+            counts[STATES[status]] += count
+        return counts
+
+    def of_captures(self, captures: Collection[str]) -> dict[str, list[tuple[str, str]]]:
+        """Id and state of every job of some captures, newest first."""
+        found = self.index.of_captures(captures)
+        return {capture: [(job.id, STATES[job.status]) for job in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
         """Ids of queued and running jobs."""
@@ -244,10 +242,9 @@ class Jobs:
 
     def without_result(self) -> list[str]:
         """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
-        rows = self.client.list_workflows(
-            name=WORKFLOW, status=STATUSES["succeeded"], sort_desc=True, load_input=False, load_output=False
-        )
-        return [row.workflow_id for row in rows if not self._result(row.workflow_id).is_dir()]
+        there = set(self._store.ids("jobs"))
+        done = self.index.newest_first(STATUSES["succeeded"])
+        return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
 
     def _result(self, job_id: str) -> Path:
         return self._store.folder("jobs", job_id) / "result"
@@ -282,22 +279,16 @@ class Jobs:
         self._store.remove(self._store.folder("jobs", job_id))
         self.events.remove([job_id])
         self.client.delete_workflow(job_id)
-        with self._engine.begin() as connection:
-            connection.execute(sa.delete(job_index).where(job_index.c.job_id == job_id))
+        self.index.remove(job_id)
 
-    def _index(self, job_id: str, capture: str, session: str | None) -> None:
-        row = {"job_id": job_id, "capture_id": capture, "session": session}
-        with suppress(IntegrityError), self._engine.begin() as connection:
-            connection.execute(sa.insert(job_index).values(**row))
+    def _requests(self, jobs: list[str]) -> dict[str, JobRequest]:
+        rows = self.client.list_workflows(workflow_ids=jobs, name=WORKFLOW, load_output=False)
+        return {row.workflow_id: request for row in rows if (request := _request(row)) is not None}
 
-    def _indexed(self, capture: str | None, session: str | None) -> list[str] | None:
-        """Ids of the jobs of a capture or session; None where nothing narrows the list."""
-        wanted = [(job_index.c.capture_id, capture), (job_index.c.session, session)]
-        clauses = [column == value for column, value in wanted if value is not None]
-        if not clauses:
-            return None
-        with self._engine.connect() as connection:
-            return [*connection.scalars(sa.select(job_index.c.job_id).where(*clauses))]
+    def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
+        latest = self.events.latest([row.workflow_id for row in rows])
+        places = self.index.places() if any(STATES[row.status] == "queued" for row in rows) else {}
+        return [self._job(row, latest.get(row.workflow_id), places) for row in rows]
 
     def _check_count(self, key: str) -> None:
         active = len(self.active(key=key))
@@ -315,7 +306,13 @@ class Jobs:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
                 return None
+        if queue == self._settings.queue and self.worker_may_start():
+            return "The worker is being started."
         return f"No worker serves the queue {queue!r}: start one with `eigenhead worker --queue {queue}`."
+
+    def worker_may_start(self) -> bool:
+        """Whether the service is so young that its worker may still be loading."""
+        return time.monotonic() - self._began < WORKER_START_S
 
     def _status(self, job_id: str, load: bool = True) -> WorkflowStatus | None:
         rows = self.client.list_workflows(workflow_ids=[job_id], name=WORKFLOW, load_input=load, load_output=load)
@@ -327,8 +324,7 @@ class Jobs:
             raise NotFound("job", job_id)
         return row
 
-    def _job(self, row: WorkflowStatus, event: JobEvent | None = None) -> Job:
-        event = event or self.events.latest([row.workflow_id]).get(row.workflow_id)
+    def _job(self, row: WorkflowStatus, event: JobEvent | None, places: Mapping[str, int]) -> Job:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = _request(row)
@@ -349,11 +345,23 @@ class Jobs:
             restart_of=None if request is None else request.get("restart_of"),
             queue=row.queue_name,
             priority=row.priority or 0,
+            ahead=places.get(row.workflow_id) if state == "queued" else None,
             created=_moment(row.created_at),
             started=_moment(row.dequeued_at),
             finished=_moment(row.completed_at) if state in FINISHED else None,
             files=dict(row.output or {}) if state == "succeeded" else {},
         )
+
+
+def _by_state(query: JobQuery) -> JobQuery:
+    words = query.sought.split()
+    states = [word.casefold() for word in words if word.casefold() in STATUSES]
+    if not states:
+        return query
+    statuses = [status for state in states for status in STATUSES[state]]
+    both = statuses if query.statuses is None else [status for status in statuses if status in query.statuses]
+    rest = " ".join(word for word in words if word.casefold() not in STATUSES)
+    return replace(query, sought=rest, statuses=both)
 
 
 def _request(row: WorkflowStatus) -> JobRequest | None:

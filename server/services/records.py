@@ -2,8 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 from server.storage.records import FileEntry
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Found(Generic[T]):
+    """One page of a list: ``next`` is the cursor of the page after it, None on the last; ``total`` counts what all
+    pages hold."""
+
+    items: tuple[T, ...]
+    next: str | None
+    total: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +31,7 @@ class Failure:
 @dataclass(frozen=True, slots=True)
 class Job:
     """A job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone;
-    ``files`` are those of a result, by name."""
+    ``ahead`` is how many jobs of its queue go before a queued one; ``files`` are those of a result, by name."""
 
     id: str
     name: str
@@ -35,6 +48,7 @@ class Job:
     restart_of: str | None
     queue: str | None
     priority: int
+    ahead: int | None
     created: str | None
     started: str | None
     finished: str | None
@@ -53,8 +67,26 @@ class Session:
 
 
 @dataclass(frozen=True, slots=True)
+class Subject:
+    """One person: sessions of one name, newest first, with how many captures they have; ``id`` is the newest session's.
+    ``head``: the newest job with a result, ``heads`` how many there are."""
+
+    id: str
+    label: str
+    created: str
+    sessions: tuple[str, ...]
+    captures: int
+    heads: int
+    running: int
+    head: str | None
+    capture: str | None
+    consent: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Calibration:
-    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera."""
+    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera; ``stage``,
+    ``progress`` (0 to 1) and remaining seconds of one that runs; ``missing``: what would make its verdict better."""
 
     id: str
     created: str
@@ -62,7 +94,12 @@ class Calibration:
     label: str
     pictures: dict[str, int]
     state: str
+    stage: str | None = None
+    progress: float = 0.0
+    eta_s: float | None = None
     error: Failure | None = None
+    verdict: str | None = None
+    missing: tuple[str, ...] = ()
     figures: Mapping[str, object] = field(default_factory=dict)
     checks: tuple[Mapping[str, object], ...] = ()
     warnings: tuple[str, ...] = ()

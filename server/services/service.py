@@ -18,6 +18,7 @@ from server.services.uploads import ResumableUploads
 from server.services.webhooks import Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import open_database
+from server.storage.library import Library
 from server.storage.store import Store
 from server.tasks.calibrate import ingest_board_pictures
 from server.tasks.child import Children
@@ -25,10 +26,12 @@ from server.tasks.child import Children
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding about the service: whether it is well, and what to do where it is not."""
+    """One finding about the service: whether it is well, and what to do where it is not; ``starting``: it is not well
+    yet, and nothing is to be done."""
 
     ok: bool
     detail: str
+    starting: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +68,11 @@ class Service:
             child.remote(ingest_board_pictures)(archive=str(archive), folder=str(target), limits=limits)
         return self.calibrations.add(target, "upload", label)
 
-    def use_calibration(self, identity: str) -> RigState:
-        """Every capture from now on gets this calibration; returns the rig's state. Raises NotFound, Conflict."""
+    def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
+        """Every capture from now on gets this calibration; returns the rig's state. Raises NotFound; Conflict, for a
+        poor one, too, unless ``poor`` says that it is to be used all the same."""
+        if not poor:
+            self.calibrations.check_usable(identity)
         self.rig.use(self.calibrations.cameras_json(identity))
         self.calibrations.mark_in_use(identity)
         return self.rig.describe()
@@ -81,19 +87,21 @@ class Service:
 
 def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     """Opens the data folder, the database and the rig's description. Raises InputError, DatabaseUnavailable."""
-    store = Store(settings.data)
     engine = open_database(settings)
+    library = Library(engine)
+    store = Store(settings.data, library)
+    library.reconcile(store)
     migrate(settings)
-    jobs, rig = Jobs(settings, store, engine), open_rig(settings)
+    jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)
     children = Children(settings.checks_at_once, niceness=3)
     return Service(
         settings=settings,
         store=store,
         engine=engine,
         jobs=jobs,
-        captures=Captures(store, jobs, rig, children, settings),
-        sessions=Sessions(store, jobs),
-        calibrations=Calibrations(store, jobs.client, settings.queue),
+        captures=Captures(store, jobs, rig, children, settings, library),
+        sessions=Sessions(store, jobs, library),
+        calibrations=Calibrations(store, jobs.client, settings.queue, jobs.events),
         keys=Keys(engine),
         webhooks=Webhooks(engine, settings.webhook_origins),
         uploads=ResumableUploads(store, settings),

@@ -1,20 +1,24 @@
 """Sessions: one subject's captures, and their erasure."""
 
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 
+from server.errors import NotFound
 from server.services.erasure import erase_captures
 from server.services.jobs import Jobs
-from server.services.records import Session
-from server.storage.records import CaptureRecord, SessionRecord
+from server.services.records import Found, Session, Subject
+from server.storage.library import Library, SubjectOrder, subject_of
+from server.storage.records import SessionRecord
 from server.storage.store import Store, new_id
 
 
 class Sessions:
     """The sessions of a service. Methods block."""
 
-    def __init__(self, store: Store, jobs: Jobs) -> None:
-        self._store, self._jobs = store, jobs
+    def __init__(self, store: Store, jobs: Jobs, library: Library) -> None:
+        self._store, self._jobs, self._library = store, jobs, library
 
     def add(self, label: str, consent: str) -> Session:
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -22,17 +26,45 @@ class Sessions:
         self._store.save_session(record)
         return _with_captures(record, [])
 
-    def find(self) -> list[Session]:
-        """Newest first, each with the ids of its captures."""
-        of: dict[str | None, list[str]] = {}
-        for capture in self._store.captures():
-            of.setdefault(capture.session, []).append(capture.id)
-        return [_with_captures(record, of.get(record.id, [])) for record in self._store.sessions()]
+    def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[Session]:
+        """Newest first, each with the ids of its captures. Raises InputError for a cursor of another list."""
+        page = self._library.sessions(sought, limit, cursor)
+        captures = self._library.captures_of(page.ids)
+        records = [record for identity in page.ids if (record := self._record(identity)) is not None]
+        return Found(tuple(_with_captures(record, captures[record.id]) for record in records), page.next, page.total)
+
+    def subjects(
+        self, sought: str = "", order: SubjectOrder = "-created", limit: int = 100, cursor: str | None = None
+    ) -> Found[Subject]:
+        """People, by the names of their sessions. Raises InputError for a cursor of another list."""
+        page = self._library.subjects(sought, order, limit, cursor)
+        captures = self._library.captures_of([session for sessions in page.subjects for session in sessions])
+        jobs = self._jobs.of_captures([capture for some in captures.values() for capture in some])
+        found = []
+        for sessions in page.subjects:
+            records = [record for session in sessions if (record := self._record(session)) is not None]
+            if records:
+                theirs = {capture: jobs[capture] for session in sessions for capture in captures[session]}
+                found.append(_subject(records, theirs))
+        return Found(tuple(found), page.next, page.total)
+
+    def captures_of_subject(self, session: str | None) -> list[str]:
+        """Ids of the captures of all sessions that bear the name of this one; none without a session."""
+        if session is None or (record := self._record(session)) is None:
+            return []
+        sessions = self._library.sessions_of(subject_of(record))
+        return [capture for some in self._library.captures_of(sessions).values() for capture in some]
+
+    def _record(self, identity: str) -> SessionRecord | None:
+        """None where it was removed since the index was asked."""
+        with suppress(NotFound):
+            return self._store.session(identity)
+        return None
 
     def get(self, identity: str) -> Session:
         """Raises NotFound."""
         record = self._store.session(identity)
-        return _with_captures(record, [capture.id for capture in self._captures(identity)])
+        return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
         """Another label or consent note; what is None stays. Raises NotFound."""
@@ -47,14 +79,30 @@ class Sessions:
         own record goes last, so that an erasure that was cut short can be asked for again. Raises NotFound, and
         Unavailable while a worker still writes."""
         self._store.session(identity)
-        captures = [capture.id for capture in self._captures(identity)]
+        captures = self._library.captures_of([identity])[identity]
         jobs = {job.id for job in self._jobs.find(session=identity, limit=100_000)}
         erase_captures(self._store, self._jobs, captures, jobs)
-        self._store.remove(self._store.folder("sessions", identity).with_suffix(".json"))
-
-    def _captures(self, identity: str) -> list[CaptureRecord]:
-        return [record for record in self._store.captures() if record.session == identity]
+        self._store.remove_session(identity)
+        self._library.scrub()
 
 
 def _with_captures(record: SessionRecord, captures: list[str]) -> Session:
     return Session(**asdict(record), captures=tuple(captures))
+
+
+def _subject(records: Sequence[SessionRecord], jobs: Mapping[str, Sequence[tuple[str, str]]]) -> Subject:
+    """``records``: a person's sessions, newest first; ``jobs``: id and state of those of each capture."""
+    all_jobs = sorted(((job, state, capture) for capture, some in jobs.items() for job, state in some), reverse=True)
+    heads = [job for job, state, _ in all_jobs if state == "succeeded"]
+    return Subject(
+        id=records[0].id,
+        label=records[0].label,
+        created=records[0].created,
+        sessions=tuple(record.id for record in records),
+        captures=len(jobs),
+        heads=len(heads),
+        running=sum(state in ("queued", "running") for _, state, _ in all_jobs),
+        head=heads[0] if heads else None,
+        capture=next(iter(jobs), None),
+        consent=all(record.consent.strip() for record in records),
+    )

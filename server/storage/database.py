@@ -3,6 +3,7 @@
 Times are seconds since 1970 on the *database's* clock, so that two hosts whose clocks differ agree on who is silent.
 """
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from rig.errors import EigenheadError
 from server.settings import ServiceSettings
 
 CONNECT_S = 10  # a database that does not even refuse
+SCRUB_TRIES, SCRUB_PAUSE_S = 20, 0.05
 
 metadata = sa.MetaData()
 
@@ -43,6 +45,31 @@ job_index = sa.Table(  # what jobs are looked up by; the job itself is the engin
     sa.Column("job_id", sa.String(64), primary_key=True),
     sa.Column("capture_id", sa.String(64), nullable=False, index=True),
     sa.Column("session", sa.String(64), nullable=True, index=True),
+    sa.Column("words", sa.Text, nullable=True),  # what a search compares; None in rows of earlier versions
+)
+
+capture_index = sa.Table(  # what captures are found by; the capture itself is its record in the data folder
+    "eigenhead_capture_index",
+    metadata,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("session", sa.String(64), nullable=True, index=True),
+    sa.Column("label", sa.Text, nullable=False),
+    sa.Column("verdict", sa.String(16), nullable=False),
+    sa.Column("source", sa.String(16), nullable=False),
+    sa.Column("board", sa.Boolean, nullable=False),
+    sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
+    sa.Column("changed", sa.BigInteger, nullable=False),  # of its record, in ns: tells whether the row is of it still
+)
+
+session_index = sa.Table(
+    "eigenhead_session_index",
+    metadata,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("subject", sa.Text, nullable=False, index=True),  # what sessions of one person have alike
+    sa.Column("label", sa.Text, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),
+    sa.Column("changed", sa.BigInteger, nullable=False),
 )
 
 workers = sa.Table(
@@ -93,15 +120,39 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
             connection.isolation_level = "IMMEDIATE"  # a writer that starts as a reader could not wait for its turn
             connection.execute("PRAGMA busy_timeout=30000")
             connection.execute("PRAGMA journal_mode=WAL")  # kept in the file: the job engine's connections read it too
+            connection.execute("PRAGMA secure_delete=ON")  # names of people who were erased stand in no free page
             connection.execute("PRAGMA synchronous=FULL")  # WAL's default loses the last commits with the power
     else:
         patience = {"connect_timeout": CONNECT_S}
         engine = sa.create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10, connect_args=patience)
     try:
         metadata.create_all(engine)
+        _add_columns(engine)
     except SQLAlchemyError as error:
         raise DatabaseUnavailable(settings.place, error) from error
     return engine
+
+
+def _add_columns(engine: sa.Engine) -> None:
+    """Gives tables of an earlier version the columns that they lack; all of those may be empty."""
+    known = {column["name"] for column in sa.inspect(engine).get_columns(job_index.name)}
+    if job_index.c.words.name not in known:
+        with engine.begin() as connection:
+            connection.execute(sa.text(f"ALTER TABLE {job_index.name} ADD COLUMN words TEXT"))
+
+
+def scrub(engine: sa.Engine) -> None:
+    """Lets go of what removed rows have left in the database's files: names of people among it. Where somebody reads at
+    this moment, the files keep it until the next time."""
+    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        if engine.dialect.name != "sqlite":
+            connection.execute(sa.text(f"VACUUM {capture_index.name}, {session_index.name}, {job_index.name}"))
+            return
+        for _ in range(SCRUB_TRIES):
+            busy, _, _ = connection.execute(sa.text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
+            if not busy:
+                return
+            time.sleep(SCRUB_PAUSE_S)
 
 
 def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElement[bool]:

@@ -150,8 +150,11 @@ class FileEntry(TypedDict):
 
 
 class CalibrationOutcome(TypedDict):
-    """What a calibration found, as the job engine keeps it; ``sha256`` is of its cameras.json."""
+    """What a calibration found, as the job engine keeps it; ``sha256`` is of its cameras.json. Those of earlier
+    versions were not judged."""
 
+    verdict: NotRequired[str]
+    missing: NotRequired[list[str]]
     figures: Mapping[str, object]
     checks: list[Mapping[str, object]]
     warnings: list[str]

@@ -32,7 +32,13 @@ from rig.rig import Rig
 
 SUFFIX = ".silhouettes"
 PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
-ROOMS = (".", "imaging", "multiview", "silhouettes")  # of the pipeline: what silhouettes come from
+ROOMS = (
+    ".",
+    "imaging",
+    "multiview",
+    "silhouettes",
+    "silhouettes/without_plates",
+)  # of the pipeline: what silhouettes come from
 QUICK = 1  # zlib's fastest level: 35 MB become 4.7 MB in 0.2 s, and no level gets below 4
 
 Report = Callable[[str, float], None]
@@ -92,7 +98,7 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
             mask = np.unpackbits(packed, count=height * width).reshape(height, width).view(bool)
             distance = _from_steps(zlib.decompress(arrays[f"distance{number}"].tobytes()), height, width)
             name = view.pop("name")
-            listed = {field: tuple(view[field]) for field in ("cut_off", "warnings")}
+            listed = {field: tuple(view[field]) for field in ("cut_off", "warnings", "doubts")}
             found[name] = Silhouette(mask, distance, ViewQuality(**view | listed))
     return found
 

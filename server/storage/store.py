@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import structlog
 
@@ -58,11 +58,20 @@ class StoredFile:
     sha256: str
 
 
+class RecordIndex(Protocol):
+    """What is told of every record that is written or removed; ``changed``: its file's time, in ns."""
+
+    def put_capture(self, record: CaptureRecord, changed: int) -> None: ...
+    def drop_capture(self, identity: str) -> None: ...
+    def put_session(self, record: SessionRecord, changed: int) -> None: ...
+    def drop_session(self, identity: str) -> None: ...
+
+
 class Store:
     """The data folder. Every id that comes from a request passes ``is_id`` before it becomes part of a path."""
 
-    def __init__(self, data: Path) -> None:
-        self.data = data
+    def __init__(self, data: Path, index: RecordIndex | None = None) -> None:
+        self.data, self._index = data, index
         self._changing = threading.Lock()  # two changes of one record must not lose one of them
         for name in FOLDERS:
             (data / name).mkdir(parents=True, exist_ok=True)
@@ -103,6 +112,34 @@ class Store:
         """Moves ``folder`` (with ``files/`` in it) to its place, with its record."""
         write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
         move_durably(folder, self.folder("captures", record.id))
+        self._tell(record)
+
+    def found(self, kind: str, identity: str) -> CaptureRecord | SessionRecord | None:
+        """The record of a capture or session ("captures", "sessions"), if it is there and whole."""
+        with suppress(NotFound):
+            return self.capture(identity) if kind == "captures" else self.session(identity)
+        return None
+
+    def changes(self, kind: str) -> dict[str, int]:
+        """When (ns) the record of each capture or session was last written."""
+        found = {}
+        for identity in self.ids(kind):
+            with suppress(FileNotFoundError, NotADirectoryError):
+                found[identity] = self._record_path(kind, identity).stat().st_mtime_ns
+        return found
+
+    def _record_path(self, kind: str, identity: str) -> Path:
+        folder = self.folder(kind, identity)
+        return folder / "record.json" if kind == "captures" else folder.with_suffix(".json")
+
+    def _tell(self, record: CaptureRecord | SessionRecord) -> None:
+        if self._index is None:
+            return
+        if isinstance(record, CaptureRecord):
+            changed = self._record_path("captures", record.id).stat().st_mtime_ns
+            self._index.put_capture(record, changed)
+        else:
+            self._index.put_session(record, self._record_path("sessions", record.id).stat().st_mtime_ns)
 
     def capture(self, identity: str) -> CaptureRecord:
         """The record of a capture. Raises NotFound."""
@@ -137,12 +174,15 @@ class Store:
         with self._changing:
             record = change(self.capture(identity))
             write_atomically(self.folder("captures", identity) / "record.json", _encoded(CAPTURE.document(record)))
+            self._tell(record)
         return record
 
     def remove_capture(self, identity: str) -> None:
         """Removes a capture with what was kept of it: that shows a face too."""
         self.remove(self.folder("captures", identity))
         self.remove(self.cache_of(identity))
+        if self._index is not None:
+            self._index.drop_capture(identity)
 
     def cache_of(self, identity: str) -> Path:
         """Where silhouettes, thumbnails and the like of a capture are kept."""
@@ -152,6 +192,13 @@ class Store:
         path = self.folder("sessions", record.id).with_suffix(".json")
         write_atomically(path, _encoded(SESSION.document(record)))
         _sync_folder(path.parent)
+        self._tell(record)
+
+    def remove_session(self, identity: str) -> None:
+        """Removes a session's record; its captures are not its own."""
+        self.remove(self.folder("sessions", identity).with_suffix(".json"))
+        if self._index is not None:
+            self._index.drop_session(identity)
 
     def session(self, identity: str) -> SessionRecord:
         """The record of a session. Raises NotFound."""

@@ -18,13 +18,14 @@ from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
-from rig.formats.capture_folder import capture_root, read_shot, size_fault, stray_faults
+from rig.formats.capture_folder import capture_root, picture_folder, read_shot, size_fault, stray_faults
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
 from rig.plausibility import rig_faults
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import Bench, Report
+from server.tasks.photographs import calibrate_photographs, photographs_alone
 
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -40,12 +41,29 @@ def ingest_archive(
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
+    if photographs_alone(root):
+        _calibrate(root, image_pixels, report)
     described = check_capture(root, image_pixels, report)
     for name in described.inputs:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).rename(target / name)
     shutil.rmtree(unpacked)
     return described
+
+
+def _calibrate(root: Path, image_pixels: int, report: Report) -> None:
+    """Leaves cameras.json beside photographs that came alone. Raises InputError with the views that did not join."""
+    from calibration.result import CalibrationRefused
+
+    files = [path for path in picture_folder(root).rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
+    sizes = {path: picture_size(path) for path in files}  # headers, before anything is decoded
+    huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
+    if huge:
+        raise InputError("capture", [f"{fault}; at most {image_pixels:,} pixels are accepted" for fault in huge])
+    try:
+        calibrate_photographs(root, root, front=None, report=report)
+    except CalibrationRefused as refusal:
+        raise InputError("capture", list(refusal.reasons)) from refusal
 
 
 def ingest_folder(
@@ -166,7 +184,7 @@ def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
 
 
 def _images_of(root: Path, camera: str) -> list[Path]:
-    folders = [root / "images", root / "masks", root / "background", root / "background" / camera]
+    folders = [picture_folder(root), root / "masks", root / "background", root / "background" / camera]
     files = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
     files = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     return [path for path in files if path.stem == camera or path.parent == folders[3]]

@@ -7,6 +7,8 @@ from typing import Protocol
 
 from server.tasks.child import Bench, Report
 
+DONE = "done"  # the pipeline's last word, when nothing is written yet
+
 
 class CaptureWork(Protocol):
     """What a worker runs for a job: ``reconstruct_capture``, or what the setting ``work`` names in its place."""
@@ -58,6 +60,11 @@ def reconstruct_capture(
     head_model = bench.keep(f"model {name}", lambda: load_model(name))
     renderer = bench.keep("renderer", Renderer.create)
     shot, rig = read_capture(Path(capture))
-    done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=report, segment=once)
+
+    def tell(stage: str, fraction: float) -> None:
+        if stage != DONE:  # the files are still to be written
+            report(stage, fraction)
+
+    done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=once)
     report("write", 0.0)
     write_result(Path(result), done, shot)

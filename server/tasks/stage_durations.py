@@ -24,11 +24,10 @@ FIRST_S = {
     "fine": 9.0,
     "texture": 1.4,
     "bust": 24.0,
-    "atlas": 62.0,
     "evidence": 0.8,
     "write": 3.0,
 }
-"""Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine --atlas` on two cores that four
+"""Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine` on two cores that four
 other processes share. On idle ones all are three to four times shorter, which a job's own pace soon tells."""
 SIMPLEX_S = 200.0  # of the simplex's fit, at the same pace: a minute on idle cores
 LEARNING = 0.3  # weight of the newest job; the first one of its kind counts alone
@@ -37,8 +36,7 @@ LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
 
 def kind_of(settings: Settings) -> str:
     """What decides which stages a job has and how long they are: "contour photo both", say."""
-    atlas = " atlas" if settings.outputs.atlas else ""
-    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}{atlas}"
+    return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}"
 
 
 def first_guess(settings: Settings) -> dict[str, float]:
@@ -52,7 +50,6 @@ def first_guess(settings: Settings) -> dict[str, float]:
         "depth": not (fine or bust),
         "fine": not fine,
         "bust": not bust,
-        "atlas": not settings.outputs.atlas,
     }
     seconds = {stage: took for stage, took in FIRST_S.items() if not left_out.get(stage)}
     if settings.method == "simplex":
@@ -60,6 +57,18 @@ def first_guess(settings: Settings) -> dict[str, float]:
     if parts and not photographs:
         seconds["fit again"] = 0.0
     return seconds
+
+
+def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
+    """Seconds that a second of the first guess takes on this machine, by the kinds of jobs that it has done; 1 where
+    there is none."""
+    took = guessed = 0.0
+    for kind, stages in learnt.items():
+        simplex = kind.startswith("simplex")
+        known = {stage: seconds for stage, seconds in stages.items() if seconds > 0}
+        took += sum(known.values())
+        guessed += sum(SIMPLEX_S if simplex and stage == "fit" else FIRST_S[stage] for stage in known)
+    return took / guessed if took > 0 and guessed > 0 else 1.0
 
 
 class StageDurations:
@@ -71,9 +80,14 @@ class StageDurations:
         self._learnt: dict[str, dict[str, float]] = {}
 
     def of(self, settings: Settings) -> dict[str, float]:
-        """Seconds by stage, in their order."""
-        known = self._read().get(kind_of(settings), {})
-        return {stage: known.get(stage, seconds) for stage, seconds in first_guess(settings).items()}
+        """Seconds by stage, in their order. The first job of a kind goes by the guess, at the pace of the other kinds
+        that this machine has done."""
+        learnt, guess = self._read(), first_guess(settings)
+        known = learnt.get(kind_of(settings))
+        if known is None:
+            known, pace = {}, pace_of(learnt)
+            guess = {stage: pace * seconds for stage, seconds in guess.items()}
+        return {stage: known.get(stage, seconds) for stage, seconds in guess.items()}
 
     def learn(self, settings: Settings, seconds: Mapping[str, float]) -> None:
         """Takes in how long the stages of a job took."""

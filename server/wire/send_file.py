@@ -23,6 +23,7 @@ TYPES = {
     ".mtl": "model/mtl",
     ".stl": "model/stl",
     ".usdz": "model/vnd.usdz+zip",
+    ".3mf": "model/3mf",
 }
 BLOCK_BYTES = 1 << 20
 RANGE = re.compile(r"^bytes=(\d{1,18})?-(\d{1,18})?$")

@@ -42,7 +42,7 @@ from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store, move_durably
-from server.tasks.calibrate import calibrate_folder
+from server.tasks.calibrate import calibrate_folder, expected
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
@@ -179,6 +179,7 @@ class Worker:
                 meter.tick()  # asked many times a second, also where a stage reports nothing
                 return not self._states.runs(job_id)
 
+            meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
             with self._children.one() as child:
                 child.remote(self._work, report=meter.report, cancelled=cancelled)(
                     capture=str(self.store.folder("captures", request["capture_id"]) / "files"),
@@ -201,9 +202,15 @@ class Worker:
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
+        meter = ProgressMeter(self.events, identity, JobProgress(expected(folder)))
+
+        def tick() -> bool:
+            meter.tick()
+            return False
+
         try:
             with self._children.one() as child:
-                result = child.remote(calibrate_folder)(
+                result = child.remote(calibrate_folder, report=meter.report, cancelled=tick)(
                     folder=str(folder),
                     result=str(attempt),
                     previous=str(in_use) if in_use.is_file() else None,

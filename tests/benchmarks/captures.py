@@ -1,6 +1,7 @@
 """Errors of the captures with a truth beside them at every level of detail, as delivered (world frame, not realigned).
 
 python -m tests.benchmarks.captures --json
+python -m tests.benchmarks.captures --noise 6 --levels photo fine
 
 Distances from the true face region to the head's surface, mm, weighted by area; default model, the project's own masks.
 """
@@ -16,6 +17,7 @@ from pipeline.experiments.detail import read_known, surface_error
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
 from rig.render.renderer import Renderer
+from tests.support.noisy_captures import noisier
 
 LEVELS = ("span", "kernel", "photo", "fine")
 
@@ -24,15 +26,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data/captures"))
     parser.add_argument("--levels", nargs="+", choices=LEVELS, default=LEVELS)
+    parser.add_argument("--noise", type=float, default=0.0, help="levels of 255 that are added to pictures and plates")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     model, found = load_model(), {}
     with Renderer.create() as renderer:
         for truth in sorted(arguments.captures.glob("*.truth")):
             known = read_known(truth.with_suffix(""))
+            capture = noisier(known.capture, arguments.noise) if arguments.noise else known.capture
             for level in arguments.levels:
                 settings = replace(Settings(), detail=level, outputs=OutputSettings(surface="head"))
-                head = reconstruct(known.capture, known.rig, model, settings, renderer=renderer, report=lambda *_: None)
+                head = reconstruct(capture, known.rig, model, settings, renderer=renderer, report=lambda *_: None)
                 for name, value in surface_error(known, head.mesh_world).items():
                     found[f"{known.name}_{level}_{name}"] = round(value, 4)
     if arguments.json:

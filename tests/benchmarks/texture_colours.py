@@ -171,7 +171,7 @@ def background_share(
     scene: Scene, capture: Capture, mesh: Mesh, silhouettes: Mapping[str, Silhouette], settings: TextureSettings
 ) -> Float[np.ndarray, " v"]:
     """Of each vertex's colour, for the silhouettes that the photographs gave and the default blend's own weights."""
-    plain = replace(settings, balance=False, highlight=1e9)  # what remains is linear in the light
+    plain = replace(settings, balance=False, outlier=1e9)  # what remains is linear in the light
     light, depths = [], depth_maps(scene.rig, mesh)
     for level in (0.0, SCREEN):
         views = {name: replace(view, backdrop=np.full_like(view.backdrop, level)) for name, view in scene.views.items()}

@@ -208,6 +208,17 @@ def test_the_same_rig_passes_every_check(good: Session) -> None:
     assert [check.name for check in calibration.checks if check.passed is not True] == []
 
 
+def test_enough_shots_are_good_and_few_say_what_is_missing(calibrated: Calibration) -> None:
+    assert (calibrated.verdict().word, calibrated.verdict().missing) == ("good", ())
+    assert calibrated.document()["verdict"] == "good"
+    few = calibrate_detections(session(cameras=CAMERAS, shots=6, seed=5).detections)
+    assert failed(few.checks) == []  # every check passes, and it says too little all the same
+    verdict = few.verdict()
+    assert verdict.word == "poor"
+    assert "fewer than 3 views of the board" in verdict.missing[0]
+    assert any("take 15 in all" in missing for missing in verdict.missing)
+
+
 def test_the_world_frame_is_the_projects(calibrated: Calibration, good: Session) -> None:
     rig = calibrated.rig
     # Planted in the project's frame: x to the left, y up, z to the front camera (azimuth 0), cameras not rolled.

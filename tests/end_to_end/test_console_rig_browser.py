@@ -4,13 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from tests.support.board_pictures import BoardPictures
-from tests.support.browser import chromium, keep_screenshots, live_rate, visit
-from tests.support.services import RunningService, running_service
+from tests.support.browser import keep_screenshots, live_rate, visit
 from tests.support.shared_data import shared
+from tests.support.studio_pages import StudioPages, studio_pages
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -25,30 +25,18 @@ def board() -> BoardPictures:
 
 
 @pytest.fixture
-def studio(board: BoardPictures, tmp_path: Path) -> Iterator[StudioDevices]:
+def pages(board: BoardPictures, tmp_path: Path) -> Iterator[StudioPages]:
     (tmp_path / "studio").mkdir()
-    with StudioDevices(tmp_path / "studio", NAMES, board, board) as devices:
-        yield devices
-
-
-@pytest.fixture
-def browser(studio: StudioDevices) -> Iterator[Browser]:
-    """Opened after the studio and closed before it: both run an event loop of their own in this thread."""
-    with chromium() as opened:
+    with studio_pages(
+        StudioDevices(tmp_path / "studio", NAMES, board, board), tmp_path / "data", worker=True
+    ) as opened:
         yield opened
 
 
-@pytest.fixture
-def service(studio: StudioDevices, tmp_path: Path) -> Iterator[RunningService]:
-    with running_service(tmp_path / "data", console="true", rig=str(studio.folder / "rig.toml")) as running:
-        yield running
-
-
-def test_a_rig_is_calibrated_and_captures(
-    browser: Browser, service: RunningService, studio: StudioDevices, board: BoardPictures, screenshots: Path
-) -> None:
+def test_a_rig_is_calibrated_and_captures(pages: StudioPages, board: BoardPictures, screenshots: Path) -> None:
     """Faults in plain words, clean plates, board shots with their coverage on two pages, the calibration put to use, a
     capture in sync, and a camera that falls silent."""
+    browser, service, studio = pages.browser, pages.service, pages.studio
     v = visit(browser, service.url)
     page = v.go("/")
     expect(page.locator("article.tile")).to_have_count(len(NAMES))

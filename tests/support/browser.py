@@ -26,7 +26,7 @@ FLAGS = [
     "--disable-sync",
 ]
 SIZES = {"1366x768": (1366, 768), "3840x2160": (3840, 2160)}
-SEVERE = ("serious", "critical")
+WIDTHS = {1440: 900, 1024: 768, 390: 844}  # a desk, a tablet, a telephone
 LONG_MS = 240_000  # a reconstruction on a machine that does other things too
 
 
@@ -94,6 +94,21 @@ def keep_screenshots(page: Page, folder: Path, name: str) -> None:
     page.set_viewport_size({"width": SIZES["1366x768"][0], "height": SIZES["1366x768"][1]})
 
 
+def keep_widths(page: Page, folder: Path, name: str) -> None:
+    """At a desk's, a tablet's and a telephone's width: nothing is cut off at the side, nobody is kept out."""
+    folder.mkdir(parents=True, exist_ok=True)
+    before = page.viewport_size
+    for width, height in WIDTHS.items():
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(500)
+        page.screenshot(path=folder / f"{name}-{width}.png")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} is too wide at {width}"
+        found = violations(page)
+        assert not found, f"{name} at {width}: {found}"
+    if before is not None:
+        page.set_viewport_size(before)
+
+
 def live_rate(page: Page, seconds: float = 6.0) -> float:
     """Pictures a second that the slowest tile of the rig's page gets."""
     count = "[...document.querySelectorAll('article.tile')].map(t => Number(t.dataset.frames))"
@@ -111,11 +126,10 @@ def _axe_script() -> str:
 
 
 def violations(page: Page) -> list[str]:
-    """Serious and critical findings of axe-core, with where they are."""
+    """What axe-core finds, of whatever weight, and where."""
     page.evaluate(_axe_script())
     found = page.evaluate("axe.run(document, { resultTypes: ['violations'] }).then(r => r.violations)")
     return [
         f"{v['id']} ({v['impact']}): {v['help']}: " + "; ".join(node["html"][:160] for node in v["nodes"][:4])
         for v in found
-        if v["impact"] in SEVERE
     ]

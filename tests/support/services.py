@@ -165,3 +165,19 @@ def uploaded_capture(service: RunningService, folder: Path, seed: int = 0) -> st
     )
     assert answer.status_code == 201, answer.text
     return answer.json()["id"]
+
+
+def packed(folder: Path) -> bytes:
+    """An archive of a capture folder."""
+    pack_folder(folder, folder.with_suffix(".tar"))
+    return folder.with_suffix(".tar").read_bytes()
+
+
+def stored(service: RunningService) -> list[str]:
+    """Everything that lies in the data folder of captures and jobs."""
+    kinds = ("captures", "jobs", "incoming", "uploads", "trash", "set-aside")
+    return sorted(p.relative_to(service.data).as_posix() for kind in kinds for p in (service.data / kind).rglob("*"))
+
+
+def upload(http: httpx.Client, data: bytes, path: str = "/v1/captures/uploads", **fields: str) -> httpx.Response:
+    return http.post(path, files={"file": ("capture.tar", data)}, data=fields)

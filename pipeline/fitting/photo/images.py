@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.fitting.rim import Views
-from pipeline.imaging.grey import LUMINANCE, noise_level
+from pipeline.imaging.grey import LUMINANCE, blur_growth, noise_level
 from pipeline.parallel_for import thread_count
 
 LEAST_BLUR_PX = 0.7  # below that a bilinear sample is mostly interpolation error
+UNKNOWN_NOISE = 0.5  # share of the noise: the contrast of a window holds it once already
 INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
 
 
@@ -59,8 +60,11 @@ def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h 
 def blurred(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """All images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
-    sigma = np.maximum(sigma_px, LEAST_BLUR_PX)
+    """All images, blurred, in one row, and what a comparison adds to their norms for the noise that is left: white
+    noise falls by 2 sqrt(pi) sigma."""
+    growth = np.array([blur_growth(noise) for noise in photographs.noise.tolist()])
+    sigma = np.maximum(sigma_px, LEAST_BLUR_PX * growth)
     with ThreadPoolExecutor(thread_count()) as pool:
         smooth = pool.map(lambda i, s: cv2.GaussianBlur(i, (0, 0), s).ravel(), photographs.grey, sigma.tolist())
-        return np.concatenate(list(smooth)), photographs.noise / (2.0 * np.sqrt(np.pi) * sigma)
+        left = photographs.noise / (2.0 * np.sqrt(np.pi) * sigma)
+        return np.concatenate(list(smooth)), UNKNOWN_NOISE * left

@@ -1,13 +1,15 @@
 // History at the left; at the right the shots that are being taken, or the report of the chosen calibration.
 import { liveView } from "/console/static/live.js";
-import { clock, fixed, send } from "/console/static/words.js";
+import { clock, fixed, keepAddress, keepDraft, kept, send, span, stageWords } from "/console/static/words.js";
 
 export default {
   mixins: [liveView],
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ chosen: null, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000", measured_width_mm: null, inverted: false }, label: "", busy: "", over: false, upload: null }),
-  watch: { "state.board": { handler(board) { if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board); }, immediate: true },
+  data: () => ({ chosen: new URLSearchParams(location.search).get("calibration"), sure: false, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000", measured_width_mm: null, inverted: false, ...kept("board") }, label: kept("calibration name") || "", busy: "", over: false, upload: null }),
+  watch: { chosen(id) { keepAddress({ calibration: id }); this.sure = false; },
+    board: { handler(board) { keepDraft("board", board); }, deep: true }, label(text) { keepDraft("calibration name", text); },
+    "state.board": { handler(board) { if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board); }, immediate: true },
     "state.rig.kind": { handler(kind) { if (kind === "real") this.look(); }, immediate: true } }, // nobody holds a board in the simulated studio
   computed: {
     collecting() { return this.state.shots > 0; }, // then the board stays what it is
@@ -26,17 +28,17 @@ export default {
         <button class="b" :aria-pressed="!current" @click="chosen = null">New calibration</button>
         <template v-if="current"><a v-if="current.state === 'succeeded'" class="b" target="_blank" rel="noopener" :href="'/console/calibrations/' + current.id + '/report.html'">Whole report</a><a v-if="current.state === 'succeeded'" class="b" :href="'/console/calibrations/' + current.id + '/cameras.json'" download="cameras.json">cameras.json</a>
           <button class="b" :disabled="!!busy || ['queued', 'running'].includes(current.state)" @click="act('remove', { id: current.id })">Remove</button>
-          <button class="b main-action" :disabled="!!busy || current.in_use || current.state !== 'succeeded'" @click="act('use', { id: current.id })">{{ current.in_use ? 'In use' : 'Use this' }}</button></template></header>
+          <button class="b" id="use" :class="{ 'main-action': current.verdict !== 'poor' }" :disabled="!!busy || current.in_use || current.state !== 'succeeded'" @click="current.verdict === 'poor' ? (sure = true) : act('use', { id: current.id })">{{ current.in_use ? 'In use' : current.verdict === 'poor' ? 'Use this ...' : 'Use this' }}</button></template></header>
       <div class="columns" style="grid-template-columns: 19rem minmax(0, 1fr)">
         <div class="stack" style="min-height: 0">
           <div :class="['drop', { over }]">Drop board pictures here: an archive of IMAGES/ and board.toml
             <div style="margin-top: .4rem"><button class="b" @click="$refs.file.click()">Choose a file</button><input ref="file" type="file" hidden accept=".zip,.tar,.gz,.tgz" aria-label="Archive of board pictures" @change="take($event.target.files); $event.target.value = ''"></div></div>
           <div v-if="upload" class="panel pad small stack" style="gap: .3rem" role="status"><div class="line"><span class="grow cut">{{ upload.name }}</span><span class="num">{{ upload.state }}</span><button class="b quiet" aria-label="Close" @click="upload = null">&times;</button></div>
             <template v-if="upload.detail"><p class="fault">{{ upload.detail }}</p><ul class="faults"><li v-for="(e, i) in upload.errors" :key="i">{{ e }}</li></ul></template></div>
-          <div class="panel scroll grow" tabindex="0" role="region" aria-label="History of calibrations">
+          <div class="panel scroll grow" tabindex="0" role="region" aria-label="History of calibrations" data-scroll="calibrations">
             <p v-if="!state.loading && !list.length" class="muted small" style="padding: .8rem">No calibrations yet. Take board shots at the right, or drop an archive above.</p>
             <button v-for="c in list" :key="c.id" class="row-button" :data-calibration="c.id" :data-state="c.state" :aria-current="current && c.id === current.id" @click="chosen = c.id">
-              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="{ accent: c.in_use || c.state === 'running', fault: c.state === 'failed' }">{{ c.in_use ? 'in use' : c.state }}</span></span>
+              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="{ accent: c.in_use || c.state === 'running', fault: c.state === 'failed' }">{{ c.in_use ? 'in use' : c.state === 'running' ? Math.round(100 * c.progress) + ' %' : c.state === 'succeeded' && c.verdict ? c.verdict : c.state }}</span></span>
               <span class="small muted">{{ clock(c.created) }} &middot; {{ Object.keys(c.pictures).length }} cameras<template v-if="c.figures.rms_px"> &middot; {{ fixed(c.figures.rms_px, 2) }} px</template></span></button>
           </div>
         </div>
@@ -44,7 +46,11 @@ export default {
           <div class="line wrap"><h2>{{ current.label || clock(current.created) }}</h2><span class="tag" :class="{ accent: current.in_use, fault: current.state === 'failed' }">{{ current.in_use ? 'in use' : current.state }}</span></div>
           <template v-if="current.error"><p class="fault">{{ current.error.detail }}</p><ul class="faults small"><li v-for="(e, i) in current.error.errors" :key="i">{{ e }}</li></ul></template>
           <ul v-if="current.warnings.length" class="faults small"><li v-for="(w, i) in current.warnings" :key="i" class="warn">{{ w }}</li></ul>
-          <p v-if="['queued', 'running'].includes(current.state)" class="muted">The calibration is under way; its report appears here.</p>
+          <div v-if="['queued', 'running'].includes(current.state)" class="stack" role="status"><div class="line"><strong class="grow">{{ current.state === 'queued' ? 'Waiting for the worker' : stageWords(current.stage || 'detection') }}</strong><span class="num">{{ Math.round(100 * current.progress) }} %</span><span v-if="current.eta_s !== null && current.state === 'running'" class="num muted">about {{ span(current.eta_s) }} left</span></div>
+            <div class="bar" role="progressbar" aria-label="Progress of the calibration" :aria-valuenow="Math.round(100 * current.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * current.progress + '%' }"></i></div></div>
+          <div v-if="current.verdict" class="stack" id="calibration-verdict" role="region" aria-label="Verdict" :data-verdict="current.verdict" style="gap: .35rem"><div class="line wrap"><span class="tag" :class="{ good: 'good', usable: 'warn', poor: 'fault' }[current.verdict]">{{ { good: 'Good', usable: 'Usable', poor: 'Poor' }[current.verdict] }}</span><span>{{ { good: 'Every camera is known well enough.', usable: 'Enough for heads; better ones are had with what is missing.', poor: 'Not enough: heads made with it would be wrong.' }[current.verdict] }}</span></div>
+            <ul v-if="current.missing.length" class="faults small" aria-label="What is missing"><li v-for="(m, i) in current.missing" :key="i">{{ m }}</li></ul></div>
+          <div v-if="sure && current.verdict === 'poor' && !current.in_use" class="panel pad line wrap small" role="alertdialog" aria-label="Use a poor calibration" style="border-color: var(--warn)"><span class="grow warn">Every capture from now on would get cameras that are not known well enough.</span><button class="b main-action" @click="sure = false; chosen = null">Take more shots</button><button class="b" id="use-poor" :disabled="!!busy" @click="act('use', { id: current.id, poor: true })">Use it all the same</button></div>
           <template v-if="current.state === 'succeeded'">
             <div class="line wrap" style="gap: 2rem"><div><div class="small muted">Residual</div><div class="mono" style="font-size: 1.4rem">{{ fixed(current.figures.rms_px, 2) }} px</div></div><div><div class="small muted">Corners used</div><div class="mono" style="font-size: 1.4rem">{{ fixed(100 * current.figures.used_share, 1) }} %</div></div><div><div class="small muted">Front camera</div><div class="mono" style="font-size: 1.4rem">{{ current.front }}</div></div></div>
             <div class="columns" style="grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); flex: none">
@@ -76,10 +82,10 @@ export default {
         </div>
       </div>
     </section>`,
-  created() { this.clock = clock; this.fixed = fixed; },
+  created() { Object.assign(this, { clock, fixed, span, stageWords }); },
   methods: {
     act(name, more) { this.busy = name; this.$emit("act", { name, ...more }); },
-    acted() { this.busy = ""; },
+    acted(name, done) { this.busy = ""; if (name === "use" && done) this.sure = false; if (name === "calibrate" && done) this.label = ""; },
     async take(files) {
       const file = files[0];
       if (!file) return;

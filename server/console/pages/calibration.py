@@ -79,6 +79,12 @@ class CalibrateForm(TypedDict):
     label: NotRequired[str | None]
 
 
+class UseForm(Chosen):
+    """``poor``: the operator has read what it lacks."""
+
+    poor: NotRequired[bool]
+
+
 class CalibrationPage(Page, component="calibration.js"):
     def look(self) -> CalibrationState:
         return shared.get("calibration page", 0.4, lambda: calibration_state(self.service))
@@ -130,7 +136,7 @@ def shoot(page: Page, event: BoardForm) -> str:
         found = child.remote(detect_shot)(files=str(files), board=board)
     seen = sum(bool(corners) for corners in found.values())
     if not seen:
-        service.store.remove(service.store.folder("captures", identity))
+        service.store.remove_capture(identity)
         detail = "No camera saw the board; the shot was not kept. Check columns, rows and kind, and hold it in view."
         raise Unusable("no-board", detail)
     shots.add(board, identity, found)
@@ -159,8 +165,8 @@ def calibrate(page: Page, event: CalibrateForm) -> str:
     return "The calibration is queued."
 
 
-def use(page: Page, event: Chosen) -> str:
-    page.service.use_calibration(event["id"])
+def use(page: Page, event: UseForm) -> str:
+    page.service.use_calibration(event["id"], poor=event.get("poor", False))
     _forget()
     return "Every capture from now on gets this calibration."
 
@@ -188,5 +194,5 @@ CalibrationPage.actions = {
 
 
 @ui.page("/calibration")
-async def calibration_page() -> RedirectResponse | None:
-    return await show("calibration", CalibrationPage)
+async def calibration_page(calibration: str = "") -> RedirectResponse | None:
+    return await show("calibration", CalibrationPage, calibration=calibration)

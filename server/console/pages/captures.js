@@ -1,23 +1,25 @@
 // Sessions and captures at the left, the pictures of the chosen one at the right.
+import { Pager, paged } from "/console/static/list.js";
 import { Outline, Verdict, checksOf, faultsOf, verdictTag } from "/console/static/verdict.js";
-import { clock, keepAddress, keepSession, openSession, send, sessionName, size } from "/console/static/words.js";
+import { clock, keepDraft, keepSession, kept, openSession, send, sessionName, size, typing } from "/console/static/words.js";
+
+const asked = new URLSearchParams(location.search);
 
 export default {
-  mixins: [checksOf],
-  components: { Outline, Verdict },
+  mixins: [checksOf, paged],
+  components: { Outline, Pager, Verdict },
   props: { state: Object },
-  emits: ["act"],
-  data: () => ({ chosen: new URLSearchParams(location.search).get("capture"), sought: new URLSearchParams(location.search).get("find") || "", outlines: false, drawing: 0, large: null, removal: null, over: false, uploads: [], busy: "", session: openSession(), form: null, erasing: false, draft: {}, writing: false, method: "", model: "" }),
+  emits: ["act", "choose"],
+  data: () => ({ chosen: asked.get("capture") || "", verdict: asked.get("verdict") || "", sort: asked.get("sort") || "", outlines: false, drawing: 0, large: null, removal: null, sure: false, over: false, uploads: [], busy: "", session: asked.get("session") || openSession(), form: kept("captures form"), erasing: false, draft: {}, writing: false, method: "", model: "" }),
   computed: {
     sessions() { return this.state.sessions || []; },
     open() { return this.sessions.find((s) => s.id === this.session) || null; },
-    captures() {
-      const words = this.sought.toLowerCase().split(/\s+/).filter(Boolean);
-      const told = (c) => [c.label, c.expression, this.name(this.sessions.find((s) => s.id === c.session)), c.verdict, c.source, c.id, c.job?.state].filter(Boolean).join(" ").toLowerCase();
-      return (this.state.captures || []).filter((c) => (!this.open || c.session === this.open.id) && words.every((word) => told(c).includes(word)));
-    },
+    captures() { return this.state.captures || []; },
+    listed() { return this.captures; },
     models() { return this.state.models || []; },
-    current() { return this.captures.find((c) => c.id === this.chosen) || this.captures[0] || null; },
+    current() { return this.state.chosen || null; },
+    preset() { return (this.state.presets || []).find((p) => p.id === this.method); },
+    narrowed() { return !!(this.sought || this.verdict); },
   },
   watch: {
     sessions: { handler(all) {
@@ -25,15 +27,20 @@ export default {
       if (made) { this.session = made.id; this.begun = null; }
       else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
     }, immediate: true },
-    session(id) { keepSession(id); this.erasing = false; this.large = null; },
+    session(id) { keepSession(id); this.erasing = false; this.large = null; this.chosen = ""; this.first(); },
     "current.id": { handler(id) { this.readChecks(id); if (id) this.keepAddress(); }, immediate: true },
-    sought() { this.keepAddress(); },
-    current: { handler(c) { if (!this.writing) this.draft = c ? { label: c.label, expression: c.expression, session: c.session || "" } : {}; }, immediate: true },
+    verdict() { this.first(); }, sort() { this.first(); },
+    form: { handler(form) { keepDraft("captures form", form); }, deep: true },
+    current: { handler(c) {
+      if (this.writing) return;
+      const mine = kept("capture draft"); // typed before a reload, and not sent
+      this.draft = !c ? {} : mine?.id === c.id ? mine : { label: c.label, expression: c.expression, session: c.session || "" };
+    }, immediate: true },
   },
   template: `
     <section class="page" aria-label="Captures" @dragover.prevent="over = true" @dragleave="over = false" @drop.prevent="drop">
       <header>
-        <h1>Captures</h1><span class="lead">{{ state.loading ? 'Reading' : captures.length + (captures.length === 1 ? ' capture' : ' captures') }}</span>
+        <h1>Captures</h1><span class="lead">{{ state.loading ? 'Reading' : state.total + (state.total === 1 ? ' capture' : ' captures') }}</span>
         <template v-if="current">
           <template v-if="!current.board">
             <button class="b" :aria-pressed="outlines" @click="outlines = !outlines">Silhouettes</button>
@@ -68,30 +75,44 @@ export default {
             <div v-if="!u.done" class="bar" role="progressbar" :aria-valuenow="Math.round(100 * u.share)" aria-valuemin="0" aria-valuemax="100" :aria-label="'Upload of ' + u.name"><i :style="{ width: 100 * u.share + '%' }"></i></div>
             <template v-if="u.detail"><p class="fault">{{ u.detail }}</p><ul class="faults scroll" style="max-height: 14rem"><li v-for="(f, i) in u.errors" :key="i">{{ f }}</li></ul></template>
           </div>
-          <input v-model="sought" id="find" type="search" placeholder="Find: label, session, verdict, id" aria-label="Find captures">
-          <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures">
-            <button v-for="c in captures" :key="c.id" class="row-button" :aria-current="current && c.id === current.id" @click="chosen = c.id">
-              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span class="tag" :class="tag(c).kind">{{ tag(c).text }}</span></span>
+          <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, verdict, id" aria-label="Find captures"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
+          <div class="line"><select v-model="verdict" id="verdict" class="grow" aria-label="Verdict"><option value="">every verdict</option><option value="good">good</option><option value="usable">usable</option><option value="poor">poor</option><option value="none">not judged</option></select>
+            <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="label">by label</option><option value="verdict">by verdict</option><option value="-bytes">largest first</option></select></div>
+          <div v-if="picking" class="panel pad stack small" role="region" aria-label="Selected captures">
+            <div class="line wrap"><strong>{{ picked.length }} selected</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button></div>
+            <div class="line wrap"><button class="b" id="bulk-reconstruct" :disabled="!picked.length || !!busy" @click="bulk('reconstruct', '', { method, model })">Reconstruct</button>
+              <select aria-label="Move to a session" id="bulk-move" :disabled="!picked.length || !!busy" @change="bulk('move', $event.target.value === 'none' ? '' : $event.target.value); $event.target.value = ''"><option value="">Move to ...</option><option value="none">no session</option><option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option></select>
+              <button class="b" id="bulk-remove" :disabled="!picked.length || !!busy" @click="bulk('remove')">Remove the pictures</button><button class="b danger" id="bulk-erase" :disabled="!picked.length || !!busy" @click="sure = true">Erase ...</button></div>
+            <div v-if="sure && picked.length" class="stack" style="gap: .4rem" role="alertdialog" aria-label="Erase the selected captures"><p class="warn">Erase {{ picked.length }} {{ picked.length === 1 ? 'capture' : 'captures' }} with pictures, heads, jobs and every record of them? It cannot be taken back.</p>
+              <div class="line"><button class="b danger" id="bulk-erase-for-good" :disabled="!!busy" @click="bulk('erase')">Erase for good</button><button class="b quiet" @click="sure = false">Keep</button></div></div></div>
+          <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures" data-scroll="captures" @keydown="walk">
+            <div v-for="c in captures" :key="c.id" class="row-line"><input v-if="picking" type="checkbox" :value="c.id" v-model="picked" :aria-label="'Select ' + (c.label || clock(c.created))">
+            <button class="row-button" :data-capture="c.id" :aria-current="current && c.id === current.id" @click="choose(c.id)">
+              <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span v-if="tags(c).length === 1" class="tag" :class="tags(c)[0].kind">{{ tags(c)[0].text }}</span></span>
+              <span v-if="tags(c).length > 1" class="line wrap" style="gap: .3rem"><span v-for="t in tags(c)" :key="t.text" class="tag" :class="t.kind">{{ t.text }}</span></span>
               <span class="small muted">{{ clock(c.created) }} &middot; {{ c.source === 'rig' ? 'rig' : 'upload' }} &middot; {{ c.cameras.length }} cameras &middot; {{ size(c.bytes) }}</span>
               <span v-if="c.session || c.expression || c.features" class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression, c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
-            </button>
+            </button></div>
+            <pager :behind="behind.length" :next="state.next" :size="captures.length" :total="state.total" @back="back" @forward="forward"></pager>
           </div>
         </div>
         <div class="panel pad scroll" style="position: relative" tabindex="0" role="region" aria-label="Pictures">
           <div v-if="!state.loading && !current" class="empty" style="height: 100%; align-content: center">
-            <h2>{{ sought ? 'No capture matches' : open ? 'No captures in this session yet' : 'No captures yet' }}</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
-            <a class="b main-action" href="/">Go to the rig</a></div>
+            <h2>{{ narrowed ? 'No capture matches' : open ? 'No captures in this session yet' : 'No captures yet' }}</h2><p>Take one with the rig, or drop an archive of images, clean plates and cameras.json anywhere on this page.</p>
+            <div class="line wrap" style="justify-content: center"><a class="b main-action" href="/">Go to the rig</a><button v-if="!narrowed && !open" class="b" id="sample" :disabled="!!busy" @click="act('sample', '')">{{ busy === 'sample' ? 'Drawing the studio ...' : 'Try a sample capture' }}</button></div></div>
           <div v-if="removal && current && removal.id === current.id" class="panel pad stack small" role="alertdialog" aria-label="Remove the capture" id="removal" style="border-color: var(--warn); margin-bottom: .7rem">
             <p><strong>Remove</strong> takes the {{ removal.pictures }} pictures with clean plates and caches ({{ size(removal.bytes) }}); it can be taken back for 10 s. <strong v-if="removal.heads.length" class="warn">{{ removal.heads.length }} {{ removal.heads.length === 1 ? 'head' : 'heads' }} ({{ size(removal.head_bytes) }}) with photographs of the face in the overlays would stay.</strong><span v-else>No head was made of it.</span></p>
             <p><strong>Erase for good</strong> takes {{ ['the pictures', removal.heads.length && (removal.heads.length === 1 ? 'the head' : 'all ' + removal.heads.length + ' heads'), removal.jobs.length && 'all other jobs'].filter(Boolean).join(', ') }} and every record of them. It cannot be taken back.</p>
             <div class="line wrap"><button class="b" id="keep-capture" @click="removal = null">Keep</button><button class="b" id="remove-pictures" :disabled="!!busy || removal.active.length > 0" :title="removal.active.length ? 'Jobs that are queued or running need it' : ''" @click="act('remove', current.id); removal = null">Remove the pictures</button><button class="b danger" id="erase-capture" :disabled="!!busy" @click="act('erase_capture', current.id); removal = null">Erase for good</button></div></div>
-          <form v-if="current && large === null" class="line wrap" style="align-items: end; margin-bottom: .7rem" aria-label="About the capture" @submit.prevent @focusin="writing = true" @focusout="writing = false">
+          <form v-if="current && large === null" class="line wrap" style="align-items: end; margin-bottom: .7rem" aria-label="About the capture" @submit.prevent @focusin="writing = true" @focusout="writing = false" @input="keepDraft('capture draft', { ...draft, id: current.id })" @change="keepDraft('capture draft', null)">
             <label class="field grow">Label<input v-model="draft.label" maxlength="500" :placeholder="clock(current.created)" @change="act('edit', current.id, { label: draft.label })"></label>
             <label class="field grow">Expression<input v-model="draft.expression" maxlength="500" placeholder="neutral, smile ..." @change="act('edit', current.id, { expression: draft.expression })"></label>
             <label class="field">Session<select v-model="draft.session" style="max-width: 11rem" @change="act('edit', current.id, { session: draft.session || null })"><option value="">none</option><option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option></select></label>
-            <label class="field">Solver<select v-model="method" id="method"><option value="">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
+            <label class="field" :title="preset?.explanation">Settings<select v-model="method" id="method" aria-describedby="preset"><option v-for="p in state.presets" :key="p.id" :value="p.id">{{ p.title }}</option></select></label>
             <label v-if="models.length > 1" class="field">Model<select v-model="model" id="model"><option value="">default</option><option v-for="m in models.filter(m => m !== 'default')" :key="m">{{ m }}</option></select></label>
           </form>
+          <p v-if="current && large === null && !current.board && preset" id="preset" class="small muted" style="margin-bottom: .7rem">{{ preset.explanation }}</p>
+          <p v-if="current && large === null && current.jobs.length" class="line wrap small" id="jobs-of-capture" style="margin-bottom: .7rem"><span class="muted">Jobs</span><a v-for="j in current.jobs.slice(0, 12)" :key="j.id" class="tag" :class="jobKind(j)" :href="j.state === 'succeeded' ? '/result/' + j.id : '/jobs?job=' + j.id">{{ j.state === 'succeeded' ? 'head' : j.state }} {{ j.progress === null ? j.id.slice(-6) : Math.round(100 * j.progress) + ' %' }}</a><a v-if="current.jobs.length > 12" :href="'/jobs?find=' + current.id">all {{ current.jobs.length }}</a></p>
           <verdict v-if="current && large === null && !current.board" :capture="current" style="margin-bottom: .7rem"></verdict>
           <div v-if="current && large === null" class="thumbs four">
             <button v-for="(camera, i) in current.cameras" :key="current.id + camera" class="thumb" style="padding: 0; border: 0; cursor: zoom-in" :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }" :aria-label="'Enlarge ' + camera" @click="large = i">
@@ -107,7 +128,7 @@ export default {
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, size, faultsOf, verdictTag }); },
+  created() { Object.assign(this, { clock, size, keepDraft, faultsOf, verdictTag }); },
   mounted() { window.addEventListener("keydown", this.key); },
   unmounted() { window.removeEventListener("keydown", this.key); },
   methods: {
@@ -120,20 +141,25 @@ export default {
     acted(name, done) {
       this.busy = "";
       if (name === "new_session" && done) this.form = null;
+      if (name === "bulk") { this.sure = false; this.picked = this.picked.filter((id) => this.captures.some((c) => c.id === id)); }
     },
-    keepAddress() { keepAddress({ capture: this.current?.id, find: this.sought }); },
+    fields() { return { capture: this.current?.id, find: this.sought, verdict: this.verdict, sort: this.sort }; },
+    question() { return { ...this.fields(), capture: this.chosen, session: this.session, after: this.behind.at(-1) || "" }; },
+    bulk(action, id, more) { this.busy = "bulk"; this.$emit("act", { name: "bulk", action, id: id || "", ids: [...this.picked], ...more }); },
     name(session) { return sessionName(session, this.sessions); },
-    count(id) { return (this.state.captures || []).filter((c) => c.session === id).length; },
+    count(id) { return this.sessions.find((s) => s.id === id)?.captures || 0; },
     begin() { this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) }; this.act("new_session", "", this.form); },
-    tag(c) {
-      if (!c.job) return { text: "new", kind: "" };
-      if (c.job.state === "running") return { text: `${Math.round(100 * c.job.progress)} %`, kind: "accent" };
-      return { text: c.job.state, kind: c.job.state === "failed" ? "fault" : c.job.state === "succeeded" ? "accent" : "" };
+    tags(c) { // all its jobs: heads, what is under way, what failed
+      const of = (state) => c.jobs.filter((j) => j.state === state), heads = of("succeeded").length, running = of("running"), failed = of("failed").length;
+      const told = [running.length && { text: `${Math.round(100 * (running[0].progress || 0))} %`, kind: "accent" }, of("queued").length && { text: of("queued").length === 1 ? "queued" : `${of("queued").length} queued`, kind: "" },
+        heads && { text: heads === 1 ? "head" : `${heads} heads`, kind: "good" }, failed && { text: failed === 1 ? "failed" : `${failed} failed`, kind: "fault" }].filter(Boolean);
+      return told.length ? told : [{ text: "new", kind: "" }];
     },
+    jobKind(j) { return { succeeded: "good", running: "accent", failed: "fault" }[j.state] || ""; },
     failed() { if (this.outlines) { this.outlines = false; window.eigenheadSay("fault", "No silhouettes: a camera of this capture has neither a usable clean plate nor a mask."); } },
     step(by) { this.large = (this.large + by + this.current.cameras.length) % this.current.cameras.length; },
     key(event) {
-      if (this.large === null) return;
+      if (this.large === null || typing(event)) return;
       if (event.key === "Escape") this.large = null;
       else if (event.key === "ArrowLeft") this.step(-1);
       else if (event.key === "ArrowRight") this.step(1);
@@ -148,7 +174,7 @@ export default {
           mine.share = share; mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking";
         });
         mine.done = true;
-        if (status === 201) { this.chosen = document.id; this.uploads = this.uploads.filter((u) => u.id !== mine.id); window.eigenheadSay("done", `${file.name} is here.`); }
+        if (status === 201) { this.choose(document.id); this.uploads = this.uploads.filter((u) => u.id !== mine.id); window.eigenheadSay("done", `${file.name} is here.`); }
         else { mine.state = "refused"; mine.detail = document.detail; mine.errors = document.errors || []; }
       }
     },

@@ -1,8 +1,9 @@
 """Captures: what there is, uploads, silhouettes over the images, jobs to start, removal with undo."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
-from typing import NotRequired, TypedDict, cast
+from typing import NotRequired, TypedDict, cast, get_args
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
@@ -10,21 +11,31 @@ from starlette.responses import RedirectResponse
 from pipeline.eigenheads.model_names import list_models
 from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
 from rig.errors import InputError
-from server.console.page import Action, Chosen, Page, remove_later, shared, show
+from server.console.identity import permit
+from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
+from server.errors import NotFound, Unusable
+from server.services.bulk import each
 from server.services.captures import TEXT_MOST, About
-from server.services.jobs import Work
+from server.services.presets import PRESETS, settings_of
+from server.services.records import Session
 from server.services.service import Service
+from server.services.work import Work
+from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
-SHOWN = 500
+SHOWN = 50  # captures of a page
+ASKED = ("find", "session", "verdict", "sort", "after", "capture")
+SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
 
 
-class LatestJob(TypedDict):
+class JobOfCapture(TypedDict):
+    """``progress`` (0 to 1) of one that runs."""
+
     id: str
     state: str
-    progress: float
+    progress: float | None
 
 
 class SyncLine(TypedDict):
@@ -35,7 +46,7 @@ class SyncLine(TypedDict):
 
 
 class CaptureLine(TypedDict):
-    """A capture in the list; ``size`` is that of its first camera's pictures, ``job`` its newest."""
+    """A capture in the list; ``size`` is that of its first camera's pictures, ``jobs`` all of it, newest first."""
 
     id: str
     created: str
@@ -47,7 +58,7 @@ class CaptureLine(TypedDict):
     cameras: list[str]
     bytes: int
     session: str | None
-    job: LatestJob | None
+    jobs: list[JobOfCapture]
     board: bool
     size: dict[str, str | int]
     sizes: dict[str, tuple[int, int]]
@@ -57,19 +68,36 @@ class CaptureLine(TypedDict):
 
 
 class SessionLine(TypedDict):
+    """``captures``: how many."""
+
     id: str
     created: str
     label: str
     consent: str
+    captures: int
+
+
+class PresetLine(TypedDict):
+    id: str
+    title: str
+    explanation: str
 
 
 class CapturesState(TypedDict):
+    """One page of captures; ``chosen`` is the one that is looked at, which may lie on another page."""
+
     captures: list[CaptureLine]
+    chosen: CaptureLine | None
+    next: str | None
+    total: int
     sessions: list[SessionLine]
     models: list[str]
+    presets: list[PresetLine]
 
 
 class WorkForm(Chosen):
+    """``method`` is a preset's id."""
+
     model: NotRequired[str | None]
     method: NotRequired[str | None]
 
@@ -89,31 +117,55 @@ class SessionEditForm(Chosen, SessionForm):
     pass
 
 
+class BulkForm(WorkForm):
+    """An action on all ``ids``; ``id`` is the session of move, empty for none."""
+
+    ids: list[str]
+    action: str
+
+
 class CapturesPage(Page, component="captures.js"):
     def look(self) -> CapturesState:
-        return shared.get("captures", 0.3, lambda: captures_state(self.service))
+        asked = {
+            name: self.choice.get(name) or None for name in ("find", "session", "verdict", "sort", "after", "capture")
+        }
+        return shared.get(("captures", *asked.values()), 0.3, lambda: captures_state(self.service, asked))
 
 
-def captures_state(service: Service) -> CapturesState:
-    """Captures, newest first, with the newest job of each."""
-    jobs: dict[str | None, LatestJob] = {}
-    for job in service.jobs.find(limit=SHOWN):
-        jobs.setdefault(job.capture_id, {"id": job.id, "state": job.state, "progress": job.progress})
-    captures: list[CaptureLine] = []
-    for record in service.store.captures():
-        if record.id in removals:
-            continue
-        captures.append(capture_line(record, jobs.get(record.id)))
-        if len(captures) == SHOWN:
-            break
+def captures_state(service: Service, asked: Mapping[str, str | None]) -> CapturesState:
+    """A page of the captures that are sought, with the jobs of each."""
+    order = cast(CaptureOrder, asked["sort"] if asked["sort"] in get_args(CaptureOrder) else "-created")
+    query = CaptureQuery(asked["find"] or "", asked["session"], asked["verdict"], order=order)
+    found = service.captures.page(query, SHOWN, asked["after"])
+    records = [record for record in found.items if record.id not in removals]
+    chosen = [record for record in service.captures.of([asked["capture"] or ""]) if record.id not in removals]
+    jobs = jobs_of(service, [record.id for record in (*records, *chosen)])
+    lines = [capture_line(record, jobs[record.id]) for record in records]
     return {
-        "captures": captures,
-        "sessions": sessions_list(service),
+        "captures": lines,
+        "chosen": capture_line(chosen[0], jobs[chosen[0].id]) if chosen else next(iter(lines), None),
+        "next": found.next,
+        "total": found.total - (len(found.items) - len(records)),
+        "sessions": sessions_list(service, asked["session"]),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
+        "presets": [{"id": p.id, "title": p.title, "explanation": p.explanation} for p in PRESETS],
     }
 
 
-def capture_line(record: CaptureRecord, job: LatestJob | None) -> CaptureLine:
+def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
+    """Every job of some captures, newest first, with the progress of those that run."""
+    found = service.jobs.of_captures(captures)
+    running = [job for jobs in found.values() for job, state in jobs if state == "running"]
+    progress = {job.id: job.progress for job in service.jobs.of(running)}
+    return {
+        capture: [
+            {"id": job, "state": state, "progress": progress.get(job)} for job, state in jobs if job not in removals
+        ]
+        for capture, jobs in found.items()
+    }
+
+
+def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine:
     return {
         "id": record.id,
         "created": record.created,
@@ -125,7 +177,7 @@ def capture_line(record: CaptureRecord, job: LatestJob | None) -> CaptureLine:
         "cameras": [camera.name for camera in record.cameras],
         "bytes": record.bytes,
         "session": record.session,
-        "job": job,
+        "jobs": jobs,
         "board": record.board,
         "size": asdict(record.cameras[0]),
         "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
@@ -152,12 +204,27 @@ def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | Sim
     return certificate.get("cameras", {})
 
 
-def sessions_list(service: Service) -> list[SessionLine]:
-    """Newest first."""
-    return [
-        {"id": record.id, "created": record.created, "label": record.label, "consent": record.consent}
-        for record in service.store.sessions()
-    ]
+def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLine]:
+    """The newest ones, newest first, and the chosen one where it is older."""
+
+    def make() -> list[Session]:
+        return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
+
+    sessions = shared.get("sessions", 0.5, make)
+    if chosen and all(session.id != chosen for session in sessions):
+        with suppress(NotFound):
+            sessions = [*sessions, service.sessions.get(chosen)]
+    return [session_line(session) for session in sessions]
+
+
+def session_line(session: Session) -> SessionLine:
+    return {
+        "id": session.id,
+        "created": session.created,
+        "label": session.label,
+        "consent": session.consent,
+        "captures": sum(capture not in removals for capture in session.captures),
+    }
 
 
 def reconstruct(page: Page, event: WorkForm) -> str:
@@ -172,22 +239,28 @@ def reconstruct_session(page: Page, event: WorkForm) -> str:
 
 
 def chosen_work(event: WorkForm) -> Work:
-    """Model and solver of the form; what is not chosen is the service's default."""
-    method = event.get("method")
-    settings = {"method": method} if method else {}
-    return Work(event.get("model") or None, settings)
+    """Model and preset of the form; what is not chosen is the service's default."""
+    return Work(event.get("model") or None, settings_of(event.get("method")))
+
+
+def sample(page: Page, event: object) -> str:
+    """A capture of the simulated studio, for who has no pictures yet."""
+    record = page.service.captures.sample()
+    page.choice["capture"] = record.id
+    forget_captures()
+    return "A sample capture of the simulated studio is here: press Reconstruct."
 
 
 def edit(page: Page, event: EditForm) -> None:
     given: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     About.of({name: given[name] for name in given if name != "session"})
     page.service.captures.edit(event["id"], given)
-    shared.forget("captures")
+    forget_captures()
 
 
 def new_session(page: Page, event: SessionForm) -> str:
     made = page.service.sessions.add(*session_texts(event.get("label", ""), event.get("consent", "")))
-    shared.forget("captures")
+    forget_captures()
     return f"Session {made.label or made.id[-6:]}: what is taken or uploaded now belongs to it."
 
 
@@ -195,7 +268,7 @@ def edit_consent(page: Page, event: SessionEditForm) -> None:
     given = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
     session_texts(*given.values())
     page.service.sessions.edit(event["id"], label=given.get("label"), consent=given.get("consent"))
-    shared.forget("captures")
+    forget_captures()
 
 
 def erase(page: Page, event: Chosen) -> str:
@@ -219,6 +292,37 @@ def discard(page: Page, event: Chosen) -> None:
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 
+def bulk(page: Page, event: BulkForm) -> str | None:
+    """One action on the captures that are ticked; what is refused to some is told with its reasons."""
+    service, ids, action = page.service, event["ids"], event["action"]
+    if action == "reconstruct":
+        permit(page.caller, "submit")
+        work = chosen_work(event)
+        done = each(ids, lambda capture: service.jobs.submit(capture, work, key=page.caller.key))
+    elif action == "move":
+        done = each(ids, lambda capture: service.captures.edit(capture, {"session": event["id"] or None}))
+    elif action == "erase":
+        done = each(ids, service.captures.erase)
+    else:
+        done = each(ids, service.captures.check_unused)
+        heads = sum(len(service.captures.holdings(capture).heads) for capture in done.done)
+        title = f"the pictures of {len(done.done)} captures" + (
+            f"; {heads} heads with overlay photographs stay" if heads else ""
+        )
+        if done.done:
+            remove_all_later(done.done, service.captures.remove, title, "capture")
+    forget_captures()
+    said = {"reconstruct": "queued", "move": "moved", "erase": "erased for good", "remove": "removed"}[action]
+    if done.refused:
+        told = [f"{one.id[-6:]}: {one.detail}" for one in done.refused]
+        raise Unusable("some-refused", f"{len(done.done)} {said}, {len(told)} refused.", told)
+    return f"{len(done.done)} {'capture' if len(done.done) == 1 else 'captures'} {said}."
+
+
+def forget_captures() -> None:
+    shared.forget("captures", "sessions")
+
+
 def session_texts(*texts: str) -> tuple[str, ...]:
     """Raises InputError for texts that are too long."""
     if any(len(text) > TEXT_MOST for text in texts):
@@ -235,9 +339,14 @@ CapturesPage.actions = {
     "erase": Action("capture", erase),
     "erase_capture": Action("capture", erase_capture),
     "remove": Action("capture", discard),
+    "bulk": Action("capture", bulk),
+    "sample": Action("capture", sample),
 }
 
 
 @ui.page("/captures")
-async def captures_page() -> RedirectResponse | None:
-    return await show("captures", CapturesPage)
+async def captures_page(
+    capture: str = "", find: str = "", session: str = "", verdict: str = "", sort: str = ""
+) -> RedirectResponse | None:
+    asked = {"capture": capture, "find": find, "session": session, "verdict": verdict, "sort": sort}
+    return await show("captures", CapturesPage, **asked)

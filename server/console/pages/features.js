@@ -1,21 +1,27 @@
 // Up to four views side by side; what is drawn over them is in pixels of the image, pixel (0, 0) being a centre.
-import { clock, typing } from "/console/static/words.js";
+import { clock, keepAddress, typing } from "/console/static/words.js";
 
 const TITLES = { exocanthion_right: "Right eye, outer corner", exocanthion_left: "Left eye, outer corner", pronasale: "Tip of the nose", subnasale: "Below the nose",
   cheilion_right: "Right corner of the mouth", cheilion_left: "Left corner of the mouth", gnathion: "Underside of the chin" };
 const ZOOM = 5, LENS_REM = 11;
 const GRAB_SHARE = 0.012; // of the image's width: who drags from so near carries the point, or the model's landmark
 const DRAG_PX = 3; // of the screen, which the pointer moves before a click is a drag
+const SEVEN = 7;
 const VIEWS_LEAST = 2, POINTS_LEAST = 3;
 
 export default {
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ at: 0, chosen: {}, lens: null, drag: null, count: 4, busy: "", pending: {}, sent: 0 }),
+  watch: {
+    point: { handler(name) { if (name) { this.$emit("choose", { point: name }); keepAddress({ point: this.at }); } }, immediate: true },
+  },
+  data: () => ({ at: Number(new URLSearchParams(location.search).get("point")) || 0, all: false, chosen: {}, lens: null, drag: null, count: 4, busy: "", pending: {}, sent: 0 }),
   computed: {
     capture() { return this.state.capture; },
     names() { return this.capture?.names || []; },
     point() { return this.names[this.at]; },
+    offered() { return this.names.map((name, i) => ({ name, i })).filter(({ name, i }) => i < SEVEN || this.all || i === this.at || Object.keys(this.capture.points[name] || {}).length); },
+    wrong() { return Object.entries(this.capture?.contradictions || {}); },
     sizes() { return Object.fromEntries((this.capture?.cameras || []).map((c) => [c.name, c])); },
     views() { return (this.capture?.views || []).slice(0, this.count).map((name, i) => this.chosen[i] || name); },
     ready() { return this.names.filter((n) => Object.keys(this.capture.points[n] || {}).length >= VIEWS_LEAST).length; },
@@ -33,12 +39,17 @@ export default {
         <template v-if="capture"><span class="group" role="group" aria-label="Number of views"><button v-for="n in [3, 4]" :key="n" class="b" :aria-pressed="count === n" @click="count = n">{{ n }} views</button></span>
         <button class="b" id="save" :disabled="!capture.dirty || !!busy" @click="act('save')">Save <kbd>S</kbd></button>
         <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct')">{{ ready ? 'Reconstruct' : 'Skip and reconstruct' }}</button></template></header>
+      <div v-if="capture && capture.asked && wrong.length" class="panel pad stack small" role="alertdialog" aria-label="Points contradict each other" id="contradictions" style="border-color: var(--warn)">
+        <p><strong class="warn">Not saved yet: views contradict each other.</strong> A job would leave these out. Right and left confused, or another point clicked?</p>
+        <ul class="faults"><li v-for="[name, text] in wrong" :key="name"><button class="b quiet" @click="at = names.indexOf(name)">{{ title(name) }}</button> {{ text }}</li></ul>
+        <div class="line wrap"><button class="b main-action" @click="at = names.indexOf(wrong[0][0])">Look at them</button><button class="b" id="save-anyway" :disabled="!!busy" @click="act('save', { sure: true })">Save all the same</button></div></div>
       <div v-if="!state.loading && !capture" class="panel grow" style="display: grid"><div class="empty"><h2>{{ state.asked ? 'This capture is not there' : 'No captures yet' }}</h2><p>Points are picked in the pictures of a capture.</p><a class="b main-action" :href="state.asked ? '/captures' : '/'">{{ state.asked ? 'Go to captures' : 'Go to the rig' }}</a></div></div>
       <div v-else-if="capture" class="columns" style="grid-template-columns: 15rem minmax(0, 1fr)">
-        <div class="panel scroll" tabindex="0" role="region" aria-label="The seven points">
-          <button v-for="(name, i) in names" :key="name" class="row-button" :data-point="name" :aria-current="i === at" @click="at = i">
-            <span class="line"><kbd>{{ i + 1 }}</kbd><span class="grow">{{ title(name) }}</span></span>
-            <span class="small muted line"><span class="grow">{{ placed(name) }}</span><span v-if="worst(name) !== null" class="num" :class="{ warn: worst(name) > 3 }">{{ worst(name).toFixed(1) }} px</span></span></button>
+        <div class="panel scroll" tabindex="0" role="region" aria-label="The points" data-scroll="points">
+          <button v-for="{ name, i } in offered" :key="name" class="row-button" :data-point="name" :aria-current="i === at" @click="at = i">
+            <span class="line"><kbd v-if="i < 7">{{ i + 1 }}</kbd><span class="grow">{{ title(name) }}</span></span>
+            <span class="small muted line"><span class="grow">{{ placed(name) }}</span><span v-if="capture.contradictions[name]" class="tag fault" :title="capture.contradictions[name]">contradicts</span><span v-if="worst(name) !== null" class="num" :class="{ warn: worst(name) > 3 }">{{ worst(name).toFixed(1) }} px</span></span></button>
+          <button class="b quiet small" style="margin: .5rem .75rem 0" :aria-pressed="all" @click="all = !all">{{ all ? 'The seven points alone' : 'All 26 points' }}</button>
           <p class="small muted" style="padding: .7rem .75rem">Right and left are the subject's. Click the point in each view where you see it; lines show where the other views expect it, the ring where all of them do, the diamond where the model has it. <kbd>Enter</kbd> takes that place, arrows move it, <kbd>Del</kbd> takes it back.</p>
         </div>
         <div :style="{ display: 'grid', gap: '.6rem', minHeight: 0, gridTemplateColumns: 'repeat(2, minmax(0, 1fr))', gridTemplateRows: 'repeat(2, minmax(0, 1fr))' }">
@@ -66,14 +77,13 @@ export default {
         <path :d="'M' + (lens.x + .5) + ' ' + (lens.y - 999) + 'v1998M' + (lens.x - 999) + ' ' + (lens.y + .5) + 'h1998'" stroke="#ffffff" :stroke-width="lens.step" opacity=".8"></path></g></svg>
     </section>`,
   created() { this.clock = clock; },
-  mounted() { window.addEventListener("keydown", this.key); window.addEventListener("beforeunload", this.leave); },
-  unmounted() { window.removeEventListener("keydown", this.key); window.removeEventListener("beforeunload", this.leave); },
+  mounted() { window.addEventListener("keydown", this.key); },
+  unmounted() { window.removeEventListener("keydown", this.key); },
   methods: {
-    title(name) { return TITLES[name] || name; },
+    title(name) { return TITLES[name] || name.replaceAll("_", " "); },
     address(camera) { return `/console/captures/${this.capture.id}/${encodeURIComponent(camera)}.image`; },
-    act(name) { this.busy = name; this.$emit("act", { name }); },
+    act(name, more) { this.busy = name; this.$emit("act", { name, ...more }); },
     acted(name) { this.busy = ""; if (name === "place" && --this.sent === 0) this.pending = {}; },
-    leave(event) { if (this.capture?.dirty) event.preventDefault(); },
     placed(name) { const n = Object.keys(this.capture.points[name] || {}).length; return n ? `${n} view${n > 1 ? "s" : ""}` : "not set"; },
     worst(name) { const off = Object.values(this.capture.off_px[name] || {}); return off.length ? Math.max(...off) : null; },
     here(camera) {

@@ -1,7 +1,9 @@
-"""Features: the seven points of section 4.2, picked in three or four views. Skipping this page is fine: without points
-the pipeline finds the alignment by itself."""
+"""Features: the seven points of section 4.2, and others, picked in three or four views. Skipping this page is fine:
+without points the pipeline finds the alignment by itself."""
 
 import threading
+from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NotRequired, TypedDict
@@ -10,18 +12,21 @@ import numpy as np
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from pipeline.eigenheads.landmarks import SEVEN_POINTS
+from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS
 from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.rig import Rig
-from server.console.guides import Helps, helps, mean_landmarks, nearest_views
+from server.console.guides import Guides, Helps, mean_landmarks, nearest_views
 from server.console.page import Action, Page, shared, show
 from server.console.removal import removals
 from server.errors import Conflict
-from server.services.jobs import Work
 from server.services.service import Service
+from server.services.work import Work
+from server.storage.library import CaptureQuery
+from server.storage.records import CaptureRecord
 from server.tasks.ingest import Points
 
 VIEWS = 4
+CHOICES = 100  # captures to choose from; the page Captures leads to all
 
 
 class CaptureChoice(TypedDict):
@@ -38,7 +43,8 @@ class Size(TypedDict):
 
 
 class Picking(Helps):
-    """One capture's points, and what helps to pick them."""
+    """One capture's points, and what helps to pick them. The first seven ``names`` are those of section 4.2;
+    ``asked``: whether contradictions are to be looked at before they are saved."""
 
     id: str
     cameras: list[Size]
@@ -46,6 +52,7 @@ class Picking(Helps):
     names: list[str]
     points: Points
     dirty: bool
+    asked: bool
 
 
 class FeaturesShown(TypedDict):
@@ -62,13 +69,40 @@ class Place(TypedDict):
     at: list[float] | None
 
 
+class Sure(TypedDict):
+    sure: NotRequired[bool]
+
+
 @dataclass(slots=True)
 class Picked:
-    """The points of a capture as they stand on the page, and as they were saved."""
+    """The points of a capture as they stand on the page, and as they were saved; ``asked``: as they stood when they
+    were to be saved and contradicted each other."""
 
     capture: str
     points: Points
     saved: Points
+    guides: Guides
+    asked: Points | None = None
+
+
+class Drafts:
+    """Points that are not saved yet, by who picks them: a reload of the page brings them back."""
+
+    def __init__(self, most: int = 200) -> None:
+        self._most, self._kept = most, OrderedDict[tuple[str, str], Points]()
+
+    def keep(self, caller: str, picked: Picked) -> None:
+        self._kept.pop((caller, picked.capture), None)
+        if picked.points != picked.saved:
+            self._kept[caller, picked.capture] = picked.points
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+
+    def of(self, caller: str, capture: str) -> Points | None:
+        return self._kept.get((caller, capture))
+
+
+drafts = Drafts()
 
 
 class FeaturesPage(Page, component="features.js"):
@@ -77,33 +111,37 @@ class FeaturesPage(Page, component="features.js"):
     picked: Picked | None = None
 
     def look(self) -> FeaturesShown:
-        captures: list[CaptureChoice] = [
-            {"id": c.id, "label": c.label, "created": c.created, "features": c.features}
-            for c in self.service.store.captures()
-            if not c.board and c.id not in removals
-        ]
+        captures: list[CaptureChoice] = shared.get("choices", 0.3, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
-        if chosen is None or all(capture["id"] != chosen for capture in captures):
+        known = any(capture["id"] == chosen for capture in captures)
+        if not known and chosen is not None:  # an older one, by its address
+            older = [record for record in self.service.captures.of([chosen]) if not record.board]
+            captures = [*captures, *(choice_of(record) for record in older if record.id not in removals)]
+            known = bool(older)
+        if chosen is None or not known:
             return {"captures": captures, "capture": None, "asked": self.choice.get("capture")}
         return {"captures": captures, "capture": self._picking(chosen)}
 
     def _picking(self, capture_id: str) -> Picking:
+        record = self.service.store.capture(capture_id)
+        rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service, capture_id))
         picked = self.picked
         if picked is None or picked.capture != capture_id:
             saved = self.service.captures.features(capture_id)
-            self.picked = picked = Picked(capture_id, points=saved, saved=saved)
-        record = self.service.store.capture(capture_id)
-        rig = shared.get(("cameras", capture_id), 3600.0, lambda: rig_of(self.service, capture_id))
+            draft = drafts.of(self.caller.key, capture_id)
+            self.picked = picked = Picked(capture_id, saved if draft is None else draft, saved, Guides(rig))
         points = picked.points
         pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in points.items()}
+        shown = self.choice.get("point") or SEVEN_POINTS[0]
         return {
             "id": capture_id,
             "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in record.cameras],
             "views": nearest_views(rig, record.front, VIEWS),
-            "names": list(SEVEN_POINTS),
+            "names": [*SEVEN_POINTS, *(name for name in NAMES if name not in SEVEN_POINTS)],
             "points": points,
             "dirty": points != picked.saved,
-            **helps(rig, pixels, landmarks.of(self.service)),
+            "asked": picked.asked == points,
+            **picked.guides.helps(pixels, landmarks.of(self.service), [shown]),
         }
 
     def of_capture(self) -> Picked:
@@ -113,6 +151,16 @@ class FeaturesPage(Page, component="features.js"):
         return self.picked
 
 
+def captures_to_pick(service: Service) -> list[CaptureChoice]:
+    """The newest ones that show a head."""
+    found = service.captures.page(CaptureQuery(board=False), CHOICES)
+    return [choice_of(record) for record in found.items if record.id not in removals]
+
+
+def choice_of(record: CaptureRecord) -> CaptureChoice:
+    return {"id": record.id, "label": record.label, "created": record.created, "features": record.features}
+
+
 def rig_of(service: Service, capture_id: str) -> Rig:
     path = find_rig_file(service.store.folder("captures", capture_id) / "files")
     assert path is not None  # it was accepted with one
@@ -120,7 +168,7 @@ def rig_of(service: Service, capture_id: str) -> Rig:
 
 
 class Landmarks:
-    """The seven landmarks of the default model's mean head (head frame, mm). Loading a model takes a second or more:
+    """The landmarks of the default model's mean head (head frame, mm). Loading a model takes a second or more:
     it is asked for once, in a thread, and the page works without until it is there."""
 
     def __init__(self) -> None:
@@ -135,7 +183,7 @@ class Landmarks:
     def _load(self, service: Service) -> None:
         try:
             with service.children.one() as child:
-                found = child.remote(mean_landmarks)(model="default", names=list(SEVEN_POINTS))
+                found = child.remote(mean_landmarks)(model="default", names=list(NAMES))
             self.found = {name: np.array(point) for name, point in found.items()}
         finally:
             self._asked.release()
@@ -154,20 +202,32 @@ def place(page: FeaturesPage, event: Place) -> None:
     else:
         views[event["camera"]] = [round(float(value), 2) for value in event["at"]]
     picked.points = {name: views for name, views in points.items() if views}
+    drafts.keep(page.caller.key, picked)
 
 
-def save(page: FeaturesPage, event: object) -> str:
+def save(page: FeaturesPage, event: Sure) -> str | None:
+    """Stores the points. Where views contradict each other the page asks first, once, and ``sure`` is the answer."""
     picked = page.of_capture()
     points = picked.points
+    if not event.get("sure") and contradictions(page):
+        picked.asked = points
+        return None
     page.service.captures.put_features(picked.capture, points)
-    picked.saved = points
+    picked.saved, picked.asked = points, None
+    drafts.keep(page.caller.key, picked)
     return "Saved. Jobs from now on use these points."
 
 
-def reconstruct(page: FeaturesPage, event: object) -> str:
+def contradictions(page: FeaturesPage) -> Mapping[str, str]:
     picked = page.of_capture()
-    if picked.points != picked.saved:
-        save(page, event)
+    pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in picked.points.items()}
+    return picked.guides.helps(pixels, {}, [])["contradictions"]
+
+
+def reconstruct(page: FeaturesPage, event: Sure) -> str | None:
+    picked = page.of_capture()
+    if picked.points != picked.saved and save(page, event) is None:
+        return None
     job = page.service.jobs.submit(picked.capture, Work(), key=page.caller.key)
     return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
 

@@ -1,36 +1,37 @@
 // The queue at the left, one job at the right.
-import { clock, fixed, keepAddress, span, stageWords } from "/console/static/words.js";
+import { Pager, paged } from "/console/static/list.js";
+import { clock, fixed, keepDraft, kept, span, stageWords } from "/console/static/words.js";
+
+const asked = new URLSearchParams(location.search);
 
 const MOSTLY = 0.25; // of the rim: beyond it hair or clothes hide the face, and the residual says nothing
 const POOR_PX = 3.0; // contour residual from which a camera is worth a look
 
 export default {
+  mixins: [paged],
+  components: { Pager },
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ form: null, busy: "", show: "", sought: new URLSearchParams(location.search).get("find") || "" }),
+  data: () => ({ chosen: asked.get("job") || "", only: asked.get("state") || "", sort: asked.get("sort") || "", form: null, busy: "", show: "" }),
   watch: {
-    "job.id"() { this.keepAddress(); }, sought() { this.keepAddress(); },
+    "job.id": { handler(id) { if (id) this.keepAddress(); this.form = kept("restart")?.job === id ? kept("restart") : null; }, immediate: true },
+    only() { this.first(); }, sort() { this.first(); },
+    form: { handler(form) { keepDraft("restart", form); }, deep: true },
   },
   computed: {
     jobs() { return this.state.jobs || []; },
-    shown() { // running ones first, then the queue in its order, then what ended, newest first
-      const words = this.sought.toLowerCase().split(/\s+/).filter(Boolean);
-      const told = (j) => [j.capture, j.state, j.id, j.model, j.settings.method || "contour", j.settings.detail].filter(Boolean).join(" ").toLowerCase();
-      const found = this.jobs.filter((j) => words.every((word) => told(j).includes(word)));
-      const of = (...states) => found.filter((j) => states.includes(j.state));
-      return [...of("running"), ...of("queued").sort((a, b) => (this.before(a, b) ? -1 : 1)), ...of("succeeded", "failed", "cancelled")];
-    },
-    job() { return this.jobs.find((j) => j.id === this.state.detail?.id) || null; },
+    listed() { return this.jobs; },
+    job() { return this.state.job || null; },
     active() { return this.job && ["queued", "running"].includes(this.job.state); },
     waiting() {
       if (this.job.notice) return this.job.notice;
-      const before = this.jobs.filter((j) => j.state === "running" || (j.state === "queued" && this.before(j, this.job))).length;
+      const before = this.job.ahead || 0;
       return before ? `Waiting, ${before} ${before === 1 ? "job" : "jobs"} before it` : "Waiting for the worker";
     },
     sheet() { return `/console/jobs/${this.job.id}/contact_sheet.png`; },
     lead() {
-      const running = this.jobs.filter((j) => j.state === "running").length, queued = this.jobs.filter((j) => j.state === "queued").length;
-      return this.state.loading ? "Reading" : `${running} running, ${queued} queued, ${this.jobs.length - running - queued} ended`;
+      const { running = 0, queued = 0, succeeded = 0, failed = 0, cancelled = 0 } = this.state.counts || {};
+      return this.state.loading ? "Reading" : `${running} running, ${queued} queued, ${succeeded + failed + cancelled} ended`;
     },
   },
   template: `
@@ -43,16 +44,24 @@ export default {
           <a class="b main-action" v-if="job.state === 'succeeded'" id="to-result" :href="'/result/' + job.id">Open the head</a>
         </template></header>
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
-        <div class="panel scroll" tabindex="0" role="region" aria-label="List of jobs">
-          <input v-model="sought" id="find" type="search" placeholder="Find: label, state, solver, id" aria-label="Find jobs" style="width: calc(100% - 1rem); margin: .5rem">
-          <p v-if="sought && !shown.length" class="muted small" style="padding: .5rem .75rem">No job matches.</p>
-          <button v-for="j in shown" :key="j.id" class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="$emit('choose', { job: j.id }); form = null">
+        <div class="stack" style="min-height: 0">
+          <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, solver, id" aria-label="Find jobs"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
+          <div class="line"><select v-model="only" id="state" class="grow" aria-label="State"><option value="">every state</option><option v-for="(n, s) in state.counts" :key="s" :value="s">{{ s }} ({{ n }})</option></select>
+            <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="-finished">ended last first</option></select></div>
+          <div v-if="picking" class="panel pad line wrap small" role="region" aria-label="Selected jobs"><strong>{{ picked.length }} selected</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button>
+            <button class="b" id="bulk-cancel" :disabled="!picked.length || !!busy" @click="bulk('cancel')">Cancel</button><button class="b" id="bulk-restart" :disabled="!picked.length || !!busy" @click="bulk('restart')">Restart</button><button class="b" id="bulk-remove" :disabled="!picked.length || !!busy" @click="bulk('remove')">Remove</button></div>
+        <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of jobs" data-scroll="jobs" @keydown="walk">
+          <p v-if="(sought || only) && !jobs.length" class="muted small" style="padding: .5rem .75rem">No job matches.</p>
+          <div v-for="j in jobs" :key="j.id" class="row-line"><input v-if="picking" type="checkbox" :value="j.id" v-model="picked" :aria-label="'Select job ' + j.id.slice(-6)">
+          <button class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="choose(j.id)">
             <span class="line"><strong class="cut grow">{{ j.capture || clock(j.captured) }}</strong><span class="tag" :class="kind(j)">{{ j.state }}</span></span>
             <span class="bar" role="progressbar" :aria-label="'Progress of ' + j.id.slice(-6)" :aria-valuenow="Math.round(100 * j.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * j.progress + '%' }"></i></span>
             <span class="small muted line"><span class="grow cut">{{ j.state === 'running' ? stageWords(j.stage) : clock(j.created) }}<template v-if="j.restart_of"> &middot; after {{ j.restart_of.slice(-6) }}</template></span>
-              <span class="num">{{ j.state === 'running' && j.eta_s !== null ? span(j.eta_s) + ' left' : took(j) }}</span></span>
-          </button>
-        </div>
+              <span class="num">{{ j.state === 'running' && j.eta_s !== null ? span(j.eta_s) + ' left' : j.state === 'queued' ? place(j) : took(j) }}</span></span>
+          </button></div>
+          <p v-if="state.waiting" class="muted small" style="padding: .5rem .75rem">{{ state.waiting }} more wait in the queue.</p>
+          <pager :behind="behind.length" :next="state.next" :size="jobs.length" :total="state.total" @back="back" @forward="forward"></pager>
+        </div></div>
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="The chosen job">
           <template v-if="job">
             <div class="line wrap"><h2>{{ job.capture || clock(job.captured) }}</h2><span class="tag" :class="kind(job)">{{ job.state }}</span><span class="muted small mono">{{ job.id.slice(-6) }}</span>
@@ -97,13 +106,14 @@ export default {
     act(name) { this.busy = name; this.$emit("act", { name, id: this.job.id }); },
     acted(name, done) {
       this.busy = "";
-      if (name === "restart" && done) this.form = null;
+      if (name === "restart" && done) { this.form = null; this.chosen = this.state.job?.id || ""; }
+      if (name === "bulk") this.picked = [];
     },
-    before(one, other) { // in the queue: lower priority numbers first, then who came first
-      return (one.priority - other.priority || one.created.localeCompare(other.created) || one.id.localeCompare(other.id)) < 0;
-    },
-    keepAddress() { keepAddress({ job: this.job?.id, find: this.sought }); },
-    open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { method, model: "", detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
+    place(j) { return j.ahead ? `${j.ahead} before it` : "next"; },
+    fields() { return { job: this.job?.id, find: this.sought, state: this.only, sort: this.sort }; },
+    question() { return { find: this.sought, state: this.only, sort: this.sort, job: this.chosen, after: this.behind.at(-1) || "" }; },
+    bulk(action) { this.busy = "bulk"; this.$emit("act", { name: "bulk", action, ids: [...this.picked] }); },
+    open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { job: this.job.id, method, model: "", detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
     restart() { this.busy = "restart"; this.$emit("act", { name: "restart", id: this.job.id, ...this.form }); },
   },
 };

@@ -1,9 +1,9 @@
 """Jobs: the queue, stage and progress, log, cancel, restart with other settings; what a finished one says of itself."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import NotRequired, TypedDict, cast
+from typing import NotRequired, TypedDict, cast, get_args
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
@@ -11,16 +11,24 @@ from starlette.responses import RedirectResponse
 from pipeline.eigenheads.model_names import list_models
 from pipeline.results.report import CameraReport, WarningReport
 from rig.errors import InputError
-from server.console.page import Action, Chosen, Page, remove_later, shared, show
+from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.pages.rig import read_report
 from server.console.removal import removals
+from server.errors import Conflict, Unusable
+from server.services.bulk import each
 from server.services.documents import JobLine
-from server.services.jobs import FINISHED, Work
+from server.services.jobs import FINISHED, STATUSES
 from server.services.records import Job
 from server.services.service import Service
+from server.services.work import Work
 from server.storage.events import JobEvent
+from server.storage.job_index import JobOrder, JobQuery
 
-SHOWN = 200
+SHOWN = 50  # jobs of a page, and of those that wait before them
+SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
+ACTIVE = (*STATUSES["running"], *STATUSES["queued"])
+ENDED = tuple(status for state in FINISHED for status in STATUSES[state])
+ASKED = ("find", "state", "sort", "after")
 LOG_LINES = 200
 
 
@@ -65,11 +73,20 @@ class ShownJob(JobLine):
 
 
 class JobsState(TypedDict):
+    """Jobs of one page, on the first one those that run and wait before them; ``waiting``: how many more wait."""
+
     jobs: list[ShownJob]
+    counts: dict[str, int]
+    waiting: int
+    next: str | None
+    total: int
     models: list[str]
 
 
 class JobsShown(JobsState):
+    """``job``: the one that is looked at, which may lie on another page."""
+
+    job: ShownJob | None
     detail: JobDetail | None
 
 
@@ -80,6 +97,11 @@ class SettingsForm(TypedDict, total=False):
     detail: str
     front: str
     more: str | None
+
+
+class BulkForm(TypedDict):
+    ids: list[str]
+    action: str
 
 
 class RestartForm(Chosen, SettingsForm):
@@ -98,28 +120,54 @@ class ListedJob:
 
 class JobsPage(Page, component="jobs.js"):
     def look(self) -> JobsShown:
-        state: JobsState = shared.get("jobs", 0.3, lambda: jobs_state(self.service))
+        asked = {name: self.choice.get(name) or None for name in ASKED}
+        state: JobsState = shared.get(("jobs", *asked.values()), 0.3, lambda: jobs_state(self.service, asked))
         first = next((job for job in state["jobs"] if job["state"] == "running"), next(iter(state["jobs"]), None))
-        chosen = self.choice.get("job") or (first["id"] if first else None)
-        known = next((job["id"] for job in state["jobs"] if job["id"] == chosen), None)
-        return {**state, "detail": None if known is None else job_detail(self.service, known)}
+        chosen = self.choice.get("job")
+        known = next((job for job in state["jobs"] if job["id"] == chosen), None)
+        if known is None and chosen and chosen not in removals:
+            known = next(
+                (job_line(listed) for listed in listed_jobs(self.service, self.service.jobs.of([chosen]))), None
+            )
+        job = known or first
+        return {**state, "job": job, "detail": None if job is None else job_detail(self.service, job["id"])}
 
 
-def jobs_state(service: Service) -> JobsState:
-    jobs = [job_line(listed) for listed in jobs_list(service)]
-    return {"jobs": jobs, "models": shared.get("models", 30.0, lambda: list(list_models()))}
+def jobs_state(service: Service, asked: Mapping[str, str | None]) -> JobsState:
+    """First what runs, then the queue in its order, then what ended, newest first."""
+    sought, after = asked["find"] or "", asked["after"]
+    order = cast(JobOrder, asked["sort"] if asked["sort"] in get_args(JobOrder) else "-created")
+    state = asked["state"] if asked["state"] in STATUSES else None
+    statuses = ENDED if state is None else STATUSES[state]
+    before, waiting = ([], 0) if after or state else active_jobs(service, sought)
+    if state == "queued":
+        before, waiting, statuses = *active_jobs(service, sought, running=False), ()
+    page = service.jobs.page(JobQuery(sought, statuses, order=order), SHOWN, after)
+    jobs = [job for job in (*before, *page.items) if job.id not in removals]
+    return {
+        "jobs": [job_line(listed) for listed in listed_jobs(service, jobs)],
+        "counts": shared.get("job counts", 1.0, service.jobs.counts),
+        "waiting": waiting,
+        "next": page.next,
+        "total": page.total + len(before) + waiting,
+        "models": shared.get("models", 30.0, lambda: list(list_models())),
+    }
 
 
-def jobs_list(service: Service) -> list[ListedJob]:
-    """Newest first."""
+def active_jobs(service: Service, sought: str, *, running: bool = True) -> tuple[list[Job], int]:
+    """What runs and what is taken next, and how many more wait."""
+    found = service.jobs.page(JobQuery(sought, ACTIVE if running else STATUSES["queued"]), SOUGHT_MOST)
+    jobs = sorted(found.items, key=lambda job: (job.state != "running", job.ahead or 0, job.id))
+    return jobs[:SHOWN], found.total - min(SHOWN, len(jobs))
+
+
+def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
+    """Jobs with what is known of their captures."""
     found = []
-    captures = {record.id: record for record in service.store.captures()}
-    for job in service.jobs.find(limit=SHOWN):
-        if job.id in removals:
-            continue
-        capture = captures.get(job.capture_id or "")
+    for job in jobs:
+        capture = next(iter(service.captures.of([job.capture_id or ""])), None)
         if capture is None:
-            found.append(ListedJob(job, "removed capture", None))
+            found.append(ListedJob(job, "removed capture", None, job.session))
         else:
             found.append(ListedJob(job, capture.label, capture.created, capture.session))
     return found
@@ -203,7 +251,31 @@ def delete(page: Page, event: Chosen) -> None:
     remove_later(identity, lambda: service.jobs.delete(identity), f"job {identity[-6:]}", "submit")
 
 
+def bulk(page: Page, event: BulkForm) -> str:
+    """One action on the jobs that are ticked; what is refused to some is told with its reasons."""
+    service, action = page.service, event["action"]
+    if action == "remove":
+        ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]
+        if not ended:
+            raise Conflict("job-active", "These jobs are queued or running; cancel them first.")
+        remove_all_later(ended, service.jobs.delete, f"{len(ended)} jobs with their heads", "submit")
+        return f"{len(ended)} removed."
+    restarted = Work()
+    actions: dict[str, Callable[[str], object]] = {
+        "cancel": service.cancel,
+        "restart": lambda job: service.jobs.restart(job, restarted, key=page.caller.key),
+    }
+    done = each(event["ids"], actions[action])
+    shared.forget("jobs")
+    said = {"cancel": "cancelled", "restart": "queued again"}[action]
+    if done.refused:
+        told = [f"{one.id[-6:]}: {one.detail}" for one in done.refused]
+        raise Unusable("some-refused", f"{len(done.done)} {said}, {len(told)} refused.", told)
+    return f"{len(done.done)} {said}."
+
+
 JobsPage.actions = {
+    "bulk": Action("submit", bulk),
     "restart": Action("submit", restart),
     "cancel": Action("submit", cancel),
     "delete": Action("submit", delete),
@@ -211,5 +283,5 @@ JobsPage.actions = {
 
 
 @ui.page("/jobs")
-async def jobs_page(job: str = "") -> RedirectResponse | None:
-    return await show("jobs", JobsPage, job=job or None)
+async def jobs_page(job: str = "", find: str = "", state: str = "", sort: str = "") -> RedirectResponse | None:
+    return await show("jobs", JobsPage, job=job, find=find, state=state, sort=sort)

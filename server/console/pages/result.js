@@ -31,28 +31,31 @@ function nice(value) {
 export default {
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", digits: 1 }),
+  data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", digits: 1 }),
   computed: {
     job() { return this.state.job; },
     surfaces() { return SURFACES.filter(([name]) => this.job?.files[`${name}.glb`]); },
     colourings() { return COLOURINGS.filter(([name]) => name !== "parts" || this.surface === "bust"); },
     others() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && (this.strangers || this.same(r))); },
     elsewhere() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)).length; },
+    ofSubject() { return (this.state.results || []).filter((r) => r.id === this.job?.id || this.same(r)); },
+    ofOthers() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)); },
     rows() { return Object.entries(this.job?.measurements || {}); },
     distance() { return this.points.length === 2 ? MM * this.points[0].distanceTo(this.points[1]) : null; },
   },
   watch: {
     "job.id"(id) { if (id) { this.strangers = false; this.load(id); this.readCameras(id); } },
+    sought(text) { clearTimeout(this.typed); this.typed = setTimeout(() => this.$emit("choose", { find: text }), 250); },
     surface() { if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture"; this.load(this.job.id); },
     through() { this.fit(); },
     colouring() { this.paint(); this.shine(); }, other() { this.compare(); },
-    wire(on) { this.material.wireframe = this.flat.wireframe = on; this.draw(); },
+    wire() { this.showWire(); this.draw(); },
     lights() { this.shine(); }, measuring(on) { if (!on) this.clearPoints(); },
   },
   template: `
     <section class="page" aria-label="Result">
       <header class="wraps"><h1>Result</h1>
-        <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><option v-for="r in state.results" :key="r.id" :value="r.id">{{ headName(r) }}</option></select></label>
+        <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><optgroup label="Of this subject"><option v-for="r in ofSubject" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup><optgroup v-if="ofOthers.length" label="Of others"><option v-for="r in ofOthers" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup></select><input v-if="state.total > 8" v-model="sought" id="find" type="search" maxlength="200" placeholder="Find a head" aria-label="Find heads" style="width: 9rem"></label>
         <template v-if="job"><span v-if="surfaces.length > 1" class="group" role="group" aria-label="Surface"><button v-for="[name, title, k] in surfaces" :key="name" class="b" :aria-pressed="surface === name" @click="surface = name">{{ title }} <kbd>{{ k }}</kbd></button></span>
         <span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="!other && colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
         <button class="b" :aria-pressed="wire" @click="wire = !wire">Wireframe <kbd>W</kbd></button>
@@ -77,11 +80,11 @@ export default {
               <label v-if="cameras.length" class="field">Look through<select v-model="through" id="through"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
               <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
-            <h3>Downloads</h3>
+            <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="'head-' + job.id.slice(-6) + '.zip'">All files (.zip)</a></div>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
-            <h3>Measurements, mm</h3>
+            <h2 class="third">Measurements, mm</h2>
             <table class="small"><tbody><tr v-for="[name, m] in rows" :key="name"><td>{{ name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td></tr></tbody></table>
-            <h3>Fit</h3>
+            <h2 class="third">Fit</h2>
             <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">contour residual, {{ job.clear_views }} clear {{ job.clear_views === 1 ? 'view' : 'views' }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ job.method }}</td></tr><tr><td>level of detail</td><td class="num">{{ job.level }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
           </template>
@@ -160,7 +163,11 @@ export default {
         let found = null;
         head.scene.traverse((o) => { if (o.isMesh) found = o; });
         this.mesh = new THREE.Mesh(found.geometry, this.material);
-        this.texture = found.geometry.attributes.color.clone();
+        this.skin?.map.dispose(); this.skin?.dispose();
+        this.skin = found.material.map ? new THREE.MeshStandardMaterial({ map: found.material.map, roughness: 0.85, metalness: 0, side: THREE.DoubleSide }) : null;
+        this.showWire();
+        this.texture = found.geometry.attributes.color?.clone();
+        this.repeated = head.asset.extras?.repeated_vertices || []; // at the texture's seam, after those of the .ply
         this.scene.add(this.mesh);
         this.mesh.geometry.computeBoundingSphere();
         const { center, radius } = this.mesh.geometry.boundingSphere;
@@ -191,12 +198,19 @@ export default {
       } else if (this.colouring === "clay") {
         this.mesh.material = this.material;
         geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * geometry.attributes.position.count).fill(0.55), 3));
-      } else { this.mesh.material = this.material; geometry.setAttribute("color", this.texture); }
+      } else if (this.skin) this.mesh.material = this.skin;
+      else { this.mesh.material = this.material; geometry.setAttribute("color", this.texture); }
       this.draw();
     },
+    showWire() { for (const material of [this.material, this.flat, this.skin]) if (material) material.wireframe = this.wire; },
+    withRepeated(values) {
+      const all = new Float32Array(values.length + this.repeated.length);
+      all.set(values); this.repeated.forEach((from, i) => { all[values.length + i] = values[from]; });
+      return all;
+    },
     paintParts(values) {
-      const colours = new Float32Array(3 * values.length), colour = new THREE.Color();
-      values.forEach((value, i) => colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      const all = this.withRepeated(values), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
+      all.forEach((value, i) => colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i));
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
     },
@@ -213,8 +227,8 @@ export default {
       this.loading = false; this.draw();
     },
     spread(values, title) {
-      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95), colours = new Float32Array(3 * values.length), colour = new THREE.Color();
-      values.forEach((value, i) => colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95), all = this.withRepeated(values), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
+      all.forEach((value, i) => colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i));
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       this.digits = most < 1 ? 2 : 1;

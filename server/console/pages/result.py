@@ -1,6 +1,7 @@
 """The head: turned, coloured, measured, compared, fetched."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TypedDict
 
@@ -10,12 +11,19 @@ from starlette.responses import RedirectResponse
 
 from pipeline.results.report import Measured, Report, WarningReport
 from server.console.page import Page, shared, show
-from server.console.pages.jobs import ListedJob, jobs_list
+from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report
+from server.console.removal import removals
+from server.errors import NotFound
+from server.services.jobs import STATUSES
+from server.services.records import Job
 from server.services.service import Service
+from server.storage.job_index import JobQuery
 
 THREE_JS = Path(scene.__file__).with_name("dist")  # NiceGUI's own bundle of three.js
 MOSTLY = 0.25  # of a contour, as on the page Jobs
+SHOWN = 60  # heads to choose from; the search finds the others
+SUBJECTS_HEADS = 100
 
 
 class ResultLine(TypedDict):
@@ -51,24 +59,61 @@ class Head(ResultLine):
 
 
 class ResultShown(TypedDict):
+    """``results``: the newest heads that are sought, those of the shown one's subject, and the shown one; ``total``
+    counts all that are sought."""
+
     results: list[ResultLine]
+    total: int
     job: Head | None
     asked: str | None
 
 
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
     def look(self) -> ResultShown:
-        results: list[ResultLine] = shared.get("results", 1.0, lambda: finished(self.service))
-        chosen = self.choice.get("job") or (results[0]["id"] if results else None)
+        sought, chosen = self.choice.get("find") or "", self.choice.get("job")
+        results, total = shared.get(("results", sought), 1.0, lambda: newest_heads(self.service, sought))
+        if chosen is None:
+            chosen = results[0]["id"] if results else None
         known = next((job for job in results if job["id"] == chosen), None)
-        head = None if known is None else head_of(self.service, known)
-        return {"results": results, "job": head, "asked": self.choice.get("job")}
+        if known is None and chosen is not None:
+            done = [
+                job for job in self.service.jobs.of([chosen]) if job.state == "succeeded" and job.id not in removals
+            ]
+            known = next(iter(result_lines(self.service, done)), None)
+        if known is None:
+            return {"results": results, "total": total, "job": None, "asked": self.choice.get("job")}
+        theirs: list[ResultLine] = shared.get(
+            ("results", "of", known["session"], known["capture_id"]), 1.0, lambda: heads_of_subject(self.service, known)
+        )
+        heads = {line["id"]: line for line in (known, *theirs, *results)}
+        shown = sorted(heads.values(), key=lambda line: line["id"], reverse=True)
+        head = head_of(self.service, known)
+        return {"results": shown, "total": total, "job": head, "asked": self.choice.get("job")}
 
 
-def finished(service: Service) -> list[ResultLine]:
-    subjects = {record.id: record.label for record in service.store.sessions()}
-    done = [listed for listed in jobs_list(service) if listed.job.state == "succeeded"]
-    return [result_line(listed, subjects.get(listed.session or "", "")) for listed in done]
+def newest_heads(service: Service, sought: str) -> tuple[list[ResultLine], int]:
+    """The newest finished jobs that are sought, and how many there are."""
+    page = service.jobs.page(JobQuery(sought, STATUSES["succeeded"]), SHOWN)
+    return result_lines(service, [job for job in page.items if job.id not in removals]), page.total
+
+
+def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
+    """Heads of the same capture, and of all sessions that bear the same name."""
+    captures = {head["capture_id"] or ""} | set(service.sessions.captures_of_subject(head["session"]))
+    jobs = service.jobs.of_captures(captures)
+    done = sorted((job for some in jobs.values() for job, state in some if state == "succeeded"), reverse=True)
+    return result_lines(service, service.jobs.of([job for job in done[:SUBJECTS_HEADS] if job not in removals]))
+
+
+def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
+    found = []
+    for listed in listed_jobs(service, jobs):
+        subject = ""
+        if listed.session:
+            with suppress(NotFound):
+                subject = service.store.session(listed.session).label
+        found.append(result_line(listed, subject))
+    return found
 
 
 def result_line(listed: ListedJob, subject: str) -> ResultLine:
@@ -118,5 +163,5 @@ def clear_residuals(report: Report) -> list[float]:
 
 @ui.page("/result")
 @ui.page("/result/{job}")
-async def result_page(job: str = "") -> RedirectResponse | None:
-    return await show("result", ResultPage, job=job or None)
+async def result_page(job: str = "", find: str = "") -> RedirectResponse | None:
+    return await show("result", ResultPage, job=job or None, find=find)

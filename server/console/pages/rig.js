@@ -1,7 +1,7 @@
 // Eleven tiles. Pictures and their exposure and sharpness come by one stream; the rest is the page's state.
 import { liveView } from "/console/static/live.js";
 import { Outline, Verdict, checksOf, faultsOf } from "/console/static/verdict.js";
-import { clock, fixed, keepSession, openSession, sessionName, typing } from "/console/static/words.js";
+import { clock, fixed, keepAddress, keepDraft, keepSession, kept, openSession, sessionName, span, stageWords, typing } from "/console/static/words.js";
 
 const COUNT_S = 3;
 const STALE_MS = 2500;
@@ -12,12 +12,13 @@ export default {
   mixins: [liveView, checksOf],
   components: { Outline, Verdict },
   props: { state: Object },
-  emits: ["act"],
-  data: () => ({ now: Date.now(), count: 0, busy: "", session: openSession(), label: "", expression: "", asking: null, dismissed: sessionStorage.getItem("eigenhead-plates") || "" }),
+  emits: ["act", "choose"],
+  data: () => ({ now: Date.now(), count: 0, busy: "", session: openSession(), label: kept("shot")?.label || "", expression: kept("shot")?.expression || "", asking: null, dismissed: sessionStorage.getItem("eigenhead-plates") || "" }),
   watch: {
-    session(id) { keepSession(id); },
+    session(id) { keepSession(id); }, label() { this.keepTyped(); }, expression() { this.keepTyped(); },
+    "state.job"(job, before) { if (job?.id !== before?.id || job?.state !== before?.state) this.keepPlace(); },
     dismissed(id) { sessionStorage.setItem("eigenhead-plates", id); },
-    "state.shot.id": { handler(id) { this.readChecks(id); }, immediate: true },
+    "state.shot.id": { handler(id) { this.readChecks(id); if (!this.state.loading) this.keepPlace(); }, immediate: true },
     "state.sessions": { handler(all) { if (all && this.session && !this.open) this.session = ""; }, immediate: true },
   },
   computed: {
@@ -52,6 +53,7 @@ export default {
       return `Exposure is in order. ${sharp ? `So is sharpness, in the ${sharp} of ${this.cameras.length} judged so far.` : "Sharpness is looked at next."} ${this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot."}`;
     },
     shot() { return this.state.shot; },
+    job() { return this.state.job; },
     refused() { const found = this.state.plates?.refused; return found && found.id !== this.dismissed ? found : null; },
     columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
   },
@@ -76,6 +78,11 @@ export default {
           <outline :view="view(shot.id, camera)" :size="shot.sizes[camera]"></outline>
           <span>{{ camera }}{{ camera === shot.front ? ' · front' : '' }} <b v-if="faultsOf(shot, camera).length" class="warn">{{ faultsOf(shot, camera).join(', ') }}</b><small v-else class="muted">{{ measures(shot.id, camera) }}</small></span></div></div>
       </div>
+      <div v-if="job" class="panel pad line wrap" id="job" role="status" :data-state="job.state" aria-label="The job that was started here">
+        <template v-if="job.state === 'succeeded'"><i class="dot good"></i><strong class="grow">The head is ready</strong><a class="b main-action" id="open-head" :href="'/result/' + job.id">Open the head <kbd>H</kbd></a></template>
+        <template v-else-if="['queued', 'running'].includes(job.state)"><strong>{{ job.state === 'queued' ? job.detail || 'Waiting for the worker' : stageWords(job.stage) }}</strong><span class="bar grow" role="progressbar" aria-label="Progress of the job" :aria-valuenow="Math.round(100 * job.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * job.progress + '%' }"></i></span><span class="num">{{ Math.round(100 * job.progress) }} %<template v-if="job.eta_s !== null">, about {{ span(job.eta_s) }} left</template></span></template>
+        <template v-else><i class="dot fault"></i><span class="grow"><strong>The job {{ job.state }}.</strong> {{ job.detail }}</span><a class="b" :href="'/jobs?job=' + job.id">See why</a></template>
+        <button class="b quiet" aria-label="Close" @click="$emit('choose', { job: null })">&times;</button></div>
       <div v-show="!shot" class="tiles" :style="{ gridTemplateColumns: 'repeat(' + columns + ', minmax(0, 1fr))', gridTemplateRows: 'repeat(' + Math.ceil((cameras.length + 1) / columns) + ', minmax(0, 1fr))' }">
         <article v-for="camera in cameras" :key="camera.name" class="panel tile" :data-camera="camera.name" :data-frames="live[camera.name]?.frames || 0" :aria-label="camera.name">
           <div class="picture"><canvas :ref="el => keep(camera.name, el)" width="320" height="240" role="img" :aria-label="'Live picture of ' + camera.name"></canvas>
@@ -111,7 +118,7 @@ export default {
           <div class="line"><button class="b main-action" :disabled="!!busy">Go on</button><button type="button" class="b quiet" @click="asking = null">No shot</button></div></form></div>
       <div v-if="count" class="countdown" role="alert"><span>{{ count }}</span></div>
     </section>`,
-  created() { this.faultsOf = faultsOf; this.clock = clock; this.sessionName = sessionName; this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; },
+  created() { this.faultsOf = faultsOf; this.clock = clock; this.sessionName = sessionName; this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; this.span = span; this.stageWords = stageWords; },
   mounted() {
     window.addEventListener("keydown", this.key);
     this.clockTimer = setInterval(() => (this.now = Date.now()), 500);
@@ -122,6 +129,8 @@ export default {
     clearInterval(this.clockTimer); clearInterval(this.counter);
   },
   methods: {
+    keepTyped() { keepDraft("shot", this.label || this.expression ? { label: this.label, expression: this.expression } : null); },
+    keepPlace() { keepAddress({ shot: this.shot?.id, job: this.job?.id }); document.title = this.job?.state === "succeeded" ? "Head ready - eigenhead" : "Rig - eigenhead"; },
     percent(share) { return share === undefined ? "-" : `${(100 * share).toFixed(share < 0.1 ? 1 : 0)}%`; },
     light(name) {
       const mean = this.live[name]?.mean;
@@ -177,6 +186,7 @@ export default {
       else if (this.shot && "kK".includes(event.key)) this.decide("keep");
       else if (this.shot && "rR".includes(event.key)) this.decide("retake");
       else if (this.shot && event.key === "Enter" && event.target.tagName !== "BUTTON") this.decide("reconstruct");
+      else if (this.job?.state === "succeeded" && "hH".includes(event.key)) location.href = `/result/${this.job.id}`;
       else if (event.key === "b" || event.key === "B") this.plates();
     },
   },

@@ -20,10 +20,10 @@ from server.console.pages.captures import (
     SessionLine,
     WorkForm,
     capture_line,
+    chosen_work,
     discard,
     edit_consent,
     new_session,
-    reconstruct,
     sessions_list,
     sync_of,
 )
@@ -86,16 +86,39 @@ class RigShown(TypedDict):
     ask_consent: bool
 
 
+class JobStrip(TypedDict):
+    """What the page tells of a job that was started on it."""
+
+    id: str
+    state: str
+    stage: str
+    progress: float
+    eta_s: float | None
+    detail: str | None
+
+
 class RigPageShown(RigShown):
-    """``shot``: the capture that was taken on this page and waits for the operator's decision."""
+    """``shot``: the capture that was taken on this page and waits for the operator's decision; ``job``: the one that
+    was started here last."""
 
     shot: CaptureLine | None
+    job: JobStrip | None
 
 
 class RigPage(Page, component="rig.js"):
     def look(self) -> RigPageShown:
         state: RigShown = shared.get("rig", 0.4, lambda: rig_state(self.service))
-        return {**state, "shot": shot_taken(self.service, self.choice.get("shot"))}
+        job = job_strip(self.service, self.choice.get("job"))
+        return {**state, "shot": shot_taken(self.service, self.choice.get("shot")), "job": job}
+
+
+def job_strip(service: Service, identity: str | None) -> JobStrip | None:
+    found = service.jobs.of([identity]) if identity is not None and identity not in removals else []
+    if not found:
+        return None
+    job = found[0]
+    told = job.error.detail if job.error is not None else job.notice
+    return JobStrip(id=job.id, state=job.state, stage=job.stage, progress=job.progress, eta_s=job.eta_s, detail=told)
 
 
 def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
@@ -103,14 +126,14 @@ def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
     if identity is None or identity in removals:
         return None
     with suppress(NotFound):
-        return capture_line(service.store.capture(identity), None)
+        return capture_line(service.store.capture(identity), [])
     return None
 
 
 def rig_state(service: Service) -> RigShown:
     """What the tiles say beside the live pictures: the driver's state, the last shot's sync, the calibration."""
     rig = service.rig.describe()
-    last = next(service.store.captures(), None)
+    last = service.captures.newest()
     sync = {} if last is None or last.shot is None else sync_of(last.shot)
     moved = moved_cameras(service)
     cameras: list[Tile] = [
@@ -207,9 +230,9 @@ def retake(page: Page, event: Chosen) -> None:
 
 
 def reconstruct_shot(page: Page, event: WorkForm) -> str:
-    told = reconstruct(page, event)
-    page.choice["shot"] = None
-    return told
+    job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
+    page.choice |= {"shot": None, "job": job.id}
+    return f"Queued job {job.id[-6:]}."
 
 
 def plates(page: Page, event: object) -> str | None:
@@ -254,5 +277,5 @@ RigPage.actions = {
 
 
 @ui.page("/")
-async def rig_page() -> RedirectResponse | None:
-    return await show("rig", RigPage)
+async def rig_page(job: str = "", shot: str = "") -> RedirectResponse | None:
+    return await show("rig", RigPage, job=job or None, shot=shot or None)

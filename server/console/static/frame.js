@@ -3,12 +3,15 @@ import { typing } from "/console/static/words.js";
 
 const MESSAGE_MS = 6000;
 const MESSAGES_MOST = 4;
+const SCROLL_BACK_MS = 3000;
 
 export default {
   props: { links: Array, current: String, status: Object, removed: Array },
   emits: ["undo"],
-  data: () => ({ messages: [], next: 1, help: false }),
+  data: () => ({ messages: [], next: 1, help: false, look: localStorage.getItem("eigenhead-look") || "dark" }),
+  watch: { look: { handler(look) { document.documentElement.dataset.look = look; localStorage.setItem("eigenhead-look", look); }, immediate: true } },
   computed: {
+    starting() { return (this.status?.starting || []).map((name) => (name === "egl" ? "graphics" : name)); },
     faults() { return Object.entries(this.status?.faults || {}); },
   },
   template: `
@@ -18,15 +21,15 @@ export default {
         <a v-for="(link, i) in links" :key="link.name" :href="link.path" :aria-current="link.name === current ? 'page' : null">
           <span>{{ link.title }}</span><kbd aria-hidden="true">{{ i + 1 }}</kbd></a>
         <div class="foot" role="status">
-          <div class="line"><i :class="['dot', faults.length ? 'warn' : 'good']"></i>{{ faults.length ? 'Needs a look' : 'Ready' }}</div>
+          <div class="line"><i :class="['dot', faults.length ? 'warn' : starting.length ? '' : 'good']"></i>{{ faults.length ? 'Needs a look' : starting.length ? 'Starting: ' + starting.join(', ') : 'Ready' }}</div>
           <div v-for="[name, detail] in faults" :key="name" class="warn">{{ name === 'egl' ? 'graphics' : name }}: {{ detail }}</div>
           <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
           <div>{{ status.disk || '\\u00a0' }}</div>
           <a v-if="status.local === false" href="/sign-in" style="padding: 0">Other API key</a>
-          <div><kbd>?</kbd> keys</div>
+          <div class="line"><span><kbd>?</kbd> keys</span><button class="b quiet small push" id="look" :aria-pressed="look === 'light'" @click="turn">{{ look === 'light' ? 'Dark' : 'Light' }}</button></div>
         </div>
       </nav>
-      <main class="main"><slot></slot></main>
+      <div class="main"><slot></slot></div>
       <div class="messages" role="log" aria-live="polite" aria-label="Messages">
         <div v-for="r in removed" :key="r.id" class="message line"><span class="grow">Removed: {{ r.title }}</span><button class="b" @click="$emit('undo', r.id)">Undo</button></div>
         <div v-for="m in messages" :key="m.id" :class="['message', m.kind]">
@@ -41,25 +44,36 @@ export default {
       </div>
     </div>`,
   created() {
-    this.keys = [["1 - 6", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["Esc", "stop a countdown, close"],
+    this.keys = [["1 - 7", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["H", "Rig: open the head that is ready"], ["Esc", "stop a countdown, close"],
       ["1 - 7", "Features: choose a point"], ["Arrows", "Features: move it by 0.25 px (Shift: 2 px)"], ["Tab", "Features: next view"], ["Enter", "Features: take the suggested place"],
       ["Del", "Features: take the point back"], ["S", "Features: save"], ["H B", "Result: head, bust"], ["T G U P", "Result: texture, clay, uncertainty, parts"], ["W M", "Result: wireframe, measure"], ["?", "this list"]];
     window.eigenheadSay = (kind, text, faults) => this.say(kind, text, faults || []);
   },
-  mounted() { window.addEventListener("keydown", this.key); },
-  unmounted() { window.removeEventListener("keydown", this.key); },
+  mounted() { window.addEventListener("keydown", this.key); document.addEventListener("scroll", this.scrolled, true); this.scrollBack(); },
+  unmounted() { window.removeEventListener("keydown", this.key); document.removeEventListener("scroll", this.scrolled, true); clearInterval(this.scrolling); },
   methods: {
     say(kind, text, faults) {
       const id = this.next++, further = faults.filter((fault) => !text.includes(fault));
       this.messages = [...this.messages, { id, kind, text, faults: further }].slice(-MESSAGES_MOST);
       if (kind === "done") setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
     },
+    turn() { this.look = this.look === "light" ? "dark" : "light"; },
+    place(name) { return `eigenhead scroll ${location.pathname} ${name}`; },
+    scrolled(event) { const name = event.target.dataset?.scroll; if (name && !this.scrolling) sessionStorage.setItem(this.place(name), event.target.scrollTop); },
+    scrollBack() { // to where the lists were before a reload, as soon as they are long enough again
+      const began = Date.now(), wanted = (list) => Number(sessionStorage.getItem(this.place(list.dataset.scroll)) || 0);
+      this.scrolling = setInterval(() => {
+        const lists = [...document.querySelectorAll("[data-scroll]")], back = lists.filter((list) => list.scrollHeight - list.clientHeight >= wanted(list));
+        back.forEach((list) => { list.scrollTop = wanted(list); });
+        if ((lists.length && back.length === lists.length) || Date.now() - began > SCROLL_BACK_MS) { clearInterval(this.scrolling); this.scrolling = 0; }
+      }, 100);
+    },
     drop(id) { this.messages = this.messages.filter((m) => m.id !== id); },
     key(event) {
       if (typing(event)) return;
       if (event.key === "?") this.help = !this.help;
       else if (event.key === "Escape") this.help = false;
-      else if (this.current !== "features" && /^[1-6]$/.test(event.key)) window.location.href = this.links[event.key - 1].path;
+      else if (this.current !== "features" && /^[1-7]$/.test(event.key)) window.location.href = this.links[event.key - 1].path;
     },
   },
 };

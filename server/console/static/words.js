@@ -28,12 +28,16 @@ export function fixed(value, digits) {
 }
 
 const STAGES = { ingest: "taking the pictures in", read: "reading the pictures", segmentation: "finding silhouettes", alignment: "placing the head", fit: "fitting the head",
-  texture: "colouring the head", evidence: "judging the fit", write: "writing the files" };
+  texture: "colouring the head", evidence: "judging the fit", write: "writing the files", parts: "telling skin, hair and clothes apart", "fit again": "fitting the head again", depth: "measuring depths in the photographs", fine: "drawing the head to the photographs",
+  bust: "closing the surface of the bust", atlas: "painting the texture", compiling: "compiling, once on this machine", done: "done", detection: "finding the board in the pictures", lenses: "estimating the lenses", "pose graph": "placing the cameras", bundle: "adjusting cameras and boards together", checks: "checking the result" };
 export function stageWords(stage) { return STAGES[stage] || stage; }
 
 // The session that the operator works in, kept for the pages of this browser tab.
 export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
 export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }
+// What was typed and not sent is kept in this browser tab: a reload brings it back.
+export function kept(name) { try { return JSON.parse(sessionStorage.getItem(`eigenhead ${name}`)); } catch (error) { return null; } }
+export function keepDraft(name, value) { value ? sessionStorage.setItem(`eigenhead ${name}`, JSON.stringify(value)) : sessionStorage.removeItem(`eigenhead ${name}`); }
 // What is chosen and sought stands in the address, so that a reload or a bookmark brings it back.
 export function keepAddress(fields) {
   const kept = new URLSearchParams(Object.entries(fields).filter(([, value]) => value));

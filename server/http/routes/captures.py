@@ -1,8 +1,9 @@
 """Captures: taken with the rig or uploaded, looked at, given feature points, removed."""
 
 import json
+from collections.abc import Callable
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse
@@ -10,11 +11,14 @@ from fastapi.responses import FileResponse
 from rig.errors import InputError
 from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
+from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Limit, Sought
 from server.http.rig_schemas import CaptureChecks, HoldingsOut
-from server.http.schemas import CaptureEdit, CaptureList, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
+from server.http.schemas import CaptureEdit, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
+from server.services.bulk import each
 from server.services.captures import TEXT_MOST, About
-from server.services.jobs import Work
 from server.services.keys import Caller
+from server.services.work import Work
+from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.wire.fetch import fetch_archive
 from server.wire.multipart import ARCHIVE, described_form, receive_capture
@@ -67,13 +71,37 @@ async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, r
 def list_captures(
     service: ServiceOf,
     caller: Reader,
+    q: Sought = "",
     session: Annotated[str | None, Query(max_length=64)] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    verdict: Annotated[Literal["good", "usable", "poor", "none"] | None, Query(description="none: not judged")] = None,
+    sort: CaptureOrder = "-created",
+    limit: Limit = 100,
+    cursor: Cursor = None,
     before: Annotated[str | None, Query(max_length=64, description="only captures older than this id")] = None,
 ) -> CaptureList:
-    """Newest first."""
-    found = service.captures.find(session=session, limit=limit, before=before)
-    return CaptureList(captures=[CaptureOut.model_validate(record) for record in found])
+    """A page at a time, newest first unless asked otherwise; ``q`` looks into label, expression, session, verdict,
+    source and id."""
+    query = CaptureQuery(q, session, verdict, before=before, order=sort)
+    found = service.captures.page(query, limit, cursor)
+    captures = [CaptureOut.model_validate(record) for record in found.items]
+    return CaptureList(captures=captures, next=found.next, total=found.total)
+
+
+@router.post("/captures/bulk", responses=documented(400, 413, 415, 507))
+def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> BulkOut:
+    """One action on many captures; what cannot be done to one is said and holds no other up. ``reconstruct`` needs the
+    scope ``submit``."""
+    if wanted.action == "reconstruct" and not caller.may("submit"):
+        raise Forbidden("scope-missing", "Your key may not do that: it lacks the scope 'submit'.")
+    work = Work(wanted.model, wanted.settings)
+    work.check()
+    actions: dict[str, Callable[[str], object]] = {
+        "remove": service.captures.remove,
+        "erase": service.captures.erase,
+        "reconstruct": lambda capture: service.jobs.submit(capture, work, key=caller.key),
+        "move": lambda capture: service.captures.edit(capture, {"session": wanted.session}),
+    }
+    return BulkOut.model_validate(each(wanted.ids, actions[wanted.action]))
 
 
 @router.get("/captures/{capture_id}", responses=documented(404))

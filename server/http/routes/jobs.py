@@ -1,6 +1,6 @@
 """Jobs: submitted, watched, cancelled, restarted; and the files that they made."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict
 from typing import Annotated
 from urllib.parse import quote
@@ -11,10 +11,14 @@ from fastapi.responses import FileResponse, PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.http.auth import ServiceOf, require
-from server.http.schemas import JobList, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
-from server.services.jobs import FINISHED, Work
+from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Limit, Sought
+from server.http.schemas import JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
+from server.services.bulk import each
+from server.services.jobs import FINISHED, STATUSES
 from server.services.keys import Caller
 from server.services.records import Job
+from server.services.work import Work
+from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JobWebhook
 from server.wire.problems import Responses, documented
 from server.wire.send_file import media_type, send_archive, send_file
@@ -42,26 +46,46 @@ def submit_job(
 
 
 @router.post("/sessions/{session_id}/jobs", status_code=202, responses=documented(400, 404, 413, 415, 507))
-def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wanted: NewSessionJobs) -> JobList:
+def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wanted: NewSessionJobs) -> JobBatch:
     """Queues a reconstruction of every capture of a session."""
     work = Work(wanted.model, wanted.settings)
     jobs = service.jobs.submit_session(session_id, work, key=caller.key, priority=wanted.priority)
-    return JobList(jobs=[JobOut.model_validate(job) for job in jobs])
+    return JobBatch(jobs=[JobOut.model_validate(job) for job in jobs])
 
 
 @router.get("/jobs", responses=documented(400))
 def list_jobs(
     service: ServiceOf,
     caller: Reader,
+    q: Sought = "",
     state: State | None = None,
     capture: Annotated[str | None, Query(max_length=64)] = None,
     session: Annotated[str | None, Query(max_length=64)] = None,
-    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
-    offset: Annotated[int, Query(ge=0, le=1_000_000)] = 0,
+    sort: JobOrder = "-created",
+    limit: Limit = 100,
+    cursor: Cursor = None,
+    offset: Annotated[int, Query(ge=0, le=1_000_000, deprecated=True)] = 0,
 ) -> JobList:
-    """Newest first."""
-    jobs = service.jobs.find(state=state, capture=capture, session=session, limit=limit, offset=offset)
-    return JobList(jobs=[JobOut.model_validate(job) for job in jobs])
+    """A page at a time, newest first unless asked otherwise; ``q`` looks into name, model, method, level, id and the
+    capture's words. ``offset`` serves older clients: a cursor neither repeats nor drops a job."""
+    query = JobQuery(q, None if state is None else STATUSES[state], capture, session, sort)
+    if offset:
+        old = service.jobs.find(state=state, capture=capture, session=session, limit=limit, offset=offset)
+        total = service.jobs.page(query, 1).total
+        return JobList(jobs=[JobOut.model_validate(job) for job in old], next=None, total=total)
+    found = service.jobs.page(query, limit, cursor)
+    return JobList(jobs=[JobOut.model_validate(job) for job in found.items], next=found.next, total=found.total)
+
+
+@router.post("/jobs/bulk", responses=documented(400, 413, 415, 507))
+def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkOut:
+    """One action on many jobs; what cannot be done to one is said and holds no other up."""
+    actions: dict[str, Callable[[str], object]] = {
+        "cancel": service.cancel,
+        "restart": lambda job: service.jobs.restart(job, Work(), key=caller.key),
+        "remove": service.jobs.delete,
+    }
+    return BulkOut.model_validate(each(wanted.ids, actions[wanted.action]))
 
 
 @router.get("/jobs/{job_id}", responses=documented(404))

@@ -123,5 +123,5 @@ def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesLi
 
 @router.put("/calibration", responses=documented(400, 404, 409, 413, 415, 507))
 def use_calibration(service: ServiceOf, caller: Taker, wanted: UseCalibration) -> RigOut:
-    """Every capture from now on gets this calibration."""
-    return RigOut.model_validate(service.use_calibration(wanted.calibration_id))
+    """Every capture from now on gets this calibration. 409 for a poor one, naming what it lacks, unless asked for."""
+    return RigOut.model_validate(service.use_calibration(wanted.calibration_id, poor=wanted.poor))

@@ -5,8 +5,10 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 
 from server.http.auth import ServiceOf, require
-from server.http.schemas import NewSession, SessionEdit, SessionList, SessionOut
+from server.http.list_schemas import Cursor, Limit, SessionList, Sought, SubjectList, SubjectOut
+from server.http.schemas import NewSession, SessionEdit, SessionOut
 from server.services.keys import Caller
+from server.storage.library import SubjectOrder
 from server.wire.problems import documented
 
 router = APIRouter(prefix="/v1", tags=["sessions"])
@@ -22,10 +24,29 @@ def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response
     return SessionOut.model_validate(made)
 
 
-@router.get("/sessions", responses=documented())
-def list_sessions(service: ServiceOf, caller: Reader) -> SessionList:
-    """Newest first."""
-    return SessionList(sessions=[SessionOut.model_validate(found) for found in service.sessions.find()])
+@router.get("/sessions", responses=documented(400))
+def list_sessions(
+    service: ServiceOf, caller: Reader, q: Sought = "", limit: Limit = 100, cursor: Cursor = None
+) -> SessionList:
+    """Newest first, a page at a time; ``q`` looks into label and consent."""
+    found = service.sessions.page(q, limit, cursor)
+    sessions = [SessionOut.model_validate(session) for session in found.items]
+    return SessionList(sessions=sessions, next=found.next, total=found.total)
+
+
+@router.get("/subjects", responses=documented(400))
+def list_subjects(
+    service: ServiceOf,
+    caller: Reader,
+    q: Sought = "",
+    sort: SubjectOrder = "-created",
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> SubjectList:
+    """People: sessions of one name are one person's. Each with its newest head."""
+    found = service.sessions.subjects(q, sort, limit, cursor)
+    subjects = [SubjectOut.model_validate(subject) for subject in found.items]
+    return SubjectList(subjects=subjects, next=found.next, total=found.total)
 
 
 @router.get("/sessions/{session_id}", responses=documented(404))

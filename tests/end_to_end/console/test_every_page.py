@@ -13,10 +13,10 @@ from tests.support.services import RunningService, uploaded_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-PATHS = ("/", "/captures", "/features", "/jobs", "/result", "/calibration")
+PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration")
 
 
-def test_no_page_has_a_serious_violation_and_each_says_what_to_do(
+def test_no_page_has_a_violation_dark_or_light_and_each_says_what_to_do(
     browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
 ) -> None:
     found = []
@@ -37,6 +37,13 @@ def test_no_page_has_a_serious_violation_and_each_says_what_to_do(
             capture = uploaded_capture(service, tmp_path)
             httpx.post(service.url + "/v1/jobs", json={"capture_id": capture})
             httpx.post(service.url + "/v1/jobs", json={"capture_id": capture, "settings": {"front": "fail"}})
+    v.page.locator("#look").click()
+    for path in PATHS:
+        page = v.go(path)
+        page.wait_for_timeout(1000)
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(242, 244, 247)"
+        found += [f"light {path}: {violation}" for violation in violations(page)]
+        page.screenshot(path=screenshots / f"light{path.replace('/', '-').rstrip('-')}.png")
     assert found == []
     assert v.errors == []
 

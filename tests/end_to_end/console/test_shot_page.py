@@ -6,13 +6,13 @@ from pathlib import Path
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from rig.formats.cameras_json import write_rig
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from tests.rig.acquisition.test_session import flat_rig
-from tests.support.browser import chromium, keep_screenshots, live_rate, visit
-from tests.support.services import RunningService, running_service
+from tests.support.browser import keep_screenshots, live_rate, visit
+from tests.support.studio_pages import StudioPages, studio_pages
 from tests.support.textured_studio import NAMES as ALL_NAMES
 from tests.support.textured_studio import FlatStudio
 
@@ -22,37 +22,21 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 @pytest.fixture
-def studio(tmp_path: Path) -> Iterator[StudioDevices]:
+def pages(tmp_path: Path) -> Iterator[StudioPages]:
     folder = tmp_path / "studio"
     write_rig(flat_rig(NAMES), folder / "cameras.json")
-    with StudioDevices(folder, NAMES, FlatStudio(False), FlatStudio(True), calibration="cameras.json") as devices:
-        yield devices
-
-
-@pytest.fixture
-def browser(studio: StudioDevices) -> Iterator[Browser]:
-    """Opened after the studio and closed before it: both run an event loop of their own in this thread."""
-    with chromium() as opened:
+    studio = StudioDevices(folder, NAMES, FlatStudio(False), FlatStudio(True), calibration="cameras.json")
+    with studio_pages(studio, tmp_path / "data", worker=False) as opened:
         yield opened
 
 
-@pytest.fixture
-def rig_service(studio: StudioDevices, tmp_path: Path) -> Iterator[RunningService]:
-    rig_file = str(studio.folder / "rig.toml")
-    with running_service(tmp_path / "data", worker=False, rig=rig_file, console="true") as running:
-        yield running
-
-
 def test_plates_are_judged_and_a_shot_is_kept_retaken_or_reconstructed(
-    browser: Browser,
-    studio: StudioDevices,
-    rig_service: RunningService,
-    screenshots: Path,
-    record_property: Callable[[str, object], None],
+    pages: StudioPages, screenshots: Path, record_property: Callable[[str, object], None]
 ) -> None:
     """Clean plates with somebody in them are refused, used all the same, and taken back with one click; a shot with a
     moved camera is named, retaken (which removes it), and the good one reconstructed, each with one key."""
-    v = visit(browser, rig_service.url)
+    studio, rig_service = pages.studio, pages.service
+    v = visit(pages.browser, rig_service.url)
     page = v.go("/")
     expect(page.locator("article.tile")).to_have_count(len(NAMES))
     take_plates(page, studio)

@@ -12,7 +12,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from tests.support.ball_results import RADIUS_MM
-from tests.support.browser import keep_screenshots, visit
+from tests.support.browser import Visit, keep_screenshots, keep_widths, visit
 from tests.support.services import RunningService, await_state, packed_capture, running_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -74,7 +74,24 @@ def test_what_is_shown_is_what_the_files_hold(browser: Browser, heads: RunningSe
     keep_screenshots(page, screenshots, "viewer-parts")
     check_comparison(page)
     check_look_through(page)
+    check_subjects(v, screenshots)
     v.check_clean()
+
+
+def check_subjects(v: Visit, screenshots: Path) -> None:
+    """A card a person with a picture of the newest head, which opens it."""
+    page = v.go("/subjects")
+    cards = page.locator("[data-subject]")
+    expect(cards).to_have_count(2)
+    expect(cards.filter(has_text="Anna")).to_contain_text("2 shots · 2 heads")
+    page.wait_for_function(
+        "[...document.querySelectorAll('.portrait img')].filter(i => i.naturalWidth > 0).length === 2"
+    )
+    keep_widths(page, screenshots, "subjects")
+    page.locator("#find").fill("bert")
+    expect(cards).to_have_count(1)
+    cards.get_by_role("link", name="Head", exact=True).click()
+    expect(page.get_by_label("Head", exact=True).locator("option:checked")).to_contain_text("Bert", timeout=30_000)
 
 
 def check_comparison(page: Page) -> None:

@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from rig.formats.archive import pack_folder
-from tests.support.browser import LONG_MS, keep_screenshots, live_rate, visit
+from tests.support.browser import LONG_MS, keep_screenshots, keep_widths, live_rate, visit
 from tests.support.services import RunningService, uploaded_capture
 from tests.support.shared_data import shared
 
@@ -34,6 +34,35 @@ def test_quick_keys_do_not_overtake_each_other(browser: Browser, service: Runnin
     v.check_clean()
 
 
+def test_points_that_contradict_are_told_before_they_are_saved(
+    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+) -> None:
+    """The cameras stand side by side: a point lies in the same row of all pictures."""
+    capture = uploaded_capture(service, tmp_path)
+    v = visit(browser, service.url)
+    page = v.go(f"/features/{capture}")
+    for number, up in enumerate((0, 5)):
+        page.locator("svg[data-view]").nth(number).focus()
+        page.keyboard.press("Enter")
+        for _ in range(up):
+            page.keyboard.press("Shift+ArrowUp")
+    first = page.locator("[data-point]").first
+    expect(first).to_contain_text("contradicts")
+    page.reload()
+    expect(first).to_contain_text("2 views", timeout=30_000)  # not saved, and still there
+    page.locator("#save").click()
+    asked = page.locator("#contradictions")
+    expect(asked).to_contain_text("views contradict each other")
+    keep_widths(page, screenshots, "features-contradiction")
+    stored = f"{service.url}/v1/captures/{capture}/features"
+    assert httpx.get(stored).json()["points"] == {}
+    page.locator("#save-anyway").click()
+    expect(page.get_by_text("Saved.")).to_be_visible()
+    expect(asked).to_have_count(0)
+    assert len(httpx.get(stored).json()["points"]["exocanthion_right"]) == 2
+    v.check_clean()
+
+
 def test_a_job_is_cancelled_and_restarted_with_other_settings(
     browser: Browser, service: RunningService, tmp_path: Path
 ) -> None:
@@ -48,6 +77,8 @@ def test_a_job_is_cancelled_and_restarted_with_other_settings(
     page.locator("#restart").click()
     page.get_by_label("Front camera").fill("fail")
     page.get_by_label("Further settings").fill("{")
+    page.reload()
+    expect(page.get_by_label("Front camera")).to_have_value("fail", timeout=30_000)  # what was typed outlives a reload
     page.get_by_role("button", name="Queue the new job").click()
     expect(page.get_by_text("the further settings are no JSON")).to_be_visible(timeout=10_000)
     expect(page.get_by_label("Front camera")).to_have_value("fail")  # a refused form keeps what was typed
@@ -121,6 +152,9 @@ def test_a_calibration_is_uploaded_shown_and_refused_for_another_rig(
     expect(row).to_have_count(1, timeout=LONG_MS)
     expect(page.locator("[data-calibration][data-state=succeeded]")).to_have_count(1, timeout=LONG_MS)
     expect(page.locator("table tr", has_text="cam_3")).to_be_visible()
+    verdict = page.locator("#calibration-verdict")
+    expect(verdict).to_have_attribute("data-verdict", "usable")
+    expect(verdict).to_contain_text("focal length known no better than 1 %")
     keep_screenshots(page, screenshots, "calibration-report")
     page.get_by_role("button", name="Use this").click()
     expect(page.get_by_text("The calibration is of other cameras than the rig has")).to_be_visible()

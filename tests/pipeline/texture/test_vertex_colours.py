@@ -126,7 +126,7 @@ def test_hidden_surfaces_take_no_colour_from_what_hides_them() -> None:
 
 def test_highlights_count_less_than_what_the_other_views_say() -> None:
     shot = shoot(gloss=0.5)
-    robust, plain = colour(shot), colour(shot, highlight=1e6)
+    robust, plain = colour(shot), colour(shot, outlier=1e6)
     visible = robust.views >= 3
     assert psnr(robust, shot, visible) > psnr(plain, shot, visible) + 0.5
 

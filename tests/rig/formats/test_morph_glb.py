@@ -64,6 +64,7 @@ def test_a_morph_moves_what_it_says(head: Mesh) -> None:
 
 
 def test_other_programs_still_read_the_mesh(head: Mesh) -> None:
-    scene = trimesh.load_scene(wrap_as_stream(morphed(head)), file_type="glb")
+    scene = trimesh.load(wrap_as_stream(morphed(head)), file_type="glb")
+    assert isinstance(scene, trimesh.Scene)
     (mesh,) = scene.geometry.values()
     np.testing.assert_allclose(mesh.vertices * 1000.0, head.vertices, atol=1e-3)

@@ -32,3 +32,21 @@ def test_warnings_of_a_result_reach_the_terminal_and_the_status_stays_0(
     assert done.stderr.splitlines() == [f"eigenhead: {w['code']}: {w['message']}" for w in warnings]
     if as_json:
         assert json.loads(done.stdout)["warnings"] == warnings
+
+
+def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_settings(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[Any] = []
+
+    def reconstructed(*given: Any, settings: dict[str, Any], **named: Any) -> dict[str, Any]:
+        asked.append(settings["outputs"])
+        return {"warnings": []}
+
+    monkeypatch.setattr(reconstruct_local, "reconstruct_locally", reconstructed)
+    arguments = ["reconstruct", str(small_capture(tmp_path / "capture")), "--out", str(tmp_path / "out")]
+    wrong = CliRunner().invoke(app, [*arguments, "--formats", "glb,fbx"])
+    assert (wrong.exit_code, asked) == (2, [])
+    assert "'fbx' is none of glb, ply, obj, usdz, stl, 3mf" in " ".join(wrong.stderr.replace("│", " ").split())
+    assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
+    assert asked == [{"formats": ["glb", "usdz"]}]

@@ -13,7 +13,10 @@ import pytest
 from rig.errors import InputError
 from server.errors import Conflict, NotFound
 from server.services.calibrations import Calibrations
-from server.storage.records import CameraSize, CaptureRecord
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+from server.storage.events import EventLog
+from server.storage.records import CameraSize, CaptureRecord, EventDocument
 from server.storage.store import Store, new_id
 
 BOARD = {"kind": "checkerboard", "columns": 9, "rows": 6, "square_mm": 25.0}
@@ -49,7 +52,8 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.fixture
 def calibrations(store: Store, engine: Engine) -> Calibrations:
-    return Calibrations(store, engine, "queue")  # pyright: ignore[reportArgumentType]
+    events = EventLog(open_database(ServiceSettings(data=store.data)))
+    return Calibrations(store, engine, "queue", events)  # pyright: ignore[reportArgumentType]
 
 
 def board_shot(store: Store, text: str) -> str:
@@ -163,3 +167,24 @@ def test_what_was_accepted_but_not_queued_is_queued_when_it_is_asked_for(
     record.write_text("{")
     with pytest.raises(NotFound):
         calibrations.get(identity)
+
+
+def test_a_poor_one_is_not_put_to_use_unasked_and_a_running_one_tells_its_progress(
+    calibrations: Calibrations, store: Store, engine: Engine
+) -> None:
+    made = calibrations.add_shots(BOARD, [board_shot(store, "a")], "few")
+    engine.rows[made.id].status = "PENDING"
+    assert (calibrations.get(made.id).progress, calibrations.get(made.id).eta_s) == (0.0, None)
+    told: EventDocument = {"state": "running", "stage": "bundle", "progress": 0.6, "eta_s": 12.5}
+    calibrations._events.append(made.id, told)
+    running = calibrations.get(made.id)
+    assert (running.stage, running.progress, running.eta_s) == ("bundle", 0.6, 12.5)
+    finish(store, engine, made.id)
+    calibrations.check_usable(made.id)  # of a version that did not judge
+    engine.rows[made.id].output |= {"verdict": "poor", "missing": ["cam03: fewer than 3 views of the board"]}
+    with pytest.raises(Conflict, match="calibration is poor") as refused:
+        calibrations.check_usable(made.id)
+    assert refused.value.errors == ["cam03: fewer than 3 views of the board"]
+    assert calibrations.get(made.id).missing == ("cam03: fewer than 3 views of the board",)
+    calibrations.remove(made.id)
+    assert calibrations._events.latest([made.id]) == {}

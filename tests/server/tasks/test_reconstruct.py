@@ -53,6 +53,7 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
         "texture",
         "write",
     ]
+    assert order[-1] == "write"  # nothing is called done before its files are there
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert all(camera["used"] for camera in report["cameras"].values())
     assert {warning["code"] for warning in report["warnings"]} <= {"view"}

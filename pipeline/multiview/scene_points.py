@@ -1,0 +1,126 @@
+"""Points of the scene that two neighbouring views show, from cameras that are known.
+
+SIFT keypoints of each view are matched with those of its neighbours; what the cameras allow, by the distance of both
+pixels from the point where their rays pass each other, is kept. Points say what is near and what is far where colours
+do not; a uniform backdrop has none.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rig.camera import Camera
+from rig.rig import Rig
+
+KEYPOINTS_MOST = 3000  # a view
+WIDTH_MOST = 1400  # px: larger pictures are reduced, a pixel is not asked for here
+NEIGHBOURS, ANGLE_MOST_DEG, ANGLE_LEAST_DEG = 4, 50.0, 1.5  # of the rays at the subject; SIFT bears 30 degrees or so
+RATIO = 0.75  # of the best match's distance to the second's (Lowe 2004 has 0.8)
+MISS_MOST_PX = 1.5  # of the reduced picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScenePoints:
+    """``points``: world, mm; ``pixels``: by view, where the points whose ``rows`` these are were seen."""
+
+    points: Float[np.ndarray, "n 3"]
+    pixels: Mapping[str, Float[np.ndarray, "_ 2"]]
+    rows: Mapping[str, np.ndarray]
+
+
+def find_scene_points(
+    images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], rig: Rig, *, report: Callable[[float], None] = lambda share: None
+) -> ScenePoints:
+    """All points that any two neighbouring views agree upon."""
+    seen = {}
+    for count, camera in enumerate(rig):
+        report(0.5 * count / len(rig))
+        seen[camera.name] = _keypoints(images[camera.name])
+    points: list[np.ndarray] = []
+    pixels: dict[str, list[np.ndarray]] = {name: [] for name in rig.names}
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in rig.names}
+    total = 0
+    pairs = neighbouring_pairs(rig)
+    for count, (a, b) in enumerate(pairs):
+        report(0.5 + 0.5 * count / max(1, len(pairs)))
+        first, second = _matches(seen[a], seen[b])
+        found, good = _where_rays_pass(rig[a], first, rig[b], second)
+        points.append(found[good])
+        own = np.arange(total, total + np.count_nonzero(good))
+        total += len(own)
+        for name, at in ((a, first), (b, second)):
+            pixels[name].append(at[good])
+            rows[name].append(own)
+    return ScenePoints(
+        np.concatenate(points) if points else np.zeros((0, 3)),
+        {name: np.concatenate(at) if at else np.zeros((0, 2)) for name, at in pixels.items()},
+        {name: np.concatenate(row) if row else np.zeros(0, int) for name, row in rows.items()},
+    )
+
+
+def neighbouring_pairs(rig: Rig) -> list[tuple[str, str]]:
+    """Each camera with those that look at the subject from nearly the same side."""
+    away = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    angle = np.degrees(np.arccos(np.clip(away @ away.T, -1, 1)))
+    np.fill_diagonal(angle, np.inf)
+    pairs = {
+        (min(i, int(j)), max(i, int(j)))
+        for i in range(len(rig))
+        for j in np.argsort(angle[i])[:NEIGHBOURS]
+        if angle[i, j] < ANGLE_MOST_DEG
+    }
+    return [(rig.names[i], rig.names[j]) for i, j in sorted(pairs)]
+
+
+def _keypoints(image: UInt8[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of the full image, and descriptors."""
+    scale = min(1.0, WIDTH_MOST / max(image.shape[:2]))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
+    found, descriptors = cv2.SIFT.create(nfeatures=KEYPOINTS_MOST).detectAndCompute(
+        cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None
+    )
+    at = np.array([point.pt for point in found]).reshape(-1, 2)
+    descriptors = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
+    return (at + 0.5) / scale - 0.5, np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+
+
+def _matches(
+    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of mutual matches that pass the ratio test."""
+    if min(len(first[0]), len(second[0])) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    likeness = first[1] @ second[1].T
+    best = likeness.argmax(axis=1)
+    row = np.arange(len(best))
+    top = likeness[row, best]
+    mutual = likeness.argmax(axis=0)[best] == row
+    likeness[row, best] = -1
+    next_best = likeness.max(axis=1)
+    good = mutual & (2 - 2 * top < RATIO**2 * (2 - 2 * next_best))
+    return first[0][good], second[0][best[good]]
+
+
+def _where_rays_pass(
+    a: Camera, first: Float[np.ndarray, "n 2"], b: Camera, second: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
+    """The points halfway between two rays, and which of them both pixels confirm."""
+    if not len(first):
+        return np.zeros((0, 3)), np.zeros(0, bool)
+    u, v = a.rays_world(first), b.rays_world(second)
+    base = b.centre_world - a.centre_world
+    cosine = (u * v).sum(axis=1)
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    along_u = (u @ base - cosine * (v @ base)) / sine2
+    along_v = (cosine * (u @ base) - v @ base) / sine2
+    points = 0.5 * (a.centre_world + along_u[:, None] * u + b.centre_world + along_v[:, None] * v)
+    limit = MISS_MOST_PX * max(1.0, max(a.intrinsics.width, a.intrinsics.height) / WIDTH_MOST)
+    good = (sine2 > np.sin(np.radians(ANGLE_LEAST_DEG)) ** 2) & (along_u > 0) & (along_v > 0)
+    for camera, at in ((a, first), (b, second)):
+        with np.errstate(invalid="ignore"):
+            good &= np.linalg.norm(camera.project(points) - at, axis=1) < limit
+    return points, good

@@ -1,0 +1,46 @@
+"""Which way is up, where photographs were held upright, on their side or upside down.
+
+A camera that is not rolled by anything but quarter turns has its rows or its columns level, so up is nearly along one
+of its two image axes and across the other. That is a guess: floors and faces are not looked at.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rig.rig import Rig
+
+
+def quarter_turns(rig: Rig) -> Int[np.ndarray, " c"]:
+    """By how many quarter turns each camera's frame must be turned for up to be up in its image."""
+    axes = _image_axes(rig)
+    return np.argmin(_downs(axes) @ _nearest_up(rig, axes), axis=1)
+
+
+def guessed_up(rig: Rig) -> Float[np.ndarray, " 3"]:
+    """The world's direction that is up in the photographs, as they would be had all been held upright."""
+    downs = _downs(_image_axes(rig))[np.arange(len(rig)), quarter_turns(rig)]
+    up = -downs.mean(axis=0)
+    return up / max(float(np.linalg.norm(up)), 1e-9)
+
+
+def _image_axes(rig: Rig) -> Float[np.ndarray, "c 2 3"]:
+    """x and y of each image, in the world."""
+    return np.stack([camera.camera_from_world.rotation[:2] for camera in rig])
+
+
+def _downs(axes: Float[np.ndarray, "c 2 3"]) -> Float[np.ndarray, "c 4 3"]:
+    """The image's y axis after 0, 1, 2 and 3 quarter turns."""
+    return np.stack([axes[:, 1], axes[:, 0], -axes[:, 1], -axes[:, 0]], axis=1)
+
+
+def _nearest_up(rig: Rig, axes: Float[np.ndarray, "c 2 3"]) -> Float[np.ndarray, " 3"]:
+    candidates = axes.reshape(-1, 3)
+    along = np.abs(axes @ candidates.T)
+    best = candidates[int(np.argmax((along.max(axis=1) - along.min(axis=1)).sum(axis=0)))]
+    by_axis = axes @ best
+    held = np.abs(by_axis[:, 1]) > np.abs(by_axis[:, 0])  # upright or upside down
+    votes = float(-np.sign(by_axis[held, 1]).sum())
+    if votes == 0:  # all on their side: more cameras look down at a subject than up
+        origin = rig.centre_world()
+        votes = float(sum((camera.centre_world - origin) @ best for camera in rig))
+    return best if votes >= 0 else -best

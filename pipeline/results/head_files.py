@@ -1,0 +1,108 @@
+"""The fitted head in every format that the settings ask for.
+
+head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm,
+z up.
+With a texture the first vertices of head.glb are head.ply's, in its order; those at the seam follow once more.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.results.metadata import asset_extras, ply_comments
+from pipeline.results.printable import printable
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.texture.uv_unwrap import Atlas
+from rig.atomic_write import write_atomically
+from rig.formats.glb import Skin, glb_bytes
+from rig.formats.obj import mtl_bytes, obj_bytes, textured_obj_bytes
+from rig.formats.ply import write_ply
+from rig.formats.printing import stl_bytes, threemf_bytes
+from rig.formats.usdz import usdz_bytes
+from rig.mesh import Mesh
+
+JPEG_OPTIONS = (
+    cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+)  # fmt: skip
+ENCODINGS = {
+    "jpeg": (".jpg", "image/jpeg", JPEG_OPTIONS),
+    "webp": (".webp", "image/webp", (cv2.IMWRITE_WEBP_QUALITY, 92)),
+    "png": (".png", "image/png", (cv2.IMWRITE_PNG_COMPRESSION, 6)),
+}
+
+
+def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
+    """head.ply, and what ``settings.outputs`` names beside it. Raises NoUsd, OSError.
+
+    Args:
+        folder: of the result.
+        result: what is written.
+        head: its mesh in the head frame, mm.
+    """
+    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.written, result.atlas
+    named = atlas is not None and outputs.ply_texture
+    corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
+    write_ply(
+        folder / "head.ply",
+        result.mesh_world,
+        normals=result.normals,
+        colours=result.colours,
+        quality=result.quality_mm.astype(np.float32),
+        views=result.views,
+        corner_uv=corner_uv,
+        comments=[*ply_comments(result), *(["TextureFile head.png"] if named else [])],
+    )
+    if atlas is not None and (named or "obj" in formats):
+        write_atomically(folder / "head.png", encoded(atlas, "png"))
+    normals = result.normals @ result.fit.world_from_head.rotation
+    if "glb" in formats:
+        write_atomically(folder / "head.glb", _glb(result, head, normals))
+    if "obj" in formats:
+        _write_obj(folder, result)
+    if "usdz" in formats and atlas is not None:
+        data = usdz_bytes(
+            head, normals=normals, uv=atlas.layout.uv, faces_uv=atlas.layout.faces, image=encoded(atlas, "jpeg"),
+            suffix=".jpg",
+        )  # fmt: skip
+        write_atomically(folder / "head.usdz", data)
+    if {"stl", "3mf"} & set(formats):
+        closed = printable(head)
+        for name, data_of in (("stl", stl_bytes), ("3mf", threemf_bytes)):
+            if name in formats:
+                write_atomically(folder / f"head.{name}", data_of(closed))
+
+
+def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
+    atlas, extras = result.atlas, asset_extras(result)
+    if atlas is None:
+        return glb_bytes(head, normals=normals, colours=result.colours, extras=extras)
+    kind = result.settings.outputs.image
+    source = atlas.layout.source
+    extras["repeated_vertices"] = source[len(head.vertices) :].tolist()
+    opened = Mesh(head.vertices[source], atlas.layout.faces)
+    skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1])
+    return glb_bytes(opened, normals=normals[source], skin=skin, extras=extras)
+
+
+def _write_obj(folder: Path, result: Reconstruction) -> None:
+    mesh, atlas = result.mesh_world, result.atlas
+    if atlas is None:
+        coloured = Mesh(mesh.vertices, mesh.faces, result.colours)
+        write_atomically(folder / "head.obj", obj_bytes(coloured))
+        return
+    layout = atlas.layout
+    data = textured_obj_bytes(
+        mesh, normals=result.normals, uv=layout.uv, faces_uv=layout.faces, library="head.mtl"
+    )  # fmt: skip
+    write_atomically(folder / "head.mtl", mtl_bytes("head.png"))
+    write_atomically(folder / "head.obj", data)
+
+
+def encoded(atlas: Atlas, kind: str) -> bytes:
+    """The texture as a file: ``kind`` of ``ENCODINGS``."""
+    suffix, _, options = ENCODINGS[kind]
+    stored: UInt8[np.ndarray, "s s 3"] = np.ascontiguousarray(atlas.image[:, :, ::-1])  # it is kept blue first
+    _, data = cv2.imencode(suffix, stored, list(options))
+    return data.tobytes()

@@ -1,0 +1,46 @@
+"""What files say of themselves: model, version, unit, frame, and what the job that made them was given. No ids and no
+times, so that the bytes repeat."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.settings import document_from_settings
+
+
+def ply_comments(result: Reconstruction) -> list[str]:
+    """Comment lines of head.ply and bust.ply."""
+    return [
+        "unit mm",
+        "frame world",
+        f"model {_ascii(result.model_name)} sha256 {result.model_sha256}",
+        f"job inputs sha256 {document_sha256(result.digests)}",
+        f"job settings sha256 {document_sha256(document_from_settings(result.settings))}",
+        f"version eigenhead {version('eigenhead')}",
+        "quality is the posterior standard deviation in mm, views the number of images that coloured a vertex",
+    ]
+
+
+def asset_extras(result: Reconstruction) -> dict[str, Any]:
+    """``asset.extras`` of head.glb and bust.glb."""
+    return {
+        "unit": "m",
+        "frame": "head",
+        "model": {"name": result.model_name, "sha256": result.model_sha256},
+        "inputs_sha256": document_sha256(result.digests),
+        "settings_sha256": document_sha256(document_from_settings(result.settings)),
+        "version": version("eigenhead"),
+    }
+
+
+def document_sha256(document: Mapping[str, Any]) -> str:
+    """sha256 of the canonical JSON of a document."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _ascii(text: str) -> str:
+    """A PLY header is lines of ASCII."""
+    return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)

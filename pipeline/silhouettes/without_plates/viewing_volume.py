@@ -1,0 +1,131 @@
+"""The space that the cameras look at, in voxels, and what the other views say of a pixel of one.
+
+Enters: a rig and the sizes of its reduced images. Leaves: for every voxel its pixel in every view. A voxel is the
+subject's only where no view that sees it denies it, as in the visual hull (figure 1); views vote by log odds instead
+of masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space occupancy grid*, ICCV 2005), so that one
+that is in doubt neither carves nor keeps.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32
+
+from pipeline.multiview.visual_hull import depth_of
+from rig.rig import Rig
+
+CELLS = 96  # voxels a side: 7 mm where images show 0.66 m, 2.6 pixels of the reduced images
+DENIES_MOST = 4.0  # log odds that one view's word against a voxel is worth: empty space in one view is empty ...
+GRANTS_MOST, GRANTS_SUM = 1.0, 10.0  # ... and those for it, of one view and of all, however many they are
+WITNESSES_LEAST = 3  # other views that must see a voxel before their word counts
+WITNESSES_SHARE = 0.5  # of the other views that must hold a voxel for the subject before it must be in a mask
+SOLID_ODDS = 0.5  # log odds that all pixels around a voxel must have in a view that holds it for the subject
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewingVolume:
+    """Voxels in a ball around the place that all cameras look at."""
+
+    centre_world: Float[np.ndarray, " 3"]
+    radius_mm: float
+    places: Mapping[str, Int32[np.ndarray, " n"]]  # pixel (flat) of every voxel in a view's reduced image, or -1
+    reach_px: Mapping[str, int]  # width of a voxel in the reduced image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OtherViews:
+    """What all other views say of each pixel of one: ``support``, the greatest sum of their log odds along its ray
+    (negative where they leave nothing of the subject on it), and ``solid``, where each of them has the subject."""
+
+    support: Float32[np.ndarray, "h w"]
+    solid: Bool[np.ndarray, "h w"]
+
+
+def viewing_ball(rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre (world) and radius (mm) of what the cameras look at: as far as the corners of the median image reach."""
+    centre = rig.centre_world()
+    radius = float(
+        np.median(
+            [
+                depth_of(camera, centre) / k.fx * 0.5 * np.hypot(k.width, k.height)
+                for camera in rig
+                for k in (camera.intrinsics,)
+            ]
+        )
+    )
+    return centre, radius
+
+
+def viewing_volume(
+    rig: Rig,
+    sizes: Mapping[str, tuple[int, int]],
+    ball: tuple[Float[np.ndarray, " 3"], float],
+    *,
+    plane_world: Float[np.ndarray, " 4"] | None = None,
+) -> ViewingVolume:
+    """The volume of a rig whose reduced images have ``sizes`` (height, width), in ``ball``, centre and radius (mm).
+
+    ``plane_world``: what the subject stands on; only the side on which ``plane . (x, 1)`` is positive is kept."""
+    centre, radius = ball
+    line = ((np.arange(CELLS) + 0.5) / CELLS * 2 - 1) * radius
+    offsets = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
+    voxels = centre + offsets[(offsets**2).sum(axis=1) < radius**2]
+    if plane_world is not None:
+        voxels = voxels[voxels @ plane_world[:3] + plane_world[3] > radius / CELLS]
+    places, reach = {}, {}
+    for camera in rig:
+        height, width = sizes[camera.name]
+        scale = width / camera.intrinsics.width
+        at = (camera.project(voxels) + 0.5) * scale
+        seen = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)  # NaN, behind the camera, is not
+        pixels = np.where(seen[:, None], at, 0).astype(np.int32)
+        places[camera.name] = np.where(seen, pixels[:, 1] * width + pixels[:, 0], -1).astype(np.int32)
+        voxel_px = 2 * radius / CELLS * camera.intrinsics.fx / depth_of(camera, centre) * scale
+        reach[camera.name] = int(np.ceil(voxel_px))
+    return ViewingVolume(centre, radius, places, reach)
+
+
+def reachable(volume: ViewingVolume, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """The pixels on whose rays there are voxels at all."""
+    mask = np.zeros(size[0] * size[1], np.uint8)
+    places = volume.places[name]
+    mask[places[places >= 0]] = 1
+    return cv2.dilate(mask.reshape(size), _window(volume.reach_px[name])).view(bool)
+
+
+def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray, "_ _"]]) -> dict[str, OtherViews]:
+    """For each view, what the others say; ``odds``: of subject against background, of every view."""
+    count = len(next(iter(volume.places.values())))
+    total, seen, against = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
+    grants = min(GRANTS_MOST, GRANTS_SUM / max(1, len(odds) - 1))
+    words: dict[str, Float32[np.ndarray, " n"]] = {}
+    doubts: dict[str, Bool[np.ndarray, " n"]] = {}
+    for name, field in odds.items():
+        places = volume.places[name]
+        shown = places >= 0
+        at = np.where(shown, places, 0)
+        words[name] = np.where(shown, np.clip(field.ravel()[at], -DENIES_MOST, grants), 0).astype(np.float32)
+        width = 2 * volume.reach_px[name] + 1
+        around = cv2.erode(field, np.ones((width, width), np.uint8), borderValue=2 * SOLID_ODDS)
+        doubts[name] = shown & (around.ravel()[at] < SOLID_ODDS)
+        total, seen, against = total + words[name], seen + shown, against + doubts[name]
+    told = {}
+    for name, field in odds.items():
+        places = volume.places[name]
+        asked = (places >= 0) & (seen > WITNESSES_LEAST)
+        support = np.full(field.size, -DENIES_MOST * len(odds), np.float32)
+        np.maximum.at(support, places[asked], (total - words[name])[asked])
+        wanted = max(WITNESSES_LEAST, WITNESSES_SHARE * (len(odds) - 1))
+        held = asked & (against == doubts[name]) & (seen - 1 >= wanted)
+        solid = np.zeros(field.size, np.uint8)
+        solid[places[held]] = 1
+        window = _window(volume.reach_px[name])
+        closed = cv2.morphologyEx(solid.reshape(field.shape), cv2.MORPH_CLOSE, window).view(bool)
+        told[name] = OtherViews(cv2.dilate(support.reshape(field.shape), window), closed)
+    return told
+
+
+def _window(reach: int) -> np.ndarray:
+    return np.ones((reach | 1, reach | 1), np.uint8)

@@ -1,0 +1,42 @@
+"""The texture of a result's head, where the settings ask for a file that has one."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.eigenheads.model import HeadModel
+from pipeline.settings import Settings
+from pipeline.texture.model_layout import ModelLayout, model_layout
+from pipeline.texture.paint import paint_texture, texture_size
+from pipeline.texture.uv_unwrap import Atlas, NoLayout
+from pipeline.texture.vertex_colours import Texture
+from rig.mesh import Mesh
+
+
+def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
+    """The model's texture layout where a file of the result has a texture, and warnings of settings and model."""
+    outputs = settings.outputs
+    old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
+    told = [
+        ReportWarning("old-setting", f"{name} is read as it was meant; write outputs.formats in its place")
+        for name, given in old.items()
+        if given
+    ]
+    if not outputs.textured or settings.texture.blend == "reference":
+        return None, told
+    try:
+        return model_layout(model), told
+    except NoLayout as reason:
+        return None, [*told, ReportWarning("no-texture-layout", str(reason))]
+
+
+def paint_head(
+    layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: Bool[np.ndarray, " v"], settings: Settings
+) -> Atlas | None:
+    """The head's texture; None where there is no layout, or no camera saw it."""
+    if layout is None or coloured.decision is None:
+        return None
+    region = np.flatnonzero(face_region)
+    wanted = settings.outputs.texture_size
+    size = texture_size(layout.layout, mesh, coloured.decision.views, region, wanted=wanted)
+    return paint_texture(layout.layout, mesh, coloured.colours, coloured.decision, size)

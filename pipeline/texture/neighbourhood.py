@@ -1,0 +1,28 @@
+"""Which vertices of a mesh lie beside each other, as compiled loops read it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Neighbourhood:
+    """Vertices about each vertex, in compressed rows, and the place of the same edge seen from its other end."""
+
+    starts: Int32[np.ndarray, " s"]
+    indices: Int32[np.ndarray, " e"]
+    opposite: Int32[np.ndarray, " e"]
+
+    @classmethod
+    def of(cls, starts: Int32[np.ndarray, " s"], indices: Int32[np.ndarray, " e"]) -> "Neighbourhood":
+        """``starts`` and sorted ``indices`` of a symmetric adjacency."""
+        rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
+        # Rows are sorted: ordered by the other end first, the edges of its row come in the same order.
+        opposite = np.empty(len(indices), np.int32)
+        opposite[np.lexsort((rows, indices))] = np.arange(len(indices), dtype=np.int32)
+        return cls(starts, indices, opposite)
+
+    @property
+    def rows(self) -> Int32[np.ndarray, " e"]:
+        return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))

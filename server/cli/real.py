@@ -1,0 +1,63 @@
+"""``eigenhead experiments real FOLDER...``: captures with more views than are used, calibrated first where needed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from rig.errors import InputError
+from rig.formats.capture_folder import capture_root
+from rig.formats.outlines_json import read_outlines
+from server.tasks.photographs import read_or_calibrate
+from server.tasks.prepare import prepare_kernels
+
+if TYPE_CHECKING:
+    from pipeline.experiments.outcome import Outcome
+    from pipeline.experiments.real import RealCapture
+
+Report = Callable[[str, float], None]
+OUTLINES = "outlines.json"
+
+
+def judge_folders(
+    folders: list[Path],
+    *,
+    model: str,
+    front: str | None,
+    outlines: Path | None,
+    kept: Path | None,
+    report: Report,
+) -> "Outcome":
+    """Figures of every folder. ``outlines``: drawn masks of the only folder, else its own outlines.json; ``kept``:
+    where cameras that had to be found stay. Raises InputError."""
+    if outlines is not None and len(folders) > 1:
+        raise InputError("--outlines", ["belongs to one folder; put outlines.json into each of several"])
+    from pipeline.eigenheads.model import load_model
+    from pipeline.experiments.markdown import of_figures
+    from pipeline.experiments.real import real
+    from pipeline.settings import Settings
+    from rig.atomic_write import write_atomically
+    from rig.render.renderer import Renderer
+
+    settings = Settings()
+    prepare_kernels(report, settings)
+    with TemporaryDirectory() as scratch, Renderer.create() as renderer:
+        place = kept or Path(scratch)
+        given = [_read(folder, place / folder.name, front, outlines, report) for folder in folders]
+        found = real(load_model(model), given, renderer=renderer, settings=settings, report=report)
+    if kept is not None:
+        write_atomically(kept / "real.md", of_figures(found["figures"]).encode())
+    return found
+
+
+def _read(folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Report) -> "RealCapture":
+    from pipeline.experiments.real import RealCapture
+
+    prepared = read_or_calibrate(folder, kept, front=front, report=report)
+    own = capture_root(folder) / OUTLINES
+    path = outlines or (own if own.is_file() else None)
+    drawn = {} if path is None else read_outlines(path, prepared.rig)
+    # Plates and masks that a folder has are its own; a mask that is there judges, too.
+    drawn = {**prepared.capture.masks, **drawn}
+    return RealCapture(folder.name, replace(prepared.capture, features={}), prepared.rig, drawn, front)

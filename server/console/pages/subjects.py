@@ -1,0 +1,50 @@
+"""Subjects: people as cards, each with a picture of the newest head, the shots and the heads."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import TypedDict, cast, get_args
+
+from nicegui import ui
+from starlette.responses import RedirectResponse
+
+from server.console.page import Action, Page, shared, show
+from server.console.pages.captures import SessionForm, new_session
+from server.services.service import Service
+from server.storage.library import SubjectOrder
+
+SHOWN = 48
+ASKED = ("find", "sort", "after")
+
+
+class SubjectsState(TypedDict):
+    """One page of people; ``loose``: captures that belong to no session."""
+
+    subjects: list[Mapping[str, object]]
+    next: str | None
+    total: int
+
+
+class SubjectsPage(Page, component="subjects.js"):
+    def look(self) -> SubjectsState:
+        asked = {name: self.choice.get(name) or None for name in ASKED}
+        return shared.get(("subjects", *asked.values()), 1.0, lambda: subjects_state(self.service, asked))
+
+
+def subjects_state(service: Service, asked: Mapping[str, str | None]) -> SubjectsState:
+    order = cast(SubjectOrder, asked["sort"] if asked["sort"] in get_args(SubjectOrder) else "-created")
+    found = service.sessions.subjects(asked["find"] or "", order, SHOWN, asked["after"])
+    return {"subjects": [asdict(subject) for subject in found.items], "next": found.next, "total": found.total}
+
+
+def begin(page: Page, event: SessionForm) -> str:
+    told = new_session(page, event)
+    shared.forget("subjects")
+    return told
+
+
+SubjectsPage.actions = {"new_session": Action("capture", begin)}
+
+
+@ui.page("/subjects")
+async def subjects_page(find: str = "", sort: str = "") -> RedirectResponse | None:
+    return await show("subjects", SubjectsPage, find=find, sort=sort)

@@ -1,0 +1,49 @@
+"""A small picture of a result, so that people and heads are told apart at a glance: the bust where there is one."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.results.clay import clay
+from rig.formats.images import write_image
+from rig.formats.mesh_file import read_mesh
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh
+from server.console.comparison import ply_property
+
+PANEL = (240, 300)  # width, height
+PAPER = (23, 27, 33)
+AZIMUTH_DEG = 22.0
+QUALITY = 86
+DARKEST = 0.55
+MARGIN = 1.12  # of the head's box, for hair
+
+
+def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """In the colours of the photographs, from half left. Raises FileNotFoundError where there is no head."""
+    name = "bust.ply" if (result / "bust.ply").is_file() else "head.ply"
+    head_from_world = placed(result)
+    head = head_from_world.apply(read_mesh(result / "head.ply").vertices)
+    mesh = read_mesh(result / name)
+    colours = np.stack([ply_property(result / name, part) for part in ("red", "green", "blue")], axis=1)
+    middle, half = (head.min(axis=0) + head.max(axis=0)) / 2, MARGIN * (head.max(axis=0) - head.min(axis=0)) / 2
+    shown = Mesh(head_from_world.apply(mesh.vertices), mesh.faces)
+    box = (middle - half, middle + half)
+    rgb = colours.astype(np.uint8)
+    return clay(shown, colours=rgb, azimuth_deg=AZIMUTH_DEG, panel=PANEL, box=box, paper=PAPER, darkest=DARKEST)
+
+
+def placed(result: Path) -> RigidTransform:
+    """head_from_world as the report has it; where it says nothing the head stays as it lies."""
+    try:
+        place = json.loads((result / "report.json").read_text())["world_from_head"]
+    except (FileNotFoundError, KeyError):
+        return RigidTransform(np.eye(3), np.zeros(3))
+    shift = np.array(place["translation"]) * place["scale"]
+    return RigidTransform(np.array(place["rotation"]), shift).inverse()
+
+
+def write_portrait(result: Path, target: Path) -> None:
+    write_image(target, portrait(result), quality=QUALITY)

@@ -1,0 +1,87 @@
+"""Documents on the wire: lists that come in pages, and what is done to many things at once."""
+
+from typing import Annotated, Literal
+
+from fastapi import Query
+from pydantic import ConfigDict, Field
+
+from server.http.schemas import EXAMPLE_ID, Answer, CaptureOut, Id, JobOut, JobSettings, Moment, Received, SessionOut
+
+Limit = Annotated[int, Query(ge=1, le=1000)]
+Cursor = Annotated[str | None, Query(max_length=2000, description="``next`` of the page before, in the same order")]
+Sought = Annotated[str, Query(max_length=200, description="words that must all be found")]
+
+
+class Listed(Answer):
+    """One page of a list."""
+
+    next: str | None = Field(None, description="cursor of the page after this one; null on the last")
+    total: int = Field(ge=0, description="how many all pages hold")
+
+
+class CaptureList(Listed):
+    captures: list[CaptureOut]
+
+
+class SessionList(Listed):
+    sessions: list[SessionOut]
+
+
+class SubjectOut(Answer):
+    id: str = Field(description="of the newest session")
+    label: str
+    created: Moment
+    sessions: list[str]
+    captures: int
+    heads: int
+    running: int = Field(description="jobs that are queued or running")
+    head: str | None = Field(description="newest job with a result")
+    capture: str | None = Field(description="newest capture")
+    consent: bool = Field(description="whether every session has a note of it")
+
+
+class SubjectList(Listed):
+    subjects: list[SubjectOut]
+
+
+class JobList(Listed):
+    jobs: list[JobOut]
+
+
+class JobBatch(Answer):
+    jobs: list[JobOut]
+
+
+class RefusedOne(Answer):
+    id: str
+    type: str = Field(description="as of a problem document")
+    detail: str
+
+
+class BulkOut(Answer):
+    """What was done of an action on many: each of them stands in one of the two lists."""
+
+    done: list[str]
+    refused: list[RefusedOne]
+
+
+Ids = Annotated[list[Id], Field(min_length=1, max_length=1000)]
+
+
+class CaptureBulk(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"action": "remove", "ids": [EXAMPLE_ID]}]})
+
+    action: Literal["remove", "erase", "reconstruct", "move"] = Field(
+        description="remove: pictures go, heads stay; erase: nothing stays; reconstruct: a job each; move: to a session"
+    )
+    ids: Ids
+    session: Id | None = Field(None, description="of move; null: out of any")
+    model: str | None = Field(None, max_length=200, description="of reconstruct")
+    settings: JobSettings | None = Field(None, description="of reconstruct")
+
+
+class JobBulk(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"action": "cancel", "ids": [EXAMPLE_ID]}]})
+
+    action: Literal["cancel", "restart", "remove"]
+    ids: Ids

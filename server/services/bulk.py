@@ -1,0 +1,36 @@
+"""One action on many things: each is done or refused by itself."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from rig.errors import EigenheadError, InputError
+from server.errors import URN, Refused, unusable_input
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedOne:
+    """``type`` and ``detail`` are those of the problem that the action alone would have answered."""
+
+    id: str
+    type: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bulk:
+    done: tuple[str, ...]
+    refused: tuple[RefusedOne, ...]
+
+
+def each(ids: Iterable[str], action: Callable[[str], object]) -> Bulk:
+    """Does ``action`` to every id once; what it refuses to one holds no other up."""
+    done, refused = [], []
+    for identity in dict.fromkeys(ids):
+        try:
+            action(identity)
+            done.append(identity)
+        except EigenheadError as error:
+            problem = unusable_input(error) if isinstance(error, InputError) else error
+            kind = problem.kind if isinstance(problem, Refused) else "internal-error"
+            refused.append(RefusedOne(identity, URN + kind, str(problem)))
+    return Bulk(tuple(done), tuple(refused))

@@ -1,0 +1,163 @@
+"""What jobs are found by: the service's index rows beside the job engine's own table, whose state is the one truth.
+
+The engine's table is read here alone, by names that its migrations keep; all other dealings with it go through its
+client.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Literal
+
+import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
+
+from server.storage.database import capture_index, job_index
+from server.storage.library import captures_with
+from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, words_of
+from server.storage.records import JobRequest
+
+ENQUEUED = ("DELAYED", "ENQUEUED")
+RUNNING = "PENDING"
+AT_ONCE = 500
+JobOrder = Literal["-created", "created", "-finished", "finished"]
+
+
+@dataclass(frozen=True, slots=True)
+class JobQuery:
+    """Which jobs, in what order: all words of ``sought`` stand in name, model, method, level or id, or are found in the
+    capture; ``statuses`` are the engine's words."""
+
+    sought: str = ""
+    statuses: Sequence[str] | None = None
+    capture: str | None = None
+    session: str | None = None
+    order: JobOrder = "-created"
+
+
+@dataclass(frozen=True, slots=True)
+class JobOfCapture:
+    """``status`` in the engine's words."""
+
+    id: str
+    status: str
+
+
+class JobIndex:
+    """The jobs of one workflow of the engine. Methods block."""
+
+    def __init__(self, engine: sa.Engine, workflow: str) -> None:
+        self._engine, self._workflow = engine, workflow
+        schema = None if engine.dialect.name == "sqlite" else "dbos"
+        text, number = sa.Text(), sa.BigInteger()
+        names = {"workflow_uuid": text, "status": text, "name": text, "queue_name": text}
+        names |= {"created_at": number, "completed_at": number, "priority": number}
+        columns = [sa.column(name, kind) for name, kind in names.items()]
+        self._status = sa.table("workflow_status", *columns, schema=schema)
+
+    def add(self, job_id: str, request: JobRequest, session: str | None) -> None:
+        """Nothing happens where the job is known."""
+        row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
+        with suppress(IntegrityError), self._engine.begin() as connection:
+            connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
+
+    def remove(self, job_id: str) -> None:
+        with self._engine.begin() as connection:
+            connection.execute(sa.delete(job_index).where(job_index.c.job_id == job_id))
+
+    def complete(self, requests_of: Callable[[list[str]], Mapping[str, JobRequest]]) -> int:
+        """Gives rows of earlier versions what they are searched by; returns how many there were."""
+        with self._engine.connect() as connection:
+            bare = [*connection.scalars(sa.select(job_index.c.job_id).where(job_index.c.words.is_(None)))]
+        for start in range(0, len(bare), AT_ONCE):
+            some = bare[start : start + AT_ONCE]
+            requests = requests_of(some)
+            words = {job: words_of_job(requests[job]) if job in requests else "" for job in some}
+            change = sa.update(job_index).where(job_index.c.job_id == sa.bindparam("job"))
+            with self._engine.begin() as connection:
+                connection.execute(
+                    change.values(words=sa.bindparam("new")), [{"job": j, "new": w} for j, w in words.items()]
+                )
+        return len(bare)
+
+    def page(self, query: JobQuery, limit: int, cursor: str | None = None) -> PageOf:
+        """Raises InputError for a cursor of another list."""
+        status = self._status.c
+        rows = sa.select().select_from(self._status).where(status.name == self._workflow)
+        if query.statuses is not None:
+            rows = rows.where(status.status.in_(query.statuses))
+        if clauses := self._of(query):
+            rows = rows.where(status.workflow_uuid.in_(sa.select(job_index.c.job_id).where(*clauses)))
+        finished = query.order.endswith("finished")
+        column = sa.func.coalesce(status.completed_at, 0) if finished else status.created_at
+        order = Order(column, status.workflow_uuid, query.order.startswith("-"))
+        with self._engine.connect() as connection:
+            return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
+
+    def counts(self) -> dict[str, int]:
+        """Jobs by the engine's status."""
+        status = self._status.c
+        query = sa.select(status.status, sa.func.count()).where(status.name == self._workflow).group_by(status.status)
+        with self._engine.connect() as connection:
+            return {row[0]: row[1] for row in connection.execute(query)}
+
+    def newest_first(self, statuses: Sequence[str]) -> list[str]:
+        """Ids of all jobs with one of the engine's statuses."""
+        status = self._status.c
+        query = sa.select(status.workflow_uuid).where(status.name == self._workflow, status.status.in_(statuses))
+        with self._engine.connect() as connection:
+            return [*connection.scalars(query.order_by(status.created_at.desc()))]
+
+    def places(self) -> dict[str, int]:
+        """How many jobs of its queue go before each queued one: those that run, then lower priority numbers, then who
+        came first. The engine takes jobs of one millisecond in no order of its own; here the id settles it."""
+        status = self._status.c
+        places: dict[str, int] = {}
+        running = sa.select(status.queue_name, sa.func.count()).where(status.name == self._workflow)
+        running = running.where(status.status == RUNNING).group_by(status.queue_name)
+        queued = sa.select(status.workflow_uuid, status.queue_name).where(status.name == self._workflow)
+        queued = queued.where(status.status.in_(ENQUEUED))
+        order = (status.priority, status.created_at, status.workflow_uuid)
+        with self._engine.connect() as connection:
+            before = {row[0]: row[1] for row in connection.execute(running)}
+            for row in connection.execute(queued.order_by(*order)):
+                places[row.workflow_uuid] = before.get(row.queue_name, 0)
+                before[row.queue_name] = places[row.workflow_uuid] + 1
+        return places
+
+    def of_captures(self, captures: Collection[str]) -> dict[str, list[JobOfCapture]]:
+        """Every job of some captures, newest first."""
+        found: dict[str, list[JobOfCapture]] = {capture: [] for capture in captures}
+        status, listed = self._status.c, list(captures)
+        joined = job_index.join(self._status, status.workflow_uuid == job_index.c.job_id)
+        query = sa.select(job_index.c.capture_id, job_index.c.job_id, status.status).select_from(joined)
+        query = query.order_by(status.created_at.desc(), job_index.c.job_id.desc())
+        with self._engine.connect() as connection:
+            for start in range(0, len(listed), AT_ONCE):
+                some = query.where(job_index.c.capture_id.in_(listed[start : start + AT_ONCE]))
+                for row in connection.execute(some):
+                    found[row.capture_id].append(JobOfCapture(row.job_id, row.status))
+        return found
+
+    def ids_of(self, capture: str | None, session: str | None) -> list[str]:
+        with self._engine.connect() as connection:
+            clauses = self._of(JobQuery(capture=capture, session=session))
+            return [*connection.scalars(sa.select(job_index.c.job_id).where(*clauses))]
+
+    def _of(self, query: JobQuery) -> list[sa.ColumnElement[bool]]:
+        row, clauses = job_index.c, []
+        if query.capture is not None:
+            clauses.append(row.capture_id == query.capture)
+        if query.session is not None:
+            clauses.append(row.session == query.session)
+        for word in words_of(query.sought):
+            captures = sa.select(capture_index.c.id).where(captures_with(word))
+            own = sa.or_(contains(row.words, word), is_or_ends(row.job_id, word))
+            clauses.append(sa.or_(own, row.capture_id.in_(captures)))
+        return clauses
+
+
+def words_of_job(request: JobRequest) -> str:
+    settings = request.get("settings") or {}
+    chosen = [str(settings[key]) for key in ("method", "detail") if settings.get(key)]
+    return folded(request.get("name"), request.get("model") or "default", *(chosen or ["contour"]))

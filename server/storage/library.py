@@ -1,0 +1,233 @@
+"""The index of captures and sessions: what they are found by, in the database, so that a page of a hundred thousand is
+one query. The records in the data folder stay the truth: rows are made of them as they are written, and ``reconcile``
+mends at each start what differs: a backup that was put back, a record that somebody removed, a folder of an earlier
+version.
+"""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import sqlalchemy as sa
+import structlog
+from sqlalchemy.dialects import postgresql, sqlite
+
+from server.storage.database import capture_index, scrub, session_index
+from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, words_of
+from server.storage.records import CaptureRecord, SessionRecord
+from server.storage.store import Store
+
+AT_ONCE = 500  # rows in one statement: databases bound how many values one may have
+UNJUDGED = "none"  # the verdict of captures that were not judged
+CaptureOrder = Literal["-created", "created", "label", "-label", "verdict", "-bytes"]
+SubjectOrder = Literal["-created", "created", "label", "-label"]
+
+log = structlog.get_logger()
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureQuery:
+    """Which captures, in what order: all words of ``sought`` stand in label, expression, session, verdict, source or
+    id; ``before``: only those older than this id."""
+
+    sought: str = ""
+    session: str | None = None
+    verdict: str | None = None
+    board: bool | None = None
+    before: str | None = None
+    order: CaptureOrder = "-created"
+
+
+@dataclass(frozen=True, slots=True)
+class SubjectPage:
+    """Sessions by subject: one subject's, newest first, in the order of the page's subjects."""
+
+    subjects: tuple[tuple[str, ...], ...]
+    next: str | None
+    total: int
+
+
+class Library:
+    """The two index tables. Methods block."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+
+    def put_capture(self, record: CaptureRecord, changed: int) -> None:
+        self._put(capture_index, [_capture_row(record, changed)])
+
+    def drop_capture(self, identity: str) -> None:
+        self._drop(capture_index, [identity])
+
+    def put_session(self, record: SessionRecord, changed: int) -> None:
+        self._put(session_index, [_session_row(record, changed)])
+
+    def drop_session(self, identity: str) -> None:
+        self._drop(session_index, [identity])
+
+    def scrub(self) -> None:
+        """Lets go of what removed rows have left in the database's files."""
+        scrub(self._engine)
+
+    def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> PageOf:
+        """Raises InputError for a cursor of another list."""
+        table = capture_index.c
+        rows = sa.select().select_from(capture_index)
+        if query.session is not None:
+            rows = rows.where(table.session == query.session)
+        if query.verdict is not None:
+            rows = rows.where(table.verdict == query.verdict)
+        if query.board is not None:
+            rows = rows.where(table.board == query.board)
+        if query.before is not None:
+            rows = rows.where(table.id < query.before)
+        for word in words_of(query.sought):
+            rows = rows.where(captures_with(word))
+        name = query.order.removeprefix("-")
+        column = {"created": table.id, "label": sa.func.lower(table.label, type_=sa.Text())}.get(name)
+        order = Order(table[name] if column is None else column, table.id, query.order.startswith("-"))
+        with self._engine.connect() as connection:
+            return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
+
+    def captures_of(self, sessions: Collection[str]) -> dict[str, list[str]]:
+        """Ids of the captures of some sessions, newest first."""
+        found: dict[str, list[str]] = {session: [] for session in sessions}
+        query = sa.select(capture_index.c.session, capture_index.c.id).order_by(capture_index.c.id.desc())
+        with self._engine.connect() as connection:
+            for some in _portions(sessions):
+                for row in connection.execute(query.where(capture_index.c.session.in_(some))):
+                    found[row.session].append(row.id)
+        return found
+
+    def heads_of(self, session: str) -> list[str]:
+        """Ids of a session's captures that show a head, newest first."""
+        table = capture_index.c
+        query = sa.select(table.id).where(table.session == session, table.board.is_(False)).order_by(table.id.desc())
+        with self._engine.connect() as connection:
+            return [*connection.scalars(query)]
+
+    def sessions_of(self, subject: str) -> list[str]:
+        """Ids of a person's sessions; ``subject`` as of ``subject_of``."""
+        with self._engine.connect() as connection:
+            return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
+
+    def sessions(self, sought: str, limit: int, cursor: str | None = None) -> PageOf:
+        """Newest first. Raises InputError for a cursor of another list."""
+        rows = sa.select().select_from(session_index)
+        for word in words_of(sought):
+            rows = rows.where(sessions_with(word))
+        with self._engine.connect() as connection:
+            order = Order(session_index.c.id, session_index.c.id, descending=True)
+            return page_of(connection, rows, order, limit, cursor)
+
+    def subjects(self, sought: str, order: SubjectOrder, limit: int, cursor: str | None = None) -> SubjectPage:
+        """Sessions of one name are one person's; one without a name is somebody by itself. A subject is as new as its
+        newest session. Raises InputError for a cursor of another list."""
+        table = session_index.c
+        newest, name = (
+            sa.func.max(table.id).label("newest"),
+            sa.func.min(sa.func.lower(table.label), type_=sa.Text()).label("name"),
+        )
+        rows = sa.select(table.subject, newest, name).group_by(table.subject)
+        for word in words_of(sought):
+            rows = rows.where(sessions_with(word))
+        one = rows.subquery()
+        by = one.c.newest if order.removeprefix("-") == "created" else one.c.name
+        wanted = Order(by, one.c.newest, order.startswith("-"))
+        with self._engine.connect() as connection:
+            page = page_of(connection, sa.select().select_from(one), wanted, limit, cursor)
+            theirs = sa.select(table.subject).where(table.id.in_(page.ids))
+            sessions = sa.select(table.id, table.subject).where(table.subject.in_(theirs)).order_by(table.id.desc())
+            found: dict[str, list[str]] = {}
+            for row in connection.execute(sessions):
+                found.setdefault(row.subject, []).append(row.id)
+        of = {ids[0]: tuple(ids) for ids in found.values()}
+        missing = [identity for identity in page.ids if identity not in of]  # its newest session has another name
+        of |= {i: next(tuple(ids) for ids in found.values() if i in ids) for i in missing}
+        return SubjectPage(tuple(of[identity] for identity in page.ids), page.next, page.total)
+
+    def reconcile(self, store: Store) -> int:
+        """Makes the rows those of the records in the data folder; returns how many differed."""
+        mended = 0
+        for table, kind in ((capture_index, "captures"), (session_index, "sessions")):
+            with self._engine.connect() as connection:
+                known = {row.id: row.changed for row in connection.execute(sa.select(table.c.id, table.c.changed))}
+            there = store.changes(kind)  # asked second: what is added in between is no stray row
+            self._drop(table, gone := [identity for identity in known if identity not in there])
+            rows = []
+            for identity in (identity for identity, changed in there.items() if known.get(identity) != changed):
+                if (row := _row_of(store, kind, identity, there[identity])) is not None:
+                    rows.append(row)
+            self._put(table, rows)
+            mended += len(gone) + len(rows)
+        if mended:
+            log.info("index mended", rows=mended)
+        return mended
+
+    def _put(self, table: sa.Table, rows: list[dict[str, object]]) -> None:
+        insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
+        with self._engine.begin() as connection:
+            for some in _portions(rows):
+                statement = insert(table)
+                new = {column.name: statement.excluded[column.name] for column in table.c if not column.primary_key}
+                connection.execute(statement.on_conflict_do_update(index_elements=["id"], set_=new), some)
+
+    def _drop(self, table: sa.Table, ids: Collection[str]) -> None:
+        with self._engine.begin() as connection:
+            for some in _portions(ids):
+                connection.execute(sa.delete(table).where(table.c.id.in_(some)))
+
+
+def captures_with(word: str) -> sa.ColumnElement[bool]:
+    """Of captures that a word of a search stands in, or in whose session it does."""
+    sessions = sa.select(session_index.c.id).where(sessions_with(word))
+    own = sa.or_(contains(capture_index.c.words, word), is_or_ends(capture_index.c.id, word))
+    return sa.or_(own, capture_index.c.session.in_(sessions))
+
+
+def sessions_with(word: str) -> sa.ColumnElement[bool]:
+    """Of sessions that a word of a search stands in."""
+    return sa.or_(contains(session_index.c.words, word), is_or_ends(session_index.c.id, word))
+
+
+def subject_of(record: SessionRecord) -> str:
+    """What sessions of one person have alike: their name; one without a name stands by itself."""
+    return folded(record.label).strip() or record.id
+
+
+def _row_of(store: Store, kind: str, identity: str, changed: int) -> dict[str, object] | None:
+    record = store.found(kind, identity)
+    if record is None:
+        return None
+    return _capture_row(record, changed) if isinstance(record, CaptureRecord) else _session_row(record, changed)
+
+
+def _capture_row(record: CaptureRecord, changed: int) -> dict[str, object]:
+    verdict = record.verdict or UNJUDGED
+    return {
+        "id": record.id,
+        "session": record.session,
+        "label": record.label,
+        "verdict": verdict,
+        "source": record.source,
+        "board": record.board,
+        "bytes": record.bytes,
+        "words": folded(record.label, record.expression, record.verdict, record.source),
+        "changed": changed,
+    }
+
+
+def _session_row(record: SessionRecord, changed: int) -> dict[str, object]:
+    return {
+        "id": record.id,
+        "subject": subject_of(record),
+        "label": record.label,
+        "words": folded(record.label, record.consent),
+        "changed": changed,
+    }
+
+
+def _portions(values: Iterable[T]) -> Iterable[list[T]]:
+    listed = list(values)
+    return (listed[start : start + AT_ONCE] for start in range(0, len(listed), AT_ONCE))

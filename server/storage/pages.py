@@ -1,0 +1,124 @@
+"""Pages of a list: what is asked for, a cursor that goes on where a page ended, and the condition for what comes after.
+
+Lists go on after a *place* (the value they are sorted by, and an id where values are equal), not after a number of
+rows: what is added or removed meanwhile neither repeats nor drops a line, and the last page costs what the first does.
+"""
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import sqlalchemy as sa
+
+from rig.errors import InputError
+
+WORDS_MOST = 10  # of a search: each is one comparison with every row
+ID_LEAST = 6  # digits of an id's end that name it
+Value = str | int | None
+
+
+@dataclass(frozen=True, slots=True)
+class PageOf:
+    """Ids of one page, in their order; ``next`` is the cursor of the page after it, None on the last; ``total`` counts
+    what all pages hold."""
+
+    ids: tuple[str, ...]
+    next: str | None
+    total: int
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Rows sorted by ``column`` and, where that is equal, by ``identity``."""
+
+    column: sa.ColumnElement[str] | sa.ColumnElement[int]
+    identity: sa.ColumnElement[str]
+    descending: bool
+
+    def by(self) -> tuple[sa.ColumnElement, ...]:
+        columns = dict.fromkeys((self.column, self.identity))
+        return tuple(column.desc() if self.descending else column.asc() for column in columns)
+
+    def after(self, cursor: str) -> sa.ColumnElement[bool]:
+        """Of the rows that come after a cursor. Raises InputError for what is no cursor of such a list."""
+        place = place_of(cursor)
+        if isinstance(place.value, str) != isinstance(self.column.type, sa.String):
+            raise no_cursor()
+        if self.column is self.identity:
+            return self.identity < place.identity if self.descending else self.identity > place.identity
+        ended, row = (
+            sa.tuple_(sa.literal(place.value), sa.literal(place.identity)),
+            sa.tuple_(self.column, self.identity),
+        )
+        return row < ended if self.descending else row > ended
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a page ended, and how many rows the list had when its first page was made."""
+
+    value: str | int
+    identity: str
+    total: int
+
+
+def cursor_of(value: Value, identity: str, total: int) -> str:
+    return base64.urlsafe_b64encode(json.dumps([value, identity, total]).encode()).decode().rstrip("=")
+
+
+def place_of(cursor: str) -> Place:
+    """What a cursor names. Raises InputError."""
+    try:
+        value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+    except (ValueError, RecursionError, TypeError) as error:
+        raise no_cursor() from error
+    numbers = [part for part in (value, total) if not isinstance(part, str)]
+    whole = all(isinstance(part, int) and not isinstance(part, bool) and abs(part) < 2**62 for part in numbers)
+    texts = isinstance(identity, str) and "\0" not in f"{value}{identity}"
+    if not (whole and texts) or not isinstance(total, int) or total < 0:
+        raise no_cursor()
+    return Place(value, identity, total)
+
+
+def no_cursor() -> InputError:
+    return InputError("cursor", ["is not what 'next' of this list in this order said: begin without one"])
+
+
+def page_of(
+    connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
+) -> PageOf:
+    """One page of ``rows``, which select nothing yet. ``searched``: finding the rows is what takes long, so that they
+    are counted as they are found. Raises InputError."""
+    wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
+    if cursor is not None:
+        total, wanted = place_of(cursor).total, wanted.where(order.after(cursor))
+    elif searched:
+        total, wanted = 0, wanted.add_columns(sa.func.count().over().label("total"))
+    else:
+        total = connection.scalar(rows.with_only_columns(sa.func.count())) or 0
+    found = connection.execute(wanted.order_by(*order.by()).limit(limit + 1)).all()
+    if cursor is None and searched and found:
+        total = found[0].total
+    more = len(found) > limit
+    ids = tuple(row.id for row in found[:limit])
+    return PageOf(ids, cursor_of(found[limit - 1].value, ids[-1], total) if more else None, total)
+
+
+def words_of(sought: str) -> Sequence[str]:
+    """The words of a search, which must all be found."""
+    return folded(sought).replace("\0", "").split()[:WORDS_MOST]
+
+
+def folded(*texts: str | None) -> str:
+    """What searches compare: without case."""
+    return " ".join(text for text in texts if text).casefold()
+
+
+def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
+    return column.contains(word, autoescape=True)
+
+
+def is_or_ends(identity: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
+    """Of rows whose id is ``word`` or ends with it, as pages shorten ids; a short word stands in too many ids."""
+    return identity.endswith(word, autoescape=True) if len(word) >= ID_LEAST else sa.false()

@@ -1,0 +1,134 @@
+"""A folder that holds nothing but photographs, and perhaps scale.json, made a capture: its cameras found, and kept.
+
+``kept`` is where each step's result stays: cameras.json, calibration.json (the figures, and what they were made of) and
+calibration.html; then masks/. A second run with the same photographs takes them from there.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.spread_views import spread_views
+from pipeline.settings import SegmentationSettings
+from rig.atomic_write import write_atomically
+from rig.capture import Capture
+from rig.errors import InputError
+from rig.formats.cameras_file import find_rig_file
+from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
+from rig.formats.capture_folder import capture_root, picture_folder, read_capture, read_shot
+from rig.formats.images import IMAGE_SUFFIXES, write_image
+from rig.rig import Rig
+
+Report = Callable[[str, float], None]
+CAMERAS, FIGURES, PAGE, SCALE = "cameras.json", "calibration.json", "calibration.html", "scale.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """What ``reconstruct`` needs, and what was said while it was found."""
+
+    capture: Capture
+    rig: Rig
+    warnings: tuple[ReportWarning, ...]
+
+
+def photographs_alone(folder: Path) -> bool:
+    """Whether a capture folder has photographs and no cameras."""
+    root = capture_root(folder)
+    if find_rig_file(root) is not None:
+        return False
+    pictures = picture_folder(root)
+    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in pictures.rglob("*") if path.is_file())
+
+
+def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Report) -> Prepared:
+    """A capture folder as it is, or, where it has no cameras, with those that its photographs give.
+
+    Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
+    if not photographs_alone(folder):
+        return Prepared(*read_capture(folder), ())
+    root = capture_root(folder)
+    kept.mkdir(parents=True, exist_ok=True)
+    warnings = calibrate_photographs(root, kept, front=front, report=report)
+    rig, faults = read_rig(kept / CAMERAS), list[str]()
+    capture = read_shot(root, rig, faults)
+    if faults:
+        raise InputError("capture", faults)
+    digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
+    return Prepared(replace(capture, digests=dict(sorted(digests.items()))), rig, warnings)
+
+
+def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Report) -> tuple[ReportWarning, ...]:
+    """Leaves cameras.json and its report in ``kept``, unless they are there and of the same photographs."""
+    made_of = _made_of(root, front)
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
+        if document["made_of"] == made_of and document["cameras_sha256"] == _sha256(kept / CAMERAS):
+            return tuple(ReportWarning(told["code"], told["message"]) for told in document["told"])
+    from calibration.scene.report import write_scene_report
+    from calibration.scene.scene import calibrate_scene
+
+    scale = root / SCALE
+    found = calibrate_scene(root, scale=scale if scale.is_file() else None, front=front, report=report)
+    told = [ReportWarning("view-left-out", why) for why in found.left_out.values()]
+    if found.scale.assumed:
+        told.append(ReportWarning("scale-assumed", f"the scale is {found.scale.told}; give scale.json to know it"))
+    rig = found.rig
+    if len(rig) > CAMERAS_MOST:
+        rig = rig.subset(spread_views(rig, CAMERAS_MOST))
+        message = f"{len(found.rig)} views joined, of which {CAMERAS_MOST} that stand well apart are used"
+        told.append(ReportWarning("views-many", message))
+    write_rig(rig, kept / CAMERAS)
+    write_scene_report(found, kept / PAGE)
+    document = {
+        "made_of": made_of,
+        "cameras_sha256": _sha256(kept / CAMERAS),
+        "told": [{"code": one.code, "message": one.message} for one in told],
+        **found.document(),
+    }
+    write_atomically(kept / FIGURES, json.dumps(document, indent=1).encode())
+    return tuple(told)
+
+
+def keep_masks(
+    kept: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Report
+) -> dict[str, Silhouette]:
+    """Silhouettes; where the photographs alone told them, masks/ in ``kept`` shows them, and a second run takes what
+    it finds there."""
+    from pipeline.silhouettes.segment import segment
+    from server.storage.silhouette_cache import SUFFIX, segment_once
+
+    if capture.masks or capture.backgrounds:
+        return segment(capture, rig, settings, report=report)
+    masks = kept / "masks"
+    masks.mkdir(parents=True, exist_ok=True)
+    before = set(masks.glob(f"*{SUFFIX}"))
+    found = segment_once(masks, capture, rig, settings, report=report)
+    made = set(masks.glob(f"*{SUFFIX}")) - before
+    for path in before if made else ():
+        path.unlink(missing_ok=True)
+    for name, silhouette in found.items():
+        if made or not (masks / f"{name}.png").is_file():
+            write_image(masks / f"{name}.png", silhouette.mask.astype(np.uint8) * 255)
+    return found
+
+
+def _made_of(root: Path, front: str | None) -> dict[str, str]:
+    """The sha256 of all that a calibration follows from."""
+    from importlib.metadata import version
+
+    files = [path for path in sorted(picture_folder(root).rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES]
+    files += [root / SCALE] if (root / SCALE).is_file() else []
+    digests = {path.relative_to(root).as_posix(): _sha256(path) for path in files}
+    return {**digests, "front": front or "", "version": version("eigenhead"), "pycolmap": version("pycolmap")}
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,138 @@
+"""The head's files in every format, from the model's own mean head."""
+
+import json
+import struct
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.eigenheads.model import load_model
+from pipeline.results.head_files import write_head
+from pipeline.results.printable import printable
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.write import head_mesh
+from pipeline.settings import OutputSettings, Settings, settings_from_document
+from pipeline.texture.model_layout import model_layout
+from pipeline.texture.uv_unwrap import Atlas
+from rig.errors import InputError
+from rig.formats.ply import read_head_ply
+from rig.mesh import Mesh
+from tests.support.textured_results import textured_result
+
+ALL = ("glb", "ply", "obj", "usdz", "stl", "3mf")
+
+
+@pytest.fixture(scope="module")
+def result() -> Reconstruction:
+    """The mean head, its texture red at the left of the layout and blue at the right."""
+    model = load_model()
+    mesh = Mesh(model.vertices(np.zeros(0)), model.levels["full"].faces)
+    image = np.zeros((1024, 1024, 3), np.uint8)
+    image[:, :512], image[:, 512:] = (200, 30, 30), (30, 30, 200)
+    return textured_result(mesh, Atlas(model_layout(model).layout, image))
+
+
+def written(result: Reconstruction, folder: Path, **outputs: object) -> set[str]:
+    chosen = replace(result, settings=Settings(outputs=replace(OutputSettings(), **outputs)))
+    write_head(folder, chosen, head_mesh(chosen))
+    return {path.name for path in folder.iterdir()}
+
+
+def test_every_format_is_written_and_no_other(result: Reconstruction, tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    for name in ("default", "all", "old", "image"):
+        (tmp_path / name).mkdir()
+    assert written(result, tmp_path / "default") == {"head.ply", "head.glb"}
+    every = {"head.ply", "head.glb", "head.obj", "head.mtl", "head.png", "head.usdz", "head.stl", "head.3mf"}
+    assert written(result, tmp_path / "all", formats=ALL) == every
+    assert "head.obj" in written(result, tmp_path / "old", obj=True)
+    assert written(result, tmp_path / "image", formats=("ply",), ply_texture=True) == {"head.ply", "head.png"}
+    assert b"comment TextureFile head.png\n" in (tmp_path / "image" / "head.ply").read_bytes()[:2000]
+    plain, named = (read_head_ply(tmp_path / name / "head.ply")[0] for name in ("default", "image"))
+    np.testing.assert_array_equal(plain.vertices, named.vertices)
+
+
+def test_the_glb_has_the_texture_upright_and_says_what_it_is(result: Reconstruction, tmp_path: Path) -> None:
+    written(result, tmp_path)
+    data = (tmp_path / "head.glb").read_bytes()
+    extras = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])["asset"]["extras"]
+    assert extras["model"] == {"name": result.model_name, "sha256": result.model_sha256}
+    assert {"version", "unit", "inputs_sha256", "settings_sha256"} < set(extras)
+    loaded = trimesh.load(tmp_path / "head.glb", force="mesh", process=False)
+    assert isinstance(loaded, trimesh.Trimesh)
+    visual = cast("Any", loaded.visual)  # a TextureVisuals
+    picture = np.asarray(visual.material.baseColorTexture.convert("RGB")).astype(int)
+    at = np.clip((visual.uv * (1, -1) + (0, 1)) * len(picture), 0, len(picture) - 1).astype(int)
+    seen = picture[at[:, 1], at[:, 0]]
+    aside = loaded.vertices[:, 0]  # m, to the subject's left, which is at the layout's right
+    assert (seen[aside > 0.04, 2] > 150).all()
+    assert (seen[aside < -0.04, 0] > 150).all()
+    count = len(result.mesh_world.vertices)
+    repeated = np.asarray(loaded.vertices)[extras["repeated_vertices"]]
+    np.testing.assert_array_equal(loaded.vertices[count:], repeated)
+
+
+def test_the_printable_head_is_closed_and_stands_upright(result: Reconstruction) -> None:
+    closed = printable(head_mesh(result))
+    solid = trimesh.Trimesh(closed.vertices, closed.faces, process=False)
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert 2e6 < solid.volume < 8e6  # mm3: a head with its neck
+    assert closed.vertices[:, 2].min() == 0
+    crown = closed.vertices[closed.vertices[:, 2].argmax()]
+    assert crown[2] > np.ptp(closed.vertices[:, 0])  # higher than wide
+
+
+def test_open_lids_are_closed_by_strips() -> None:
+    model = load_model()
+    mesh = Mesh(model.vertices(np.zeros(0)), model.levels["full"].faces)
+    eye = mesh.vertices[model.landmarks["exocanthion_left"]] - (12, 0, 0)
+    off = np.abs(mesh.vertices[mesh.faces].mean(axis=1) - eye) / (10.0, 3.0, 30.0)
+    opened = Mesh(mesh.vertices, mesh.faces[(off**2).sum(axis=1) > 1])
+    assert len(opened.faces) < len(mesh.faces)
+    used = np.unique(opened.faces)
+    closed = printable(opened)
+    solid = trimesh.Trimesh(closed.vertices, closed.faces, process=False)
+    assert solid.is_watertight
+    assert len(np.unique(closed.faces)) == len(used) + 1  # the neck's middle alone is new
+
+
+def test_wrong_outputs_are_named() -> None:
+    with pytest.raises(InputError) as found:
+        settings_from_document({"outputs": {"formats": ["glb", "fbx"], "texture_size": 1000}})
+    assert len(found.value.faults) == 2
+    assert settings_from_document({"outputs": {"obj": True}}).outputs.written == ("glb", "ply", "obj")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("image", ["jpeg", "png", "webp"])
+def test_the_khronos_validator_has_nothing_to_say(
+    image: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path
+) -> None:
+    written(result, tmp_path, image=image)
+    script = gltf_validator / "validate.js"
+    command = ["node", str(script), str(tmp_path / "head.glb")]
+    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout)
+    assert (told["numErrors"], told["numWarnings"], told["messages"]) == (0, 0, [])
+
+
+@pytest.fixture(scope="session")
+def gltf_validator(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The validator of the Khronos group, from npm."""
+    folder = tmp_path_factory.mktemp("validator")
+    try:
+        command = ["npm", "install", "--no-audit", "--no-fund", "gltf-validator@2.0.0-dev.3.10"]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True, timeout=120)
+    except (OSError, subprocess.SubprocessError) as reason:
+        pytest.skip(f"gltf-validator cannot be installed: {type(reason).__name__}")
+    (folder / "validate.js").write_text(
+        "const fs = require('fs'); require('gltf-validator').validateBytes("
+        "new Uint8Array(fs.readFileSync(process.argv[2])), {maxIssues: 20})"
+        ".then(report => console.log(JSON.stringify(report.issues)));"
+    )
+    return folder

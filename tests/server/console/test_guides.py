@@ -1,0 +1,66 @@
+"""What helps to pick points: only what changed is computed, and what contradicts is named."""
+
+import time
+
+import numpy as np
+import pytest
+
+from pipeline.alignment.feature_points import locate_features
+from pipeline.eigenheads.landmarks import NAMES
+from pipeline.settings import CLICK_NOISE_PX
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from server.console import guides
+
+CLICK_MOST_S = 0.2
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return default_layout()
+
+
+def picked(rig: Rig) -> dict[str, dict[str, np.ndarray]]:
+    """All landmarks, somewhere on a sphere of a head's size, in all cameras."""
+    rng = np.random.default_rng(7)
+    middle = rig.centre_world()
+    points = {name: middle + 90.0 * (d := rng.normal(size=3)) / np.linalg.norm(d) for name in NAMES}
+    return {name: {camera.name: camera.project(at[None])[0] for camera in rig} for name, at in points.items()}
+
+
+def test_a_click_costs_one_point_however_many_there_are(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    points, own = picked(rig), guides.Guides(rig)
+    assert (len(points), len(rig.names)) == (26, 11)
+    own.helps(points, {}, ["pronasale"])
+    located: list[str] = []
+    locate = guides.locate
+    monkeypatch.setattr(guides, "locate", lambda rig, name, views: (located.append(name), locate(rig, name, views))[1])
+    changed = points | {"pronasale": points["pronasale"] | {"cam03": points["pronasale"]["cam03"] + 0.5}}
+    took = []
+    for shift in (0.5, 0.7, 0.9):
+        changed["pronasale"] = points["pronasale"] | {"cam03": points["pronasale"]["cam03"] + shift}
+        began = time.process_time()
+        told = own.helps(changed, {}, ["pronasale"])
+        took.append(time.process_time() - began)
+    assert located == ["pronasale"] * 3
+    assert min(took) < CLICK_MOST_S
+    assert told["guides"].keys() == {"pronasale"}
+    whole = guides.helps(rig, changed, {})
+    assert told["off_px"] == whole["off_px"]
+    assert told["reprojected"] == whole["reprojected"]
+    assert told["guides"]["pronasale"] == whole["guides"]["pronasale"]
+
+
+def test_a_pick_that_contradicts_the_others_is_named_as_a_job_would(rig: Rig) -> None:
+    points = {name: views for name, views in picked(rig).items() if name in ("nasion", "pronasale", "stomion")}
+    own = guides.Guides(rig)
+    assert own.helps(points, {}, [])["contradictions"] == {}
+    wrong = points | {
+        "nasion": points["nasion"] | {"cam04": points["nasion"]["cam04"] + [60.0, -40.0]},
+        "stomion": {"cam00": points["stomion"]["cam00"], "cam05": points["stomion"]["cam05"] + [0.0, 90.0]},
+    }
+    told = own.helps(wrong, {}, [])["contradictions"]
+    assert told["nasion"] == "feature nasion in cam04 contradicts the other views: that view is left out"
+    assert told["stomion"] == "feature stomion is left out: its views contradict each other"
+    assert sorted(told.values()) == sorted(locate_features(wrong, rig, noise_px=CLICK_NOISE_PX).remarks)
+    assert own.helps(points, {}, [])["contradictions"] == {}  # put right again

@@ -1,0 +1,40 @@
+"""The service that the tests of HTTP speak to."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+from server.cli.client import Client
+from tests.support.services import RunningService, packed, running_service, small_capture
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
+    """One for all files of this folder that bring none of their own."""
+    with running_service(tmp_path_factory.mktemp("service") / "data") as running:
+        yield running
+
+
+@pytest.fixture
+def http(service: RunningService) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.url, timeout=30) as client:
+        yield client
+
+
+@pytest.fixture
+def client(service: RunningService) -> Iterator[Client]:
+    with Client(service.url) as client:
+        yield client
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> bytes:
+    return packed(small_capture(tmp_path / "capture"))
+
+
+@pytest.fixture(scope="session")
+def archive_of_all(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """For fixtures that outlive a test."""
+    return packed(small_capture(tmp_path_factory.mktemp("archive") / "capture"))

@@ -1,0 +1,186 @@
+"""Captures and sessions over HTTP, against a running service: uploads, what is refused, features, erasure."""
+
+import io
+import json
+import shutil
+import tarfile
+from pathlib import Path
+
+import httpx
+import pytest
+
+from server.cli.client import Client, ServiceError
+from tests.support.services import RunningService, await_state, packed, small_capture, stored, upload
+
+
+def test_upload_and_job_in_one_call(http: httpx.Client, archive: bytes) -> None:
+    response = upload(http, archive, "/v1/reconstructions", settings='{"method": "simplex"}')
+    assert response.status_code == 202
+    job = await_state(http, response.headers["location"].rsplit("/", 1)[1], ("succeeded",))
+    assert job["settings"] == {"method": "simplex"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "word"),
+    [
+        ("damaged", "damaged or cut off"),
+        ("missing image", "images/cam01.png is missing"),
+        ("nan", "cam02.camera_from_world.translation holds a value that is no finite number"),
+        ("no cameras", "holds no cameras.json"),
+        ("wrong size", "is 30 x 30 pixels, but its camera is 24 x 24"),
+        ("truncated image", "images/cam00.png is damaged"),
+    ],
+)
+def test_a_bad_capture_gets_422_by_name_and_leaves_nothing(
+    service: RunningService, http: httpx.Client, tmp_path: Path, fault: str, word: str
+) -> None:
+    folder = small_capture(tmp_path / "capture")
+    if fault == "missing image":
+        (folder / "images" / "cam01.png").unlink()
+    if fault == "nan":
+        document = json.loads((folder / "cameras.json").read_text())
+        document["cameras"][2]["camera_from_world"]["translation"][1] = float("nan")
+        (folder / "cameras.json").write_text(json.dumps(document))
+    if fault == "no cameras":
+        (folder / "cameras.json").unlink()
+    if fault == "wrong size":
+        small_capture(tmp_path / "other", size=30)
+        shutil.copy(tmp_path / "other" / "images" / "cam02.png", folder / "images")
+    if fault == "truncated image":
+        path = folder / "images" / "cam00.png"
+        path.write_bytes(path.read_bytes()[:-300])
+    data = packed(folder)
+    before = stored(service)
+    for path in ("/v1/captures/uploads", "/v1/reconstructions"):
+        response = upload(http, data[:5000] if fault == "damaged" else data, path)
+        assert response.status_code == 422
+        assert response.headers["content-type"] == "application/problem+json"
+        assert any(word in error for error in response.json()["errors"])
+    assert stored(service) == before
+
+
+def test_every_fault_is_listed(http: httpx.Client, tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    (folder / "images" / "cam00.png").unlink()
+    (folder / "background" / "cam02.png").write_bytes(b"no picture")
+    points = {"pronasale": {"cam07": [1, 2]}}
+    (folder / "features.json").write_text(json.dumps({"format": "eigenhead-features/1", "points": points}))
+    errors = upload(http, packed(folder)).json()["errors"]
+    for word in ("images/cam00", "background/cam02", "cam07"):
+        assert any(word in error for error in errors)
+
+
+def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Client, archive: bytes) -> None:
+    capture = upload(http, archive).json()["id"]
+    job = http.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+    assert http.delete(f"/v1/captures/{capture}").status_code == 409
+    assert http.delete(f"/v1/jobs/{job}").status_code in (204, 409)
+    await_state(http, job, ("succeeded",))
+    assert http.delete(f"/v1/captures/{capture}").status_code == 204
+    assert http.get(f"/v1/captures/{capture}").status_code == 404
+    assert http.get(f"/v1/jobs/{job}/result/head.ply").status_code == 200
+    assert http.post(f"/v1/jobs/{job}/restart").status_code == 404
+    assert http.delete(f"/v1/jobs/{job}").status_code == 204
+    assert http.get(f"/v1/jobs/{job}").status_code == 404
+
+
+def test_features_are_stored_or_refused_by_name(http: httpx.Client, archive: bytes) -> None:
+    capture = upload(http, archive).json()["id"]
+    points = {"pronasale": {"cam00": [3.0, 4.0], "cam01": [5.0, 6.0]}}
+    assert http.put(f"/v1/captures/{capture}/features", json={"points": points}).json()["features"] is True
+    assert http.get(f"/v1/captures/{capture}/features").json()["points"] == points
+    wrong = {"pronasale": {"cam09": [1, 2], "cam00": [900, 2]}}
+    bad = http.put(f"/v1/captures/{capture}/features", json={"points": wrong})
+    assert bad.status_code == 422
+    assert len(bad.json()["errors"]) == 2
+    assert http.get(f"/v1/captures/{capture}/features").json()["points"] == points
+
+
+def test_labels_and_sessions_can_be_put_right(http: httpx.Client, archive: bytes) -> None:
+    session = http.post("/v1/sessions", json={"label": "Anna"}).json()["id"]
+    capture = upload(http, archive, label="first").json()["id"]
+    moved = http.patch(f"/v1/captures/{capture}", json={"session": session, "expression": "smile"}).json()
+    assert (moved["session"], moved["label"], moved["expression"]) == (session, "first", "smile")
+    assert http.get(f"/v1/sessions/{session}").json()["captures"] == [capture]
+    renamed = http.patch(f"/v1/sessions/{session}", json={"consent": "signed"}).json()
+    assert (renamed["label"], renamed["consent"], renamed["captures"]) == ("Anna", "signed", [capture])
+    assert http.patch(f"/v1/captures/{capture}", json={"session": "0" * 28}).status_code == 404
+    assert http.patch(f"/v1/captures/{capture}", json={"name": "x"}).status_code == 422
+    alone = http.patch(f"/v1/captures/{capture}", json={"session": None}).json()
+    assert (alone["session"], alone["expression"]) == (None, "smile")
+
+
+def test_erasing_a_session_leaves_nothing_of_it(service: RunningService, http: httpx.Client, archive: bytes) -> None:
+    session = http.post("/v1/sessions", json={"label": "Subject 7", "consent": "signed 2024-05-01"}).json()["id"]
+    captures = [upload(http, archive, session=session, label="zebra").json()["id"] for _ in range(2)]
+    jobs = [job["id"] for job in http.post(f"/v1/sessions/{session}/jobs", json={}).json()["jobs"]]
+    assert len(jobs) == 2
+    await_state(http, jobs[0], ("running", "succeeded"))
+    assert http.get(f"/v1/sessions/{session}").json()["captures"] == sorted(captures, reverse=True)
+    for capture in captures:
+        (service.data / "cache/captures" / capture / "small").mkdir(parents=True)
+        (service.data / "cache/captures" / capture / "small/cam00.jpg").write_bytes(b"a face")
+    assert http.delete(f"/v1/sessions/{session}").status_code == 204
+    gone = [session, *captures, *jobs]
+    assert not [path for path in stored(service) if any(identity in path for identity in gone)]
+    for kind, ids in (("sessions", [session]), ("captures", captures), ("jobs", jobs)):
+        assert [http.get(f"/v1/{kind}/{identity}").status_code for identity in ids] == [404] * len(ids)
+    database = b"".join(path.read_bytes() for path in service.data.glob("eigenhead.sqlite*"))
+    assert b"Subject 7" not in database
+
+
+def test_a_resumable_upload_goes_on_after_a_break(http: httpx.Client, archive: bytes) -> None:
+    tus = {"Tus-Resumable": "1.0.0"}
+    created = http.post("/v1/uploads", headers=tus | {"Upload-Length": str(len(archive))})
+    assert created.status_code == 201
+    where, part = created.headers["location"], tus | {"Content-Type": "application/offset+octet-stream"}
+    first = http.patch(where, content=archive[:7000], headers=part | {"Upload-Offset": "0"})
+    assert (first.status_code, first.headers["upload-offset"]) == (204, "7000")
+    assert http.head(where, headers=tus).headers["upload-offset"] == "7000"
+    assert http.patch(where, content=b"x", headers=part | {"Upload-Offset": "0"}).status_code == 409
+    wrong = part | {"Upload-Offset": "7000", "Upload-Checksum": "sha256 AAAA"}
+    assert http.patch(where, content=archive[7000:8000], headers=wrong).status_code == 460
+    assert http.head(where, headers=tus).headers["upload-offset"] == "7000"
+    last = http.patch(where, content=archive[7000:], headers=part | {"Upload-Offset": "7000"})
+    assert last.status_code == 204
+    assert http.get(last.headers["location"]).status_code == 200
+    assert http.head(where, headers=tus).headers["location"] == last.headers["location"]
+
+
+def test_a_resumable_upload_of_a_bad_capture_gets_422(
+    service: RunningService, http: httpx.Client, archive: bytes
+) -> None:
+    before = stored(service)
+    tus, data = {"Tus-Resumable": "1.0.0"}, archive[:5000]
+    where = http.post("/v1/uploads", headers=tus | {"Upload-Length": str(len(data))}).headers["location"]
+    part = tus | {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    response = http.patch(where, content=data, headers=part)
+    assert response.status_code == 422
+    assert "damaged" in response.json()["errors"][0]
+    assert stored(service) == before
+
+
+def test_the_client_uploads_folders_and_checks_downloads(client: Client, tmp_path: Path) -> None:
+    session = client.post("/v1/sessions", {"label": "Ä"})["id"]
+    capture = client.upload(small_capture(tmp_path / "capture"), session=session, label="links")
+    assert (capture["session"], capture["label"]) == (session, "links")
+    job = client.wait(client.submit(capture["id"])["id"])
+    paths = client.download(job["id"], tmp_path / "out")
+    assert sorted(path.relative_to(tmp_path / "out").as_posix() for path in paths) == sorted(job["files"])
+    (tmp_path / "capture" / "images" / "cam00.png").unlink()
+    with pytest.raises(ServiceError, match=r"images/cam00.png is missing") as caught:
+        client.upload(tmp_path / "capture")
+    assert caught.value.status == 422
+
+
+def test_a_tar_made_elsewhere_with_one_enclosing_folder_works(http: httpx.Client, tmp_path: Path) -> None:
+    folder, buffer = small_capture(tmp_path / "capture"), io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
+        archive.add(folder, arcname="Anna")
+    assert upload(http, buffer.getvalue()).status_code == 201
+
+
+def test_a_session_without_captures_is_asked_as_much(http: httpx.Client) -> None:
+    session = http.post("/v1/sessions", json={}).json()["id"]
+    refused = http.post(f"/v1/sessions/{session}/jobs", json={"settings": {"detial": "fine"}})
+    assert (refused.status_code, "did you mean 'detail'" in refused.text) == (422, True)

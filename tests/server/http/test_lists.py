@@ -1,0 +1,84 @@
+"""Lists over HTTP by pages, searched, filtered, sorted; many things at once."""
+
+import httpx
+import pytest
+
+from tests.support.services import RunningService, await_state, upload
+
+
+@pytest.fixture(scope="module")
+def captures(service: RunningService, archive_of_all: bytes) -> list[str]:
+    """Five captures that a word finds and no other test's."""
+    with httpx.Client(base_url=service.url, timeout=30) as http:
+        return [upload(http, archive_of_all, label=f"walnut {number}").json()["id"] for number in range(5)]
+
+
+def test_captures_come_in_pages_that_a_cursor_goes_on_with(http: httpx.Client, captures: list[str]) -> None:
+    found, cursor = [], {}
+    while True:
+        page = http.get("/v1/captures", params={"q": "WALNUT", "limit": 2, "sort": "label"} | cursor).json()
+        assert page["total"] == 5
+        found += [capture["id"] for capture in page["captures"]]
+        if page["next"] is None:
+            break
+        cursor = {"cursor": page["next"]}
+    assert found == captures
+    newest = http.get("/v1/captures", params={"q": "walnut", "before": captures[3]}).json()["captures"]
+    assert [capture["id"] for capture in newest] == captures[2::-1]
+    assert http.get("/v1/captures", params={"q": "walnut", "verdict": "none"}).json()["total"] == 0
+
+
+@pytest.mark.parametrize(
+    "query", [{"cursor": "x"}, {"sort": "shoe size"}, {"limit": 0}, {"limit": 1001}, {"verdict": "fine"}]
+)
+@pytest.mark.parametrize("path", ["/v1/captures", "/v1/jobs"])
+def test_lists_refuse_what_they_cannot_do(http: httpx.Client, path: str, query: dict[str, str]) -> None:
+    if path == "/v1/jobs" and "verdict" in query:
+        query = {"state": "fine"}
+    answer = http.get(path, params=query)
+    assert answer.status_code == 422
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_many_captures_take_one_action_and_those_that_cannot_are_named(http: httpx.Client, captures: list[str]) -> None:
+    def act(path: str, **body: object) -> dict:
+        answer = http.post(path, json=body)
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    session = http.post("/v1/sessions", json={"label": "Wanda"}).json()["id"]
+    moved = act("/v1/captures/bulk", action="move", ids=captures[:2], session=session)
+    assert moved == {"done": captures[:2], "refused": []}
+    person = http.get("/v1/subjects", params={"q": "wanda"}).json()["subjects"][0]
+    assert (person["captures"], person["heads"], person["head"], person["consent"]) == (2, 0, None, False)
+    assert http.get("/v1/captures", params={"q": "wanda walnut"}).json()["total"] == 2
+    missing = "0" * 28
+    queued = act("/v1/captures/bulk", action="reconstruct", ids=[captures[0], missing], settings={"detail": "span"})
+    assert queued["done"] == captures[:1]
+    assert [(one["id"], one["type"]) for one in queued["refused"]] == [(missing, "urn:eigenhead:problem:not-found")]
+    page = http.get("/v1/jobs", params={"q": "span wanda"}).json()
+    assert (page["total"], page["jobs"][0]["capture_id"]) == (1, captures[0])
+    job = await_state(http, page["jobs"][0]["id"], ("succeeded",))["id"]
+    assert http.get("/v1/jobs", params={"q": "wanda succeeded"}).json()["total"] == 1
+    assert http.get("/v1/jobs", params={"q": "wanda failed"}).json()["total"] == 0
+    assert http.get("/v1/subjects", params={"q": "wanda"}).json()["subjects"][0]["head"] == job
+    gone = act("/v1/jobs/bulk", action="remove", ids=[job])
+    assert gone == {"done": [job], "refused": []}
+    removed = act("/v1/captures/bulk", action="erase", ids=captures[:2])
+    assert removed["done"] == captures[:2]
+    assert http.get("/v1/sessions", params={"q": "wanda"}).json()["sessions"][0]["captures"] == []
+
+
+def test_every_queued_job_has_a_place_of_its_own(http: httpx.Client, captures: list[str]) -> None:
+    """In a queue that nobody serves; another test may have left a job in it."""
+    left = http.get("/v1/jobs", params={"state": "queued"}).json()["jobs"]
+    http.post("/v1/jobs/bulk", json={"action": "cancel", "ids": [job["id"] for job in left] or ["0" * 28]})
+    wanted = {"capture_id": captures[4], "queue": "gpu"}
+    jobs = [http.post("/v1/jobs", json=wanted | {"priority": p}).json()["id"] for p in (100, 50, 100, 50)]
+    listed = {job["id"]: job["ahead"] for job in http.get("/v1/jobs", params={"state": "queued"}).json()["jobs"]}
+    assert [listed[job] for job in jobs] == [2, 0, 3, 1]
+    assert http.get(f"/v1/jobs/{jobs[0]}").json()["ahead"] == 2
+    both = http.post("/v1/jobs/bulk", json={"action": "cancel", "ids": jobs[:2]}).json()
+    assert both == {"done": jobs[:2], "refused": []}
+    assert [http.get(f"/v1/jobs/{job}").json()["ahead"] for job in jobs] == [None, None, 1, 0]
+    http.post("/v1/jobs/bulk", json={"action": "cancel", "ids": jobs})

@@ -1,0 +1,57 @@
+"""Photographs of the wedge alone: calibrated once, kept, and taken again when one of them is another."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.adjustment.gauge import image_distance
+from rig.errors import InputError
+from rig.formats.cameras_json import write_rig
+from rig.formats.images import read_image, write_image
+from server.tasks.photographs import photographs_alone, read_or_calibrate
+from tests.support.textured_wedge import wedge_rig, write_photographs
+
+
+def quiet(stage: str, share: float) -> None:
+    pass
+
+
+def test_photographs_alone_become_a_capture_and_are_kept(tmp_path: Path) -> None:
+    photos, kept = write_photographs(tmp_path / "photos", wedge_rig()), tmp_path / "out"
+    told: list[str] = []
+    found = read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: told.append(stage))
+    assert set(found.rig.names) == set(found.capture.images) == set(wedge_rig().names)
+    assert image_distance(found.rig, wedge_rig(), scale=True).max() < 0.1
+    assert [warning.code for warning in found.warnings] == ["scale-assumed"]
+    assert {"cameras.json", "calibration.json", "calibration.html"} <= {path.name for path in kept.iterdir()}
+    assert "structure" in told
+
+    told.clear()
+    again = read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: told.append(stage))
+    assert told == []  # nothing was worked out again
+    assert again.capture.digests == found.capture.digests
+    assert again.warnings == found.warnings
+
+    picture = np.array(read_image(photos / "cam00.png"))
+    write_image(photos / "cam00.png", np.ascontiguousarray(255 - picture))
+    read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: told.append(stage))
+    assert "structure" in told
+
+
+def test_a_folder_with_cameras_is_read_as_it_is(tmp_path: Path) -> None:
+    write_photographs(tmp_path, wedge_rig())
+    assert photographs_alone(tmp_path)
+    write_rig(wedge_rig(), tmp_path / "cameras.json")
+    assert not photographs_alone(tmp_path)
+    found = read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=quiet)
+    assert found.warnings == ()
+    assert image_distance(found.rig, wedge_rig(), scale=False).max() < 1e-6
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_few_photographs_are_refused_by_name(tmp_path: Path) -> None:
+    rig = wedge_rig()
+    write_photographs(tmp_path, rig.subset(rig.names[:2]))
+    with pytest.raises(InputError, match="2 photographs; at least 3"):
+        read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=quiet)
