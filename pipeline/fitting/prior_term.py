@@ -21,8 +21,6 @@ from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, State
 
 LOG_SCALE = 6  # its place in the pose
-
-
 TAIL = 2.0  # exponent of the weights' prior
 
 

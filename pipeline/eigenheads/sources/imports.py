@@ -10,7 +10,7 @@ triangles between existing vertices, so that the head hides what is behind it.
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +25,9 @@ from pipeline.eigenheads.landmarks import MIDLINE, NAMES, mirrored
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.model_file import ModelParts, read_parts, rounded
 from pipeline.eigenheads.pca import Components, orthogonalised
+from pipeline.eigenheads.sources.foreign import CannotImport, Foreign, read_obj
 from pipeline.eigenheads.subdivision import boundary_loops, close_loop, vertex_areas
 from pipeline.eigenheads.training.training import Training, above_neck, face_region, finish
-from rig.errors import EigenheadError
 from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
 
@@ -61,32 +61,6 @@ _BASEL_NAMES = {
     "right.lips.corner": "cheilion_right", "left.lips.corner": "cheilion_left", "center.chin.tip": "gnathion",
     "center.lips.upper.outer": "labiale_superius", "center.lips.lower.outer": "labiale_inferius",
 }  # fmt: skip
-
-
-class CannotImport(EigenheadError):
-    """A file or folder that holds no head model that can be read."""
-
-    def __init__(self, path: Path | str, why: str) -> None:
-        super().__init__(
-            f"{path} cannot be imported as a head model: {why}. Readable are ICT-FaceKit (its repository or compact "
-            "npz), statismo or Basel HDF5 files, and npz files with mean, modes, faces and landmarks (docs/models.md)"
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Foreign:
-    """A model as its file tells it, in mm and head axes (x to the subject's left, y up, z out of the face)."""
-
-    name: str
-    licence: str
-    source: str
-    notice: str
-    mean: Float[np.ndarray, "V 3"]
-    modes: Float[np.ndarray, "M V 3"]  # mm per standard deviation; need not be orthogonal
-    faces: Int[np.ndarray, "F 3"]
-    landmarks: Mapping[str, int]  # those that are known
-    subjects: Mapping[str, int]
-    expressions: Expressions | None = None  # displacements in mm
 
 
 def import_model(path: Path, *, name: str | None = None, report: Report | None = None) -> ModelParts:
@@ -136,13 +110,13 @@ def read_ict_repository(folder: Path, *, report: Report | None = None) -> Foreig
     inside = next((f for f in (folder, folder / "FaceXModel") if (f / "generic_neutral_mesh.obj").is_file()), None)
     if inside is None:
         raise CannotImport(folder, "it has no FaceXModel/generic_neutral_mesh.obj")
-    neutral, polygons = _read_obj(inside / "generic_neutral_mesh.obj")
+    neutral, polygons = read_obj(inside / "generic_neutral_mesh.obj")
     paths = sorted(inside.glob("identity[0-9][0-9][0-9].obj"))
     if not paths:
         raise CannotImport(folder, "FaceXModel holds no identity000.obj and following")
     modes = []
     for k, path in enumerate(paths):
-        vertices, _ = _read_obj(path, polygons=False)
+        vertices, _ = read_obj(path, polygons=False)
         if len(vertices) != len(neutral):
             raise CannotImport(folder, f"{path.name} has {len(vertices)} vertices, the neutral mesh {len(neutral)}")
         modes.append((vertices - neutral)[:ICT_VERTICES] * 10.0)
@@ -161,7 +135,7 @@ def _repository_expressions(
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     shapes = []
     for k, path in enumerate(paths):
-        vertices, _ = _read_obj(path, polygons=False)
+        vertices, _ = read_obj(path, polygons=False)
         if len(vertices) != len(neutral):
             raise CannotImport(folder, f"{path.name} has {len(vertices)} vertices, the neutral mesh {len(neutral)}")
         shapes.append((vertices - neutral)[:ICT_VERTICES] * 10.0)
@@ -182,18 +156,6 @@ def _ict(mean: np.ndarray, modes: np.ndarray, faces: np.ndarray, points: np.ndar
         landmarks={name: int(points[index]) for name, index in MULTI_PIE.items()},
         subjects={"total": 0, "male": 0, "female": 0},  # the repository does not say
     )
-
-
-def _read_obj(path: Path, *, polygons: bool = True) -> tuple[Float[np.ndarray, "V 3"], list[list[int]]]:
-    """Vertices and polygons in file order (trimesh would merge and reorder what the indices of the README count)."""
-    vertices, faces = [], []
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for line in file:
-            if line.startswith("v "):
-                vertices.append(line.split()[1:4])
-            elif polygons and line.startswith("f "):
-                faces.append([int(corner.split("/")[0]) - 1 for corner in line.split()[1:]])
-    return np.array(vertices, float), faces
 
 
 def read_statismo(path: Path) -> Foreign:

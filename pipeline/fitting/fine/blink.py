@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.dense.part_votes import UNSEEN
 from pipeline.eigenheads.expressions import BLINKS, plain_name
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fine.association import associate
-from pipeline.fitting.fine.eyelids import EyeEvidence, Fissure, eye_fissure, with_plain_lids
+from pipeline.fitting.fine.eyelids import EyeEvidence, Fissure, eye_fissure
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
 from rig.mesh import vertex_normals
@@ -39,23 +39,43 @@ def blinks_of(model: HeadModel) -> dict[str, int]:
 
 
 def judged_lids(
-    fit: Fit, model: HeadModel, surface: SurfacePoints, eigenheads: int, eyes: Mapping[str, EyeEvidence]
+    fit: Fit,
+    model: HeadModel,
+    base: Float[np.ndarray, "v 3"],
+    surface: SurfacePoints,
+    eyes: Mapping[str, EyeEvidence],
 ) -> dict[str, float]:
     """How far each eye is closed, 0 to 1, of those that the model can close.
 
     Args:
         fit: of the photographs.
         model: with the modes that the fit has.
+        base: the fit's head with plain lids (``with_plain_lids``), full level, world.
         surface: the dense points, world frame.
-        eigenheads: how many of the modes are a population's.
         eyes: what shows between the lids; an eye that shows none and whose lids are half down is closed.
     """
     found = {}
     for side, place in blinks_of(model).items():
-        share = _told(fit, model, surface, eigenheads, eye_fissure(model, side), place)
+        own, moved = float(fit.coefficients[place]), _moved(fit, model, place)
+        share = _told(base - own * moved, moved, own, model, surface, eye_fissure(model, side))
         shown = eyes.get(side)
         found[side] = 1.0 if shown is not None and shown.closed and share >= SHUT else share
     return found
+
+
+def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
+    """What closes the fit's eyes that far, full level, world, mm."""
+    shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
+    for side, share in lids.items():
+        if (more := share - float(fit.coefficients[places[side]])) != 0.0:
+            shift += more * _moved(fit, model, places[side])
+    return shift
+
+
+def _moved(fit: Fit, model: HeadModel, place: int) -> Float[np.ndarray, "v 3"]:
+    """An expression at weight 1, full level, world."""
+    moved = model.levels["full"].operator @ model.modes[place].astype(float)
+    return fit.world_from_head.scale * moved @ fit.world_from_head.rotation.T
 
 
 def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
@@ -73,34 +93,44 @@ def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray
     return fit.world_from_head.apply(model.vertices(plain))
 
 
-def _told(fit: Fit, model: HeadModel, surface: SurfacePoints, eigenheads: int, slit: Fissure, place: int) -> float:
-    """The weight whose lids lie nearest; the fit's own where too few points tell, or none is nearer."""
+def _told(
+    open_lids: Float[np.ndarray, "v 3"],
+    moved: Float[np.ndarray, "v 3"],
+    own: float,
+    model: HeadModel,
+    surface: SurfacePoints,
+    slit: Fissure,
+) -> float:
+    """The weight whose lids lie nearest; the fit's ``own`` where too few points tell, or none is nearer.
 
-    def lids(weight: float) -> Float[np.ndarray, "v 3"]:
-        coefficients = fit.coefficients.copy()
-        coefficients[place] = weight
-        tried = replace(fit, coefficients=coefficients)
-        fitted = fit.world_from_head.apply(model.vertices(coefficients))
-        return with_plain_lids(fitted, plain_shape(tried, model, eigenheads), model)
-
-    own, open_lids = float(fit.coefficients[place]), lids(0.0)
+    ``moved`` is what closes open lids."""
     middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
     off = np.linalg.norm(surface.points - middle, axis=1)
     about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != UNSEEN))
     if len(about.points) < LEAST_POINTS:
         return own
-    still = _misfit(open_lids, model, about)
-    misfits = {HALF: _misfit(lids(HALF), model, about)}
+    near, faces = _patch(open_lids, model, middle, NEAR * slit.length_mm + REACH_MM)
+    still = _misfit(open_lids[near], faces, about)
+    misfits = {HALF: _misfit((open_lids + HALF * moved)[near], faces, about)}
     if misfits[HALF] >= GAIN * still:  # lids that are down at all are nearer half way
         return own
-    misfits |= {weight: _misfit(lids(weight), model, about) for weight in OTHERS}
+    misfits |= {weight: _misfit((open_lids + weight * moved)[near], faces, about) for weight in OTHERS}
     return min(misfits, key=lambda weight: misfits[weight])
 
 
-def _misfit(base: Float[np.ndarray, "v 3"], model: HeadModel, points: SurfacePoints) -> float:
-    """Mean of Geman and McClure's loss of the points' distances; a point without a place counts whole."""
+def _patch(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel, middle: Float[np.ndarray, " 3"], radius_mm: float
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "f 3"]]:
+    """The head about an eye: its vertices, and its triangles between them."""
+    inside = np.linalg.norm(vertices - middle, axis=1) < radius_mm
     faces = model.levels["full"].faces
-    given = (points.points, points.normals, base, vertex_normals(base, faces), faces)
+    places = np.cumsum(inside, dtype=np.int32) - np.int32(1)  # as the head's own faces: loops are compiled for these
+    return np.flatnonzero(inside), places[faces[inside[faces].all(axis=1)]]
+
+
+def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
+    """Mean of Geman and McClure's loss of the points' distances; a point without a place counts whole."""
+    given = (points.points, points.normals, vertices, vertex_normals(vertices, faces), faces)
     found = associate(*given, reach_mm=REACH_MM, least_agreement=AGREEMENT)
     loss = np.ones(len(points.points))
     loss[found.row] = found.distance_mm**2 / (found.distance_mm**2 + ROBUST_MM**2)

@@ -21,7 +21,7 @@ from pipeline.dense.part_votes import SKIN, UNSEEN
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import Associated, associate, interpolated
-from pipeline.fitting.fine.blink import judged_lids, plain_shape, with_lids
+from pipeline.fitting.fine.blink import blink_shift, judged_lids, plain_shape
 from pipeline.fitting.fine.ears import with_ears_in_place
 from pipeline.fitting.fine.eyelids import EyeEvidence, bridged, with_plain_lids
 from pipeline.fitting.fine.folds import unfolded
@@ -101,12 +101,13 @@ def refine_to_surface(
         The displaced head and what was decided about the eyes.
     """
     faces = model.levels["full"].faces
-    lids = judged_lids(fit, model, surface, eigenheads, eyes or {})
-    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed and lids.get(side, 1.0) == 1.0)
-    fit = with_lids(fit, model, lids)
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
     shape = plain_shape(fit, model, eigenheads)
-    base = unfolded(shape, with_plain_lids(fitted, shape, model), faces)
+    base = with_plain_lids(fitted, shape, model)
+    lids = judged_lids(fit, model, base, surface, eyes or {})
+    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed and lids.get(side, 1.0) == 1.0)
+    blink = blink_shift(fit, model, lids)
+    base = unfolded(shape + blink, base + blink, faces)
     base = bridged(base, model, closed.difference(lids))
     surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
     base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))

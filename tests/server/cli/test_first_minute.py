@@ -148,6 +148,7 @@ def test_a_database_that_is_down_is_one_line_without_its_password(
         ["reconstruct", "CAPTURE", "--out", "OUT", "--detail", "everything"],
         ["reconstruct", "CAPTURE", "--out", "OUT", "--surface", "feet"],
         ["simulate", "OUT", "--fault", "dark:cam00=much"],
+        ["simulate", "OUT", "--expression", "mouthSmile=0.5"],
         ["board", "--out", "OUT", "--kind", "chess"],
         ["convert", "CAPTURE", "--out", "OUT", "--to", "paper"],
     ],

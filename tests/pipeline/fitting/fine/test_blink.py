@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
-from pipeline.fitting.fine.blink import blinks_of, judged_lids, with_lids
+from pipeline.fitting.fine.blink import blink_shift, blinks_of, judged_lids, with_lids
 from pipeline.fitting.fine.eyelids import EyeEvidence
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
@@ -21,6 +21,10 @@ def fit_of(model: HeadModel) -> Fit:
     return Fit("contour", np.zeros(len(model.modes)), Similarity.identity(), 1, "planted")
 
 
+def head_of(model: HeadModel, fit: Fit) -> np.ndarray:
+    return model.vertices(fit.coefficients)
+
+
 def points_of(model: HeadModel, fit: Fit) -> SurfacePoints:
     """Front of the head, 0.1 mm of noise along the normals."""
     vertices = model.vertices(fit.coefficients)
@@ -31,24 +35,27 @@ def points_of(model: HeadModel, fit: Fit) -> SurfacePoints:
     return SurfacePoints(vertices[seen] + off * normals[seen], normals[seen], np.full(len(seen), 0.1), part)
 
 
-@pytest.mark.slow
 def test_one_closed_eye_and_one_open_are_told_from_each_other(model: HeadModel) -> None:
     fit = fit_of(model)
     surface = points_of(model, with_lids(fit, model, {"right": 1.0}))
     open_eyes = {side: EyeEvidence(0.2, 0.3, 5) for side in ("right", "left")}
-    assert judged_lids(fit, model, surface, 2, open_eyes) == {"right": 1.0, "left": 0.0}
+    lids = judged_lids(fit, model, head_of(model, fit), surface, open_eyes)
+    assert lids == {"right": 1.0, "left": 0.0}
+    shut = head_of(model, with_lids(fit, model, lids))
+    np.testing.assert_allclose(head_of(model, fit) + blink_shift(fit, model, lids), shut, atol=1e-3)
 
 
-@pytest.mark.slow
 def test_an_open_eye_without_a_white_is_not_closed(model: HeadModel) -> None:
     fit = fit_of(model)
     nothing = {side: EyeEvidence(0.0, 0.01, 5) for side in ("right", "left")}
-    assert judged_lids(fit, model, points_of(model, fit), 2, nothing) == {"right": 0.0, "left": 0.0}
+    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), nothing) == {"right": 0.0, "left": 0.0}
     half = points_of(model, with_lids(fit, model, {"left": 0.75}))
-    assert judged_lids(fit, model, half, 2, nothing)["left"] == 1.0
+    assert judged_lids(fit, model, head_of(model, fit), half, nothing)["left"] == 1.0
 
 
 def test_a_model_that_does_not_blink_says_nothing_of_lids() -> None:
     model = with_modes(load_model(), 2)
     assert blinks_of(model) == {}
-    assert judged_lids(fit_of(model), model, points_of(model, fit_of(model)), 2, {}) == {}
+    fit = fit_of(model)
+    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), {}) == {}
+    assert not blink_shift(fit, model, {}).any()
