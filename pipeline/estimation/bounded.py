@@ -3,7 +3,6 @@
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
-from scipy.optimize import lsq_linear
 
 
 def least_within(
@@ -17,6 +16,8 @@ def least_within(
     The unknowns without a bound are eliminated (Schur's complement); what is left is least squares with bounds, solved
     by an active set (Stark and Parker 1995, *Bounded-variable least-squares*).
     """
+    from scipy.optimize import lsq_linear  # 0.4 s to load, which a model without expressions need not wait for
+
     tied = np.isfinite(lower) | np.isfinite(upper)
     free = ~tied
     right = np.column_stack([matrix[np.ix_(free, tied)], gradient[free]])
