@@ -26,7 +26,11 @@ REACH_MM, AGREEMENT, ROBUST_MM = 6.0, 0.3, 0.3
 LEAST_POINTS = 200
 GAIN = 0.97  # of the misfit of open lids that half closed ones must stay under: 0.89 and 0.94 of closed ones, 1.03 and
 # more of open ones
-SHUT = 0.5  # lids that far down over an eye that shows nothing are closed
+SHUT = 0.5  # lids that far down over an eye that shows nothing are closed ...
+OPEN = (
+    1.25  # ... and so are others, unless half closed ones fit that much worse: 1.03 and 1.16 on a real scan, whose lids
+)
+# are closed another way than the model's; 1.32 to 1.86 on open eyes of the studio
 
 
 def blinks_of(model: HeadModel) -> dict[str, int]:
@@ -44,23 +48,27 @@ def judged_lids(
     base: Float[np.ndarray, "v 3"],
     surface: SurfacePoints,
     eyes: Mapping[str, EyeEvidence],
-) -> dict[str, float]:
-    """How far each eye is closed, 0 to 1, of those that the model can close.
+) -> tuple[dict[str, float], frozenset[str]]:
+    """How far each eye is closed, 0 to 1, of those that the model can close, and the eyes that show nothing though no
+    blink of the model's lies nearer to the points: their lids are to be bridged.
 
     Args:
         fit: of the photographs.
         model: with the modes that the fit has.
         base: the fit's head with plain lids (``with_plain_lids``), full level, world.
         surface: the dense points, world frame.
-        eyes: what shows between the lids; an eye that shows none and whose lids are half down is closed.
+        eyes: what shows between the lids; an eye that shows none is closed unless the points say that it is open.
     """
-    found = {}
+    found, otherwise = {}, set[str]()
     for side, place in blinks_of(model).items():
         own, moved = float(fit.coefficients[place]), _moved(fit, model, place)
-        share = _told(base - own * moved, moved, own, model, surface, eye_fissure(model, side))
+        share, half = _told(base - own * moved, moved, own, model, surface, eye_fissure(model, side))
         shown = eyes.get(side)
-        found[side] = 1.0 if shown is not None and shown.closed and share >= SHUT else share
-    return found
+        shut = shown is not None and shown.closed
+        found[side] = 1.0 if shut and share >= SHUT else share
+        if shut and share < SHUT and half < OPEN:
+            otherwise.add(side)
+    return found, frozenset(otherwise)
 
 
 def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
@@ -100,22 +108,24 @@ def _told(
     model: HeadModel,
     surface: SurfacePoints,
     slit: Fissure,
-) -> float:
-    """The weight whose lids lie nearest; the fit's ``own`` where too few points tell, or none is nearer.
+) -> tuple[float, float]:
+    """The weight whose lids lie nearest; the fit's ``own`` where too few points tell, or none is nearer. And the misfit
+    of half closed lids by that of open ones, 1 where too few points tell.
 
     ``moved`` is what closes open lids."""
     middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
     off = np.linalg.norm(surface.points - middle, axis=1)
     about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != UNSEEN))
     if len(about.points) < LEAST_POINTS:
-        return own
+        return own, 1.0
     near, faces = _patch(open_lids, model, middle, NEAR * slit.length_mm + REACH_MM)
     still = _misfit(open_lids[near], faces, about)
     misfits = {HALF: _misfit((open_lids + HALF * moved)[near], faces, about)}
-    if misfits[HALF] >= GAIN * still:  # lids that are down at all are nearer half way
-        return own
+    half = misfits[HALF] / max(still, 1e-9)
+    if half >= GAIN:  # lids that are down at all are nearer half way
+        return own, half
     misfits |= {weight: _misfit((open_lids + weight * moved)[near], faces, about) for weight in OTHERS}
-    return min(misfits, key=lambda weight: misfits[weight])
+    return min(misfits, key=lambda weight: misfits[weight]), half
 
 
 def _patch(

@@ -104,11 +104,11 @@ def refine_to_surface(
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
     shape = plain_shape(fit, model, eigenheads)
     base = with_plain_lids(fitted, shape, model)
-    lids = judged_lids(fit, model, base, surface, eyes or {})
+    lids, otherwise = judged_lids(fit, model, base, surface, eyes or {})
     closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed and lids.get(side, 1.0) == 1.0)
     blink = blink_shift(fit, model, lids)
     base = unfolded(shape + blink, base + blink, faces)
-    base = bridged(base, model, closed.difference(lids))
+    base = bridged(base, model, closed.difference(lids) | otherwise)
     surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
     base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))
     regions = head_regions(model)
@@ -123,7 +123,7 @@ def refine_to_surface(
         look=patches and patches.places,
         report=report,
     )
-    return replace(head, closed_eyes=closed, lids=lids)
+    return replace(head, closed_eyes=closed | otherwise, lids=lids)
 
 
 def draw_to_surface(

@@ -2,7 +2,7 @@ export default {
   emits: ["key"],
   data: () => ({ key: "", fault: "", busy: false }),
   template: `
-    <main style="height: 100vh; display: grid; place-items: center">
+    <div style="height: 100vh; display: grid; place-items: center">
       <form class="panel pad stack" style="width: 26rem" @submit.prevent="send">
         <h1>eigenhead</h1>
         <p class="muted">This service asks for an API key. It stays between this browser and the service.</p>
@@ -10,7 +10,7 @@ export default {
         <p class="fault small" role="alert" style="min-height: 1.3em">{{ fault }}</p>
         <button class="b main-action" :disabled="busy || !key" style="justify-content: center">{{ busy ? 'Looking ...' : 'Sign in' }}</button>
       </form>
-    </main>`,
+    </div>`,
   mounted() { this.$refs.key.focus(); },
   methods: {
     send() { this.busy = true; this.fault = ""; this.$emit("key", this.key); },

@@ -25,12 +25,12 @@ def head_of(model: HeadModel, fit: Fit) -> np.ndarray:
     return model.vertices(fit.coefficients)
 
 
-def points_of(model: HeadModel, fit: Fit) -> SurfacePoints:
-    """Front of the head, 0.1 mm of noise along the normals."""
+def points_of(model: HeadModel, fit: Fit, noise_mm: float = 0.1) -> SurfacePoints:
+    """Front of the head, with noise along the normals."""
     vertices = model.vertices(fit.coefficients)
     normals = vertex_normals(vertices, model.levels["full"].faces)
     seen = np.flatnonzero((normals[:, 2] > 0.2) & model.levels["full"].face_region)
-    off = 0.1 * np.random.default_rng(3).standard_normal((len(seen), 1))
+    off = noise_mm * np.random.default_rng(3).standard_normal((len(seen), 1))
     part = np.ones(len(seen), np.uint8)
     return SurfacePoints(vertices[seen] + off * normals[seen], normals[seen], np.full(len(seen), 0.1), part)
 
@@ -39,7 +39,7 @@ def test_one_closed_eye_and_one_open_are_told_from_each_other(model: HeadModel) 
     fit = fit_of(model)
     surface = points_of(model, with_lids(fit, model, {"right": 1.0}))
     open_eyes = {side: EyeEvidence(0.2, 0.3, 5) for side in ("right", "left")}
-    lids = judged_lids(fit, model, head_of(model, fit), surface, open_eyes)
+    lids, _ = judged_lids(fit, model, head_of(model, fit), surface, open_eyes)
     assert lids == {"right": 1.0, "left": 0.0}
     shut = head_of(model, with_lids(fit, model, lids))
     np.testing.assert_allclose(head_of(model, fit) + blink_shift(fit, model, lids), shut, atol=1e-3)
@@ -48,14 +48,28 @@ def test_one_closed_eye_and_one_open_are_told_from_each_other(model: HeadModel) 
 def test_an_open_eye_without_a_white_is_not_closed(model: HeadModel) -> None:
     fit = fit_of(model)
     nothing = {side: EyeEvidence(0.0, 0.01, 5) for side in ("right", "left")}
-    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), nothing) == {"right": 0.0, "left": 0.0}
+    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), nothing) == (
+        {"right": 0.0, "left": 0.0},
+        frozenset(),
+    )
     half = points_of(model, with_lids(fit, model, {"left": 0.75}))
-    assert judged_lids(fit, model, head_of(model, fit), half, nothing)["left"] == 1.0
+    assert judged_lids(fit, model, head_of(model, fit), half, nothing)[0]["left"] == 1.0
+
+
+def test_lids_that_close_another_way_than_the_model_are_bridged(model: HeadModel) -> None:
+    fit = fit_of(model)
+    vague = points_of(model, fit, noise_mm=3.0)  # half closed lids lie 1.1 times as far from them as open ones
+    nothing = {side: EyeEvidence(0.0, 0.01, 5) for side in ("right", "left")}
+    lids, otherwise = judged_lids(fit, model, head_of(model, fit), vague, nothing)
+    assert lids == {"right": 0.0, "left": 0.0}
+    assert otherwise == {"right", "left"}
+    shown = {side: EyeEvidence(0.1, 0.3, 5) for side in ("right", "left")}
+    assert not judged_lids(fit, model, head_of(model, fit), vague, shown)[1]
 
 
 def test_a_model_that_does_not_blink_says_nothing_of_lids() -> None:
     model = with_modes(load_model(), 2)
     assert blinks_of(model) == {}
     fit = fit_of(model)
-    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), {}) == {}
+    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), {}) == ({}, frozenset())
     assert not blink_shift(fit, model, {}).any()
