@@ -12,6 +12,7 @@ WARNING_CODES = (
     "features",
     "mask-contradicted",
     "mask-loose",
+    "no-albedo",
     "no-bust",
     "no-texture",
     "no-texture-layout",

@@ -18,6 +18,7 @@ from pipeline.experiments.drift import drift
 from pipeline.experiments.exchanges import exchanges, false_alarms
 from pipeline.experiments.hidden import hidden
 from pipeline.experiments.levels import levels
+from pipeline.experiments.light import light
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.posterior_check import posterior_check
@@ -212,6 +213,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "visible": _visible,
     "surfaces": _surfaces,
     "texture": _texture,
+    "light": _drawn(light),
 }
 
 

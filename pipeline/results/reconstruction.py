@@ -17,6 +17,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.bust import Bust
 from pipeline.results.measurements import Landmark, Measurement
 from pipeline.settings import Settings
+from pipeline.texture.delight import Albedo
 from pipeline.texture.uv_unwrap import Atlas
 from rig.mesh import Mesh
 
@@ -69,5 +70,6 @@ class Reconstruction:
     gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
     pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
     atlas: Atlas | None = None  # where a format has a texture and the model a layout
+    albedo: Albedo | None = None  # where the settings ask for it and the light can be told
     bust: Bust | None = None  # where the settings ask for it and the photographs carry it
     parts: Mapping[str, PartMap] = field(default_factory=dict)  # skin, hair or clothes in a view's pixels, where told
