@@ -24,7 +24,9 @@ from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.pictures import labelled
 from pipeline.experiments.records import Records, key_of
 from pipeline.experiments.texture import drawn_texture
+from pipeline.imaging.cpu_raster import depth_map
 from pipeline.imaging.cpu_raster_kernels import rasterise
+from pipeline.imaging.masks import box_around
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
@@ -46,6 +48,7 @@ Report = Callable[[str, float], None]
 Image = UInt8[np.ndarray, "s s 3"]
 SUBJECTS = 1
 GRID = 512  # texels that are compared: 0.7 mm a texel, beyond what two fits differ by
+PANEL = (540, 780)
 LIGHTS: Mapping[str, tuple[Lamp, ...]] = {
     "studio": LAMPS,
     "left": (  # a warm window on the subject's left, hardly a fill
@@ -187,12 +190,15 @@ def albedo_of(head: Reconstruction) -> Albedo:
 
 def sheet(found: Mapping[str, Reconstruction], rig: Rig) -> Image:
     """A column a light: the texture above, the albedo below, as the front camera sees them unlit."""
-    camera = rig.scaled(0.75)[rig.front_camera()]
+    camera = rig[rig.front_camera()]
     columns = []
     for name, head in found.items():
-        images = {f"{name}: texture": _texture(head), f"{name}: albedo": albedo_of(head).atlas.image}
-        layout = albedo_of(head).atlas.layout
-        drawn = {text: drawn_texture(camera, head.mesh_world, layout, image) for text, image in images.items()}
-        panels = [labelled(np.clip(np.rint(one), 0, 255).astype(np.uint8), text) for text, one in drawn.items()]
+        mesh, albedo = head.mesh_world, albedo_of(head).atlas
+        inside = np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])
+        panels = []
+        for kind, image in (("texture", _texture(head)), ("albedo", albedo.image)):
+            drawn = np.clip(np.rint(drawn_texture(camera, mesh, albedo.layout, image)), 0, 255)
+            panel = np.where(inside[:, :, None], drawn, 255).astype(np.uint8)[box_around(inside, 0)]
+            panels.append(labelled(np.asarray(cv2.resize(panel, PANEL)), f"{name}: {kind}"))
         columns.append(np.vstack(panels))
     return np.hstack(columns)

@@ -1,9 +1,9 @@
 """Albedo: the texture with its light taken off.
 
 Enters: the head, its photograph-like texture, linear colours of all views. Leaves: the light
-(``pipeline.texture.light``) and an image in the texture's layout of what the skin itself reflects. Highlights move with the camera, so that of each
-vertex' views a dim one tells what is matt; the texture is multiplied, in linear light, by the factor of its vertices
-from texture to matt colour by shading, which keeps every texel's detail.
+(``pipeline.texture.light``) and an image in the texture's layout of what the skin itself reflects. Highlights move with
+the camera, so that of each vertex' views a dim one tells what is matt; the texture is multiplied, in linear light, by
+the factor of its vertices from texture to matt colour by shading, which keeps every texel's detail.
 """
 
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ def delight(
     seen = coloured.views > 0
     shown = linear_from_srgb(coloured.colours / 255.0)
     matt = shown * shine_left(shown, coloured.dim, seen, around)[:, None]
-    white = transfer(mesh_world, normals)
+    white = transfer(mesh_world, normals, around)
     light = fit_light(white, matt, seen & face_region)
     if light is None:
         return None, [
@@ -76,9 +76,7 @@ def shine_left(
     their lamp's colour, but a dim view's own colour is noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
-    count = np.maximum(np.diff(around.starts), 1)
-    for _ in range(CALM):
-        ratio = 0.5 * ratio + 0.5 * np.bincount(around.rows, ratio[around.indices], len(ratio)) / count
+    ratio = around.calmed(ratio[:, None], CALM)[:, 0]
     # Between its views every vertex differs by noise: what most of the head has is no highlight.
     ordinary = float(np.median(ratio[seen])) if seen.any() else 1.0
     return np.clip(ratio / max(ordinary, 1e-4), 1.0 - MOST_SHINE, 1.0)

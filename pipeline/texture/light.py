@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from pipeline.imaging.cpu_raster import camera_depths, depth_map
 from pipeline.imaging.projection import project_points
 from pipeline.parallel_for import in_threads
+from pipeline.texture.neighbourhood import Neighbourhood
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.mesh import Mesh
@@ -28,6 +29,8 @@ DIRECTIONS = 96  # that shadows are looked for in: their mean is that of 384 wit
 MAP_PX = 192  # 2 mm a pixel
 FAR_RADII = 20.0  # a distant light, at 3 degrees
 BIAS_MM = 4.0  # a surface does not hide itself for the map's coarse pixels
+RETURNED = 0.3  # of the light that comes from where the head itself is: skin, lit about as the rest
+CALM = 8  # rounds of means: an edge of the depth maps is no edge of a shadow
 SCALE = 0.12  # of the shading: skin varies by less, brows and lips by more, and count less
 SAMPLES = 150.0  # spots of skin that vary by themselves; freckles and folds are as large as that
 PRIOR = 1.0  # standard deviation of a coefficient by the mean light: one lamp alone has 0.6 to 1.7
@@ -72,10 +75,10 @@ def spread_directions(count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def transfer(
-    mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], directions: int = DIRECTIONS
+    mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], around: Neighbourhood, directions: int = DIRECTIONS
 ) -> Float[np.ndarray, "v 9"]:
     """How bright each vertex is, as matt white, in the light of each harmonic: what it would be unhidden, less what
-    the mesh hides of the directions, sampled."""
+    the mesh hides of the directions, sampled, but for the light that hidden directions send back."""
     unhidden = harmonics(normals) * BAND_FACTORS
     towards = spread_directions(directions)
     basis = harmonics(towards) * (4.0 / directions)  # the sphere's 4 pi by the matt surface's pi
@@ -91,9 +94,10 @@ def transfer(
 
     rows: list[np.ndarray] = [np.zeros(0, np.int64)] * directions
     in_threads(directions, work)
+    hidden = np.zeros_like(unhidden)
     for facing, part in zip(rows, parts, strict=True):  # in order, so that the sum has the same bits on any machine
-        unhidden[facing] -= part
-    return unhidden
+        hidden[facing] += part
+    return unhidden - (1.0 - RETURNED) * around.calmed(hidden, CALM)
 
 
 def _lamp_camera(mesh: Mesh, towards: Float[np.ndarray, " 3"]) -> Camera:

@@ -286,7 +286,8 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible, surfaces, texture or light."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, visible, surfaces, "
+            "texture or light."
         ),
     ],
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
