@@ -1,13 +1,20 @@
 """CIEDE2000, the difference of two colours as the eye sees it (CIE 142-2001)."""
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from rig.colour_space import linear_from_srgb
+
+XYZ_FROM_RGB = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)  # IEC 61966-2-1, D65
+
 
 def lab_from_srgb(codes: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """CIE L*a*b*, D65, of sRGB."""
-    return cv2.cvtColor((codes[None] / 255.0).astype(np.float32), cv2.COLOR_RGB2LAB)[0].astype(float)
+    """CIE L*a*b*, D65, of sRGB. OpenCV's tables are off by 0.2."""
+    xyz = linear_from_srgb(codes / 255.0) @ (XYZ_FROM_RGB / XYZ_FROM_RGB.sum(axis=1, keepdims=True)).T
+    x, y, z = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116).T
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
 
 
 def difference_2000(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:

@@ -154,7 +154,7 @@ def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray
     return cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0
 
 
-def texels(image: Image, where: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "n 3"]:
+def texels(image: Image, where: Bool[np.ndarray, "g g"]) -> UInt8[np.ndarray, "n 3"]:
     """Colours of an image, brought to the compared size."""
     small = cv2.resize(np.ascontiguousarray(image), (GRID, GRID), interpolation=cv2.INTER_AREA)
     return np.asarray(small)[where]

@@ -13,7 +13,7 @@ sphere is 1 in each channel, grey. Light that no part of the face is turned to i
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.imaging.cpu_raster import camera_depths, depth_map
 from pipeline.imaging.projection import project_points
@@ -28,7 +28,8 @@ BAND_FACTORS = np.repeat([1.0, 2.0 / 3.0, 0.25], [1, 3, 5])  # Ramamoorthi and H
 DIRECTIONS = 96  # that shadows are looked for in: their mean is that of 384 within 0.004 of white
 MAP_PX = 192  # 2 mm a pixel
 FAR_RADII = 20.0  # a distant light, at 3 degrees
-BIAS_MM = 4.0  # a surface does not hide itself for the map's coarse pixels
+BIAS_MM = 3.0  # a surface does not hide itself for its facets
+SLOPE_PX, LEAST_COSINE = 1.5, 0.1  # nor for its slope between the map's pixels; flatter light hardly counts
 RETURNED = 0.3  # of the light that comes from where the head itself is: skin, lit about as the rest
 CALM = 8  # rounds of means: an edge of the depth maps is no edge of a shadow
 SCALE = 0.12  # of the shading: skin varies by less, brows and lips by more, and count less
@@ -88,7 +89,7 @@ def transfer(
         for i in range(first, last):
             cosine = np.clip(normals @ towards[i], 0.0, None)
             facing = np.flatnonzero(cosine > 0)
-            hidden = _hidden(_lamp_camera(mesh_world, towards[i]), mesh_world, facing)
+            hidden = _hidden(_lamp_camera(mesh_world, towards[i]), mesh_world, facing, cosine[facing])
             parts[i] = (cosine[facing] * hidden)[:, None] * basis[i]
             rows[i] = facing
 
@@ -109,14 +110,19 @@ def _lamp_camera(mesh: Mesh, towards: Float[np.ndarray, " 3"]) -> Camera:
     return Camera("lamp", lens, look_at(centre + FAR_RADII * radius * towards, centre, up))
 
 
-def _hidden(camera: Camera, mesh: Mesh, rows: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Share of the four nearest pixels of the lamp's depth map that each vertex is behind."""
+def _hidden(
+    camera: Camera, mesh: Mesh, rows: Int[np.ndarray, " n"], cosine: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Share of the four nearest pixels of the lamp's depth map that each vertex is behind, by more than its own slope
+    makes of a pixel."""
     depth, _ = depth_map(camera, mesh.vertices, mesh.faces)
     points = mesh.vertices[rows]
     x, y = np.clip(project_points(camera, points), 0, MAP_PX - 1.001).T
     left, top = x.astype(int), y.astype(int)
     across, down = x - left, y - top
-    limit = camera_depths(camera, points) - BIAS_MM
+    depths = camera_depths(camera, points)
+    slope = np.sqrt(1.0 - np.minimum(cosine, 1.0) ** 2) / np.maximum(cosine, LEAST_COSINE)
+    limit = depths - BIAS_MM - SLOPE_PX * slope * depths / camera.intrinsics.fx
     share = np.zeros(len(points))
     for dy, wy in ((0, 1 - down), (1, down)):
         for dx, wx in ((0, 1 - across), (1, across)):
