@@ -30,6 +30,8 @@ from pipeline.imaging.masks import box_around
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
+from pipeline.texture import decision, delight
+from pipeline.texture import light as fitted_light
 from pipeline.texture.delight import Albedo
 from pipeline.texture.uv_unwrap import Layout
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -81,7 +83,7 @@ def light(
         folder: keeps rows, so that a stopped run goes on, and a picture of every subject.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", delight=True, texture_size=2048))
-    records = Records(folder, "light", key_of(model.sha256, settings))
+    records = Records(folder, "light", key_of(model.sha256, settings, LIGHTS, fitted_light, delight, decision))
     rows = []
     for number in range(subjects):
         name = f"{number:02}"

@@ -1,7 +1,5 @@
 """Albedo of an ellipsoid of skin whose photographs are ray-traced in two lights."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ from pipeline.texture.inpaint import neighbours
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.paint import paint_texture
 from pipeline.texture.uv_unwrap import Atlas, Layout, unwrap
-from pipeline.texture.vertex_colours import dim_views, texture
+from pipeline.texture.vertex_colours import Texture, dim_views, texture
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -88,6 +86,7 @@ def found(mesh: Mesh, layout: Layout) -> dict[str, tuple[Atlas, Albedo, np.ndarr
     return out
 
 
+@pytest.mark.slow
 def test_the_albedos_of_two_lights_differ_by_less_than_a_third_of_what_the_textures_do(
     layout: Layout, found: dict[str, tuple[Atlas, Albedo, np.ndarray]]
 ) -> None:
@@ -97,6 +96,7 @@ def test_the_albedos_of_two_lights_differ_by_less_than_a_third_of_what_the_textu
     assert difference_2000(lab[2], lab[3]).mean() < difference_2000(lab[0], lab[1]).mean() / 3
 
 
+@pytest.mark.slow
 def test_the_albedo_is_the_skins_own_by_the_mean_light(
     mesh: Mesh, layout: Layout, found: dict[str, tuple[Atlas, Albedo, np.ndarray]]
 ) -> None:
@@ -114,6 +114,7 @@ def test_the_albedo_is_the_skins_own_by_the_mean_light(
         assert np.std(ratio / np.median(ratio)) < 0.11
 
 
+@pytest.mark.slow
 def test_the_light_comes_from_the_lamp(found: dict[str, tuple[Atlas, Albedo, np.ndarray]]) -> None:
     for name, (_, albedo, _) in found.items():
         y, z, x = albedo.light.coefficients[1:4].mean(axis=1)
@@ -141,11 +142,18 @@ def test_a_dim_view_is_the_one_at_its_share_of_the_weight() -> None:
 
 
 def test_without_a_texture_there_is_a_warning(mesh: Mesh) -> None:
-    shot = {camera.name: photograph(camera, LAMPS["top"]) for camera in fan()}
-    capture = Capture({key: codes for key, (codes, _) in shot.items()})
-    silhouettes = {key: silhouette_from_mask(mask) for key, (_, mask) in shot.items()}
-    rig = fan()
-    coloured = texture(mesh, mesh.normals(), capture, silhouettes, rig, depth_maps(rig, mesh), TextureSettings())
-    albedo, warnings = delight(mesh, mesh.normals(), replace(coloured), None, np.ones(len(mesh.vertices), bool), None)
+    count = len(mesh.vertices)
+    coloured = Texture(np.full((count, 3), 120, np.uint8), np.ones(count, np.uint8))
+    albedo, warnings = delight(mesh, mesh.normals(), coloured, None, np.ones(count, bool), None)
+    assert albedo is None
+    assert [warning.code for warning in warnings] == ["no-albedo"]
+
+
+def test_a_black_face_has_no_albedo_and_a_warning(mesh: Mesh, layout: Layout) -> None:
+    count = len(mesh.vertices)
+    coloured = Texture(np.zeros((count, 3), np.uint8), np.ones(count, np.uint8), dim=np.zeros((count, 3), np.float32))
+    atlas = Atlas(layout, np.zeros((64, 64, 3), np.uint8))
+    around = Neighbourhood.of(*neighbours(mesh.faces, count))
+    albedo, warnings = delight(mesh, mesh.normals(), coloured, atlas, np.ones(count, bool), around)
     assert albedo is None
     assert [warning.code for warning in warnings] == ["no-albedo"]
