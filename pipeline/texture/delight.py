@@ -26,7 +26,7 @@ from rig.mesh import Mesh
 DIM_SHARE = 0.3  # of a vertex' weight in dimmer views: of four views the second dimmest, which noise hardly makes
 MOST_SHINE = 0.5  # of a texture's light that may be taken for a highlight
 CALM = 6  # rounds of means with the neighbours: a highlight is wide, a dim view's noise is not
-LEAST_SHADING = 0.2  # what is darker (nostrils, the mouth's crease) would be noise made bright
+LEAST_SHADING = 0.35  # by the face's: what is darker (nostrils, below the jaw) would be noise, and errors, made bright
 FACTORS_PX = 1024  # side of the image of factors, smooth as the normals are
 BAND_ROWS = 64
 CODES = 65535
@@ -60,7 +60,9 @@ def delight(
         return None, [
             ReportWarning("no-albedo", "too little of the face is seen, or it is black: no light can be told")
         ]
-    shading = np.maximum(white @ light.coefficients, LEAST_SHADING)
+    shading = white @ light.coefficients
+    least = LEAST_SHADING * np.median(shading[seen & face_region], axis=0)
+    shading = 0.5 * (shading + least + np.hypot(shading - least, 0.5 * least))  # a maximum without a crease
     own = fill_unknown(matt / shading, seen, mesh_world.faces)
     factors = own / np.maximum(shown, 1e-4)
     return Albedo(Atlas(atlas.layout, multiplied(atlas, factors)), light), []

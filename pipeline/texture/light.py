@@ -35,6 +35,7 @@ CALM = 8  # rounds of means: an edge of the depth maps is no edge of a shadow
 SCALE = 0.12  # of the shading: skin varies by less, brows and lips by more, and count less
 SAMPLES = 150.0  # spots of skin that vary by themselves; freckles and folds are as large as that
 PRIOR = 1.0  # standard deviation of a coefficient by the mean light: one lamp alone has 0.6 to 1.7
+LEAST_UNHIDDEN = 0.3  # of the face's brightness: walls and ceiling send that much back to what no lamp reaches
 ITERATIONS = 25
 LEAST_VERTICES = 100
 
@@ -73,6 +74,9 @@ def spread_directions(count: int) -> Float[np.ndarray, "n 3"]:
     z, angle = 1.0 - 2.0 * index / count, index * np.pi * (3.0 - np.sqrt(5.0))
     ring = np.sqrt(1.0 - z**2)
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
+
+
+SURROUND = harmonics(spread_directions(DIRECTIONS)) * BAND_FACTORS  # unhidden white, turned everywhere
 
 
 def transfer(
@@ -149,12 +153,22 @@ def fit_light(
     relative = seen / level
     prior = np.diag(np.r_[0.0, np.full(8, (SCALE / PRIOR) ** 2 / SAMPLES)])
     weights, found = np.ones(len(rows)), np.zeros((9, 3))
+    stiffness = 3.0 / len(SURROUND)  # firm beside the samples, which have 1 in all
     for _ in range(ITERATIONS):
         weighted = rows * (weights / weights.sum())[:, None]
-        found = np.linalg.solve(rows.T @ weighted + prior, weighted.T @ relative)
+        bounded = _bounds(found)
+        left = rows.T @ weighted + prior + bounded.T @ bounded * stiffness
+        right = weighted.T @ relative + LEAST_UNHIDDEN * stiffness * bounded.sum(axis=0)[:, None]
+        found = np.linalg.solve(left, right)
         off = (relative - rows @ found) / np.maximum(rows @ found, 0.1)
         weights = 1.0 / (1.0 + (off**2).mean(axis=1) / SCALE**2)
     mean = found[0] * 0.282095  # the first harmonic is the mean over the sphere
     if not (mean > 0).all():
         return None
     return Light(found / mean, float(np.median(np.sqrt((off**2).mean(axis=1)))))
+
+
+def _bounds(coefficients: Float[np.ndarray, "9 3"]) -> Float[np.ndarray, "n 9"]:
+    """The normals that would be darker than any studio leaves them: what no part of the face is turned to."""
+    dark = (SURROUND @ coefficients).mean(axis=1) < LEAST_UNHIDDEN
+    return SURROUND[dark] if coefficients.any() else SURROUND[:0]
