@@ -13,6 +13,7 @@ WARNING_CODES = (
     "mask-contradicted",
     "mask-doubtful",
     "mask-loose",
+    "no-albedo",
     "no-bust",
     "no-texture",
     "no-texture-layout",

@@ -45,6 +45,7 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import FINE_LEVELS, PHOTO_LEVELS, Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import usable_views
+from pipeline.texture.delight import DIM_SHARE, delight
 from pipeline.texture.head_texture import find_layout, paint_head
 from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
@@ -135,8 +136,13 @@ def reconstruct(
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     layout, texture_warnings = find_layout(model, settings)
     around = None if layout is None else layout.around
-    coloured = texture(mesh, normals, capture, silhouettes, rig, depths, settings.texture, around=around)
+    dim_share = DIM_SHARE if settings.outputs.delit else None
+    given = (mesh, normals, capture, silhouettes, rig, depths, settings.texture)
+    coloured = texture(*given, around=around, dim_share=dim_share)
     atlas = paint_head(layout, mesh, coloured, full.face_region, settings)
+    albedo, albedo_warnings = None, []
+    if settings.outputs.delit:
+        albedo, albedo_warnings = delight(mesh, normals, coloured, atlas, full.face_region, around)
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
         skin = None if finer is None else part_of(mesh, finer.observed)
@@ -159,6 +165,7 @@ def reconstruct(
         *eye_warnings(closed),
         *coloured.warnings,
         *texture_warnings,
+        *albedo_warnings,
         *bust_warnings,
     )
     refuse(told, settings.fail_on)
@@ -191,6 +198,7 @@ def reconstruct(
         expression=expression,
         posed=model.posed,
         posable=posable,
+        albedo=albedo,
         bust=bust,
         parts=parts,
     )

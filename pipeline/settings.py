@@ -209,6 +209,8 @@ class OutputSettings:
     formats: tuple[str, ...] = ("glb", "ply")  # of the head, of FORMATS; head.ply is always written
     image: Literal["jpeg", "webp", "png"] = "jpeg"  # of head.glb's texture
     texture_size: int | None = None  # texels; None: a texel is about a pixel at the face
+    delight: bool = False  # texture/albedo.png: the texture with its light taken off
+    skin: Literal["photograph", "albedo"] = "photograph"  # what head.glb shows; albedo asks for delight, too
     ply_texture: bool = False  # head.ply names head.png and has texture coordinates
     neutral: bool = False  # neutral.glb, the head without its expression
     morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names
@@ -223,7 +225,13 @@ class OutputSettings:
     @property
     def textured(self) -> bool:
         """Whether any file has a texture."""
-        return self.surface != "bust" and (self.ply_texture or bool({"glb", "obj", "usdz"} & set(self.written)))
+        asked = self.ply_texture or self.delit or bool({"glb", "obj", "usdz"} & set(self.written))
+        return self.surface != "bust" and asked
+
+    @property
+    def delit(self) -> bool:
+        """Whether the albedo is asked for."""
+        return self.delight or self.skin == "albedo"
 
 
 @dataclass(frozen=True, slots=True)

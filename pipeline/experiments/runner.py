@@ -19,6 +19,7 @@ from pipeline.experiments.exchanges import exchanges, false_alarms
 from pipeline.experiments.expressions import expressions
 from pipeline.experiments.hidden import hidden
 from pipeline.experiments.levels import levels
+from pipeline.experiments.light import light
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.posterior_check import posterior_check
@@ -224,6 +225,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "visible": _visible,
     "surfaces": _surfaces,
     "texture": _texture,
+    "light": _drawn(light),
 }
 
 

@@ -2,6 +2,7 @@
 
 head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm,
 z up.
+texture/albedo.png: in the layout of head.glb and head.obj, where the settings ask for it.
 With a texture the first vertices of head.glb are head.ply's, in its order; those at the seam follow once more.
 """
 
@@ -56,6 +57,8 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
     )
     if atlas is not None and (named or "obj" in formats):
         write_atomically(folder / "head.png", encoded(atlas, "png"))
+    if result.albedo is not None:
+        write_atomically(folder / "texture" / "albedo.png", encoded(result.albedo.atlas, "png"))
     normals = result.normals @ result.fit.world_from_head.rotation
     if "glb" in formats:
         write_atomically(folder / "head.glb", _glb(result, head, normals))
@@ -75,11 +78,13 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
 
 
 def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
-    atlas, extras = result.atlas, asset_extras(result)
+    atlas, extras, outputs = result.atlas, asset_extras(result), result.settings.outputs
     if atlas is None:
         return glb_bytes(head, normals=normals, colours=result.colours, extras=extras)
-    kind = result.settings.outputs.image
+    kind = outputs.image
     source = atlas.layout.source
+    if outputs.skin == "albedo" and result.albedo is not None:
+        atlas = result.albedo.atlas
     extras["repeated_vertices"] = source[len(head.vertices) :].tolist()
     opened = Mesh(head.vertices[source], atlas.layout.faces)
     skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1])

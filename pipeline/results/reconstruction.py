@@ -18,6 +18,7 @@ from pipeline.results.bust import Bust
 from pipeline.results.expression import Found, Posable
 from pipeline.results.measurements import Landmark, Measurement
 from pipeline.settings import Settings
+from pipeline.texture.delight import Albedo
 from pipeline.texture.uv_unwrap import Atlas
 from rig.mesh import Mesh
 
@@ -73,5 +74,6 @@ class Reconstruction:
     expression: tuple[Found, ...] = ()  # the face that the head makes, the strongest part first
     posed: range = range(0)  # which of the fit's coefficients are weights of expressions
     posable: Posable | None = None  # where the settings ask for it
+    albedo: Albedo | None = None  # where the settings ask for it and the light can be told
     bust: Bust | None = None  # where the settings ask for it and the photographs carry it
     parts: Mapping[str, PartMap] = field(default_factory=dict)  # skin, hair or clothes in a view's pixels, where told

@@ -13,6 +13,7 @@ from pipeline.results.bust import Bust
 from pipeline.results.expression import Posable
 from pipeline.results.reconstruction import CameraFigures, Reconstruction
 from pipeline.settings import document_from_settings
+from pipeline.texture.light import HARMONICS, Light
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
 
@@ -155,7 +156,12 @@ def report_document(result: Reconstruction) -> Report:
         "landmarks": {k: {"position": p.position_mm, "std": p.std_mm} for k, p in result.landmarks.items()},
         "measurements": {k: {"value": m.value_mm, "std": m.std_mm} for k, m in result.measurements.items()},
         "quality": {"median": np.median(result.quality_mm), "max": result.quality_mm.max()},
-        "texture": {"vertices": len(result.views), "filled": filled, "gains": result.gains},
+        "texture": {
+            "vertices": len(result.views),
+            "filled": filled,
+            "gains": result.gains,
+            "light": None if result.albedo is None else _light(result.albedo.light),
+        },
         "bust": None if result.bust is None else _bust(result.bust),
         "evaluations": result.fit.evaluations,
         "stopped_because": result.fit.stopped_because,
@@ -165,6 +171,16 @@ def report_document(result: Reconstruction) -> Report:
         "warnings": [{"code": w.code, "message": w.message} for w in result.warnings],
     }
     return _plain(document)
+
+
+def _light(light: Light) -> dict[str, object]:
+    return {
+        "frame": "world",
+        "harmonics": HARMONICS,
+        "coefficients": light.coefficients.T,  # a row a channel: red, green, blue
+        "convention": "the mean over the sphere is 1 in each channel",
+        "residual": light.residual,
+    }
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:

@@ -58,6 +58,7 @@ class Texture:
     offsets: Mapping[str, Rgb] = field(default_factory=dict)
     filled: int = 0
     decision: Decision | None = None  # where it was asked for
+    dim: Float32[np.ndarray, "v 3"] | None = None  # linear, of a dim view of each vertex; where it was asked for
     warnings: tuple[ReportWarning, ...] = ()
 
 
@@ -71,9 +72,11 @@ def texture(
     settings: TextureSettings,
     *,
     around: Neighbourhood | None = None,
+    dim_share: float | None = None,
 ) -> Texture:
     """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them. With
-    ``around``, the mesh's edges, a view is also chosen for every vertex."""
+    ``around``, the mesh's edges, a view is also chosen for every vertex; with ``dim_share``, the
+    colour below which that share of a vertex' weight lies is told, too."""
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
         return _reference(mesh_world, normals, capture, silhouettes, views, depths)
@@ -107,7 +110,20 @@ def texture(
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
     told = _gain_warnings(by_camera)
-    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, told)
+    dim = None if dim_share is None else dim_views(weights, balanced, dim_share)
+    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, told)
+
+
+def dim_views(
+    weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"], share: float
+) -> Float32[np.ndarray, "v 3"]:
+    """The colour of the view that is as bright as ``share`` of each vertex' weight; black where no view sees it."""
+    order = np.argsort(np.where(weights > 0, colours.sum(axis=2), np.inf), axis=0)
+    passed = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+    rank = np.argmax(passed >= share * passed[-1], axis=0)
+    chosen = np.take_along_axis(order, rank[None], axis=0)[0]
+    found = colours[chosen, np.arange(weights.shape[1])]
+    return np.where((passed[-1] > 0)[:, None], found, np.float32(0.0))
 
 
 def believed(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:

@@ -74,6 +74,9 @@ def reconstruct(
         str | None,
         typer.Option(help="Of the head: glb, ply, obj, usdz, stl, 3mf, with commas between.", callback=_formats),
     ] = None,
+    delight: Annotated[
+        bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
+    ] = False,
     obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
     atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
@@ -87,8 +90,8 @@ def reconstruct(
     """Reconstruct one capture without the service."""
     from server.cli.reconstruct_local import reconstruct_locally, settings_document
 
-    flags = {"obj": obj, "atlas": atlas, "neutral": neutral, "morphs": morphs}
-    outputs: dict[str, object] = {name: True for name, asked in flags.items() if asked}
+    switches = {"obj": obj, "atlas": atlas, "delight": delight, "neutral": neutral, "morphs": morphs}
+    outputs: dict[str, object] = {name: True for name, asked in switches.items() if asked}
     outputs |= {"surface": surface} if surface else {}
     outputs |= {"formats": formats.split(",")} if formats else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
@@ -305,7 +308,7 @@ def experiments(
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
             "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, surfaces, "
-            "texture or real."
+            "texture, light or real."
         ),
     ],
     folders: Annotated[

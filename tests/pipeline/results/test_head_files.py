@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -15,8 +16,11 @@ from pipeline.eigenheads.model import load_model
 from pipeline.results.head_files import write_head
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.report import report_document
 from pipeline.results.write import head_mesh
 from pipeline.settings import OutputSettings, Settings, settings_from_document
+from pipeline.texture.delight import Albedo
+from pipeline.texture.light import Light
 from pipeline.texture.model_layout import model_layout
 from pipeline.texture.uv_unwrap import Atlas
 from rig.errors import InputError
@@ -100,6 +104,37 @@ def test_open_lids_are_closed_by_strips() -> None:
     solid = trimesh.Trimesh(closed.vertices, closed.faces, process=False)
     assert solid.is_watertight
     assert len(np.unique(closed.faces)) == len(used) + 1  # the neck's middle alone is new
+
+
+def test_the_albedo_is_written_and_the_glb_shows_it_where_that_is_asked_for(
+    result: Reconstruction, tmp_path: Path
+) -> None:
+    assert result.atlas is not None
+    image = np.full((1024, 1024, 3), (40, 180, 90), np.uint8)
+    coefficients = np.arange(27.0).reshape(9, 3)
+    albedo = Albedo(Atlas(result.atlas.layout, image), Light(coefficients, 0.05))
+    delit = replace(result, albedo=albedo)
+    pictures = {}
+    for name, skin in (("photograph", "photograph"), ("albedo", "albedo")):
+        (tmp_path / name).mkdir()
+        assert "texture" in written(delit, tmp_path / name, delight=True, skin=skin)
+        stored = cv2.imread(str(tmp_path / name / "texture" / "albedo.png"))
+        np.testing.assert_array_equal(np.asarray(stored)[:, :, ::-1], image)
+        loaded = trimesh.load(tmp_path / name / "head.glb", force="mesh", process=False)
+        assert isinstance(loaded, trimesh.Trimesh)
+        visual: Any = loaded.visual
+        pictures[name] = np.asarray(visual.material.baseColorTexture.convert("RGB")).astype(int)
+    assert np.abs(pictures["albedo"] - (40, 180, 90)).max() <= 3  # JPEG
+    assert np.abs(pictures["photograph"][:, :500] - (200, 30, 30)).max() <= 12
+    light = report_document(delit)["texture"]["light"]
+    assert light["coefficients"] == coefficients.T.tolist()
+    assert report_document(result)["texture"]["light"] is None
+
+
+def test_the_albedo_alone_asks_for_a_layout() -> None:
+    assert OutputSettings(formats=("ply",), delight=True).textured
+    assert OutputSettings(formats=("ply",), skin="albedo").delit
+    assert not OutputSettings(surface="bust", delight=True).textured
 
 
 def test_wrong_outputs_are_named() -> None:

@@ -49,4 +49,5 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
     assert (wrong.exit_code, asked) == (2, [])
     assert "'fbx' is none of glb, ply, obj, usdz, stl, 3mf" in " ".join(wrong.stderr.replace("│", " ").split())
     assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
-    assert asked == [{"formats": ["glb", "usdz"]}]
+    assert CliRunner().invoke(app, [*arguments, "--delight"]).exit_code == 0
+    assert asked == [{"formats": ["glb", "usdz"]}, {"delight": True}]
