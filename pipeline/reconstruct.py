@@ -140,9 +140,8 @@ def reconstruct(
     given = (mesh, normals, capture, silhouettes, rig, depths, settings.texture)
     coloured = texture(*given, around=around, dim_share=dim_share)
     atlas = paint_head(layout, mesh, coloured, full.face_region, settings)
-    albedo, albedo_warnings = None, []
-    if settings.outputs.delit:
-        albedo, albedo_warnings = delight(mesh, normals, coloured, atlas, full.face_region, around)
+    lit = (mesh, normals, coloured, atlas, full.face_region, around)
+    albedo, albedo_warnings = delight(*lit) if settings.outputs.delit else (None, [])
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
         skin = None if finer is None else part_of(mesh, finer.observed)

@@ -103,7 +103,7 @@ def row_of(model: HeadModel, seed: int, renderer: Renderer, settings: Settings, 
     again = lit_head(model, seed, rig, LAMPS, renderer, settings, shot=1)
     every = [*found.values(), again]
     layout = albedo_of(every[0]).atlas.layout
-    seen = np.all([head.views > 0 for head in every], axis=0) & model.levels["full"].face_region
+    seen = np.asarray(np.all([head.views > 0 for head in every], axis=0)) & model.levels["full"].face_region
     face = face_texels(layout, seen)
     textures = {name: texels(_texture(head), face) for name, head in found.items()}
     albedos = {name: texels(albedo_of(head).atlas.image, face) for name, head in found.items()}
@@ -151,7 +151,7 @@ def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray
     """Texels of the compared size whose triangle has such corners, and all about them, too."""
     texels, ones = GRID * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, GRID, GRID)
-    whole = seen[layout.source[layout.faces]].all(axis=1)
+    whole = np.asarray(seen[layout.source[layout.faces]].all(axis=1))
     inside = ((shown >= 0) & whole[shown]).astype(np.uint8)
     return cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0
 

@@ -152,7 +152,7 @@ def fit_light(
     # In units of an evenly lit vertex; what the even light is worth is left free, the rest is drawn to zero.
     relative = seen / level
     prior = np.diag(np.r_[0.0, np.full(8, (SCALE / PRIOR) ** 2 / SAMPLES)])
-    weights, found = np.ones(len(rows)), np.zeros((9, 3))
+    weights, found, off = np.ones(len(rows)), np.zeros((9, 3)), np.zeros_like(relative)
     stiffness = 3.0 / len(SURROUND)  # firm beside the samples, which have 1 in all
     for _ in range(ITERATIONS):
         weighted = rows * (weights / weights.sum())[:, None]

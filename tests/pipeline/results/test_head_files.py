@@ -126,7 +126,7 @@ def test_the_albedo_is_written_and_the_glb_shows_it_where_that_is_asked_for(
         pictures[name] = np.asarray(visual.material.baseColorTexture.convert("RGB")).astype(int)
     assert np.abs(pictures["albedo"] - (40, 180, 90)).max() <= 3  # JPEG
     assert np.abs(pictures["photograph"][:, :500] - (200, 30, 30)).max() <= 12
-    light = report_document(delit)["texture"]["light"]
+    light: Any = report_document(delit)["texture"]["light"]
     assert light["coefficients"] == coefficients.T.tolist()
     assert report_document(result)["texture"]["light"] is None
 
