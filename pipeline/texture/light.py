@@ -25,7 +25,7 @@ from rig.mesh import Mesh
 
 HARMONICS = ("1", "y", "z", "x", "xy", "yz", "3z2-1", "xz", "x2-y2")  # the columns of ``harmonics``
 BAND_FACTORS = np.repeat([1.0, 2.0 / 3.0, 0.25], [1, 3, 5])  # Ramamoorthi and Hanrahan, eq. (8), by pi: white is 1
-DIRECTIONS = 96  # that shadows are looked for in: their mean is that of 384 within 0.004 of white
+DIRECTIONS = 96  # that shadows are looked for in: the face differs from 384 by 0.007 (rms) of white
 MAP_PX = 192  # 2 mm a pixel
 FAR_RADII = 20.0  # a distant light, at 3 degrees
 BIAS_MM = 3.0  # a surface does not hide itself for its facets
@@ -34,7 +34,7 @@ RETURNED = 0.3  # of the light that comes from where the head itself is: skin, l
 CALM = 8  # rounds of means: an edge of the depth maps is no edge of a shadow
 SCALE = 0.12  # of the shading: skin varies by less, brows and lips by more, and count less
 SAMPLES = 150.0  # spots of skin that vary by themselves; freckles and folds are as large as that
-PRIOR = 1.0  # standard deviation of a coefficient by the mean light: one lamp alone has 0.6 to 1.7
+PRIOR = 1.0  # standard deviation of a coefficient where the even light has 3.5; a studio's lamps make 2 to 3
 LEAST_UNHIDDEN = 0.3  # of the face's brightness: walls and ceiling send that much back to what no lamp reaches
 ITERATIONS = 25
 LEAST_VERTICES = 100
