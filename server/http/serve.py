@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from types import FrameType
 from typing import TYPE_CHECKING
 
 import structlog
@@ -103,7 +104,15 @@ def _serve(settings: ServiceSettings, sock: socket.socket, worker: bool, ready: 
     config = uvicorn.Config(
         create_app(settings, mount), log_config=None, lifespan="on", timeout_graceful_shutdown=3, access_log=False
     )
-    server = uvicorn.Server(config)
+
+    class Server(uvicorn.Server):
+        interrupted = False
+
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            self.interrupted = self.interrupted or sig == signal.SIGINT
+            super().handle_exit(sig, frame)
+
+    server = Server(config)
     beside = WorkerProcess(settings) if worker else None
     try:
         threading.Thread(target=_tell, args=(server, ready), daemon=True).start()
@@ -111,6 +120,8 @@ def _serve(settings: ServiceSettings, sock: socket.socket, worker: bool, ready: 
     finally:
         if beside is not None:
             beside.close()
+    if server.interrupted:  # asyncio loses the signal that uvicorn raises again where its last task ends first
+        raise KeyboardInterrupt
 
 
 def _tell(server: "uvicorn.Server", ready: Callable[[], object]) -> None:
