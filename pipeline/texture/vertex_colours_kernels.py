@@ -4,6 +4,7 @@ import numpy as np
 
 from pipeline.compiled import njit
 
+DARKER = 0.5  # of a difference, where a view is darker: most are shading that turns with the surface, few are shadows
 LEAST_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it
 
 
@@ -12,8 +13,8 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
     """Weighted mean of each vertex, views that differ from the weighted median of each channel counting less; and their
     number.
 
-    ``outlier`` is the difference from the median, by its level, at which a view counts half: brighter ones are
-    highlights, darker ones shadows of what only they see.
+    ``outlier`` is the difference from the median, by its level, at which a brighter view counts half: a highlight.
+    Darker ones, shadows of what only they see, count half at twice that.
     """
     cameras, count = weights.shape
     out = np.zeros((count, 3))
@@ -46,6 +47,7 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
             k, off = order[i], 0.0
             for c in range(3):
                 part = (colours[k, v, c] - middle[c]) / (outlier * max(middle[c], 0.0) + 0.005)
+                part *= 1.0 if part > 0.0 else DARKER
                 off += part * part / 3.0
             weight = weights[k, v] / (1.0 + off)
             norm += weight

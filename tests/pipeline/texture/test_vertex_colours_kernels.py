@@ -21,6 +21,7 @@ def expected_blend(weights: np.ndarray, colours: np.ndarray, outlier: float) -> 
             order = np.argsort(colour[:, c], kind="stable")
             middle[c] = colour[order, c][np.argmax(np.cumsum(own[order]) >= 0.5 * own.sum())]
         off = (colour - middle) / (outlier * middle + 0.005)
+        off = np.where(off > 0, off, 0.5 * off)
         share = own / (1 + (off**2).mean(axis=1))
         out[v], views[v] = share @ colour / share.sum(), np.sum(own > LEAST_SHARE * own.sum())
     return out, views
