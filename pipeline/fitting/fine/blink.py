@@ -134,8 +134,10 @@ def _patch(
     """The head about an eye: its vertices, and its triangles between them."""
     inside = np.linalg.norm(vertices - middle, axis=1) < radius_mm
     faces = model.levels["full"].faces
-    places = np.cumsum(inside, dtype=np.int32) - np.int32(1)  # as the head's own faces: loops are compiled for these
-    return np.flatnonzero(inside), places[faces[inside[faces].all(axis=1)]]
+    places = np.cumsum(inside, dtype=np.int32) - np.int32(1)
+    found = places[faces[inside[faces].all(axis=1)]]
+    found.setflags(write=False)  # as the head's own faces are: loops are compiled for those
+    return np.flatnonzero(inside), found
 
 
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
