@@ -27,7 +27,9 @@ class SessionList(Listed):
     sessions: list[SessionOut]
 
 
-class SubjectOut(Answer):
+class PersonOut(Answer):
+    """A subject of the library; ``SubjectOut`` is where somebody is in a picture."""
+
     id: str = Field(description="of the newest session")
     label: str
     created: Moment
@@ -41,7 +43,7 @@ class SubjectOut(Answer):
 
 
 class SubjectList(Listed):
-    subjects: list[SubjectOut]
+    subjects: list[PersonOut]
 
 
 class JobList(Listed):

@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import Cursor, Limit, SessionList, Sought, SubjectList, SubjectOut
+from server.http.list_schemas import Cursor, Limit, PersonOut, SessionList, Sought, SubjectList
 from server.http.schemas import NewSession, SessionEdit, SessionOut
 from server.services.keys import Caller
 from server.storage.library import SubjectOrder
@@ -45,7 +45,7 @@ def list_subjects(
 ) -> SubjectList:
     """People: sessions of one name are one person's. Each with its newest head."""
     found = service.sessions.subjects(q, sort, limit, cursor)
-    subjects = [SubjectOut.model_validate(subject) for subject in found.items]
+    subjects = [PersonOut.model_validate(subject) for subject in found.items]
     return SubjectList(subjects=subjects, next=found.next, total=found.total)
 
 
