@@ -1,9 +1,6 @@
 """Whether a calibration is worth using, and what it lacks: shots may pass every check and still say too little.
 
-The limits follow planted sessions of 4 to 30 shots (7 cameras, 0.2 px corners; ``calibrate_detections`` on
-``tests.support.board_sessions``): with 6 shots the least seen camera has 2 views, its focal length is known to 1.9 %
-and the rig is off by 0.31 px at the subject; with 8 shots 3 views, 0.6 %, 0.16 px; with 20 shots 7 views, 0.4 %,
-0.07 px.
+The limits were chosen on planted sessions of 4 to 30 shots (``tests.support.board_sessions``); nothing prints them.
 """
 
 from collections.abc import Mapping, Sequence
