@@ -2,7 +2,8 @@
 ``allowed_skips.txt`` names it."""
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Generator, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,6 +50,17 @@ def _no_gl_error(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
     with context.current() as gl:
         assert gl.error == "GL_NO_ERROR"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """A test that fails shows what its services wrote last: they run on until its fixtures end."""
+    report = yield
+    services = sys.modules.get("tests.support.services")  # not imported here: the product comes after the hook below
+    if report.failed and services is not None:
+        for service in services.running:
+            report.sections.append((f"end of {service.log}", service.log_end()))
+    return report
 
 
 class SkipList:

@@ -30,7 +30,8 @@ REFRESH_S = 0.5
 STATUS_S = 2.0
 FIRST_LOOK_S = 1.0  # so long a page waits to be sent with its state in it, which saves it a turn over the socket
 KEEP_S = 3600.0  # of a value that is shared by all pages
-KEEP_TIMES = 9.0  # a value is kept so many times as long as it took to make
+KEEP_TIMES = 9.0  # a value is kept so many times as long as it took to make,
+KEEP_MOST_S = 5.0  # but no longer: the one look that waited for a locked database would stand for minutes
 MAKE = Callable[[], Any]
 
 log = structlog.get_logger()
@@ -53,11 +54,12 @@ class Action:
 @dataclass
 class Cache:
     """Values that all open pages share, so that they agree, and ten pages cost what one does. What takes long to make
-    is kept the longer, so that making it takes a tenth of the time at most."""
+    is kept the longer, so that making it takes a tenth of the time at most, but no longer than ``KEEP_MOST_S``."""
 
     _values: dict[Any, tuple[float, float, Any]] = field(default_factory=dict)
     _locks: dict[Any, Lock] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
+    _forgets: int = 0
 
     def get(self, key: Any, age_s: float, make: MAKE) -> Any:
         """The value of ``key``, made anew where it is older than ``age_s``. Blocks; raises what ``make`` does."""
@@ -66,14 +68,17 @@ class Cache:
         with own:
             made, took, value = self._values.get(key, (0.0, 0.0, None))
             began = time.monotonic()
-            if began - made > max(age_s, KEEP_TIMES * took) or key not in self._values:
+            if began - made > max(age_s, min(KEEP_TIMES * took, KEEP_MOST_S)) or key not in self._values:
+                forgets = self._forgets
                 value = make()
-                self._values[key] = (time.monotonic(), time.monotonic() - began, value)
+                if forgets == self._forgets:  # else something changed meanwhile, which the value may not show
+                    self._values[key] = (time.monotonic(), time.monotonic() - began, value)
                 self._drop_old()
             return value
 
     def forget(self, *kinds: str) -> None:
         """Values whose key is, or begins with, one of ``kinds``."""
+        self._forgets += 1
         for key in list(self._values):
             if (key[0] if isinstance(key, tuple) else key) in kinds:
                 self._values.pop(key, None)
@@ -88,6 +93,7 @@ class Cache:
 
     def clear(self) -> None:
         with self._lock:
+            self._forgets += 1
             self._values.clear()
             self._locks.clear()
 

@@ -24,6 +24,7 @@ from rig.geometry import RigidTransform
 from rig.rig import Rig
 
 ROOT = Path(__file__).resolve().parents[2]
+running: "list[RunningService]" = []
 
 
 @dataclass
@@ -72,6 +73,9 @@ class RunningService:
                 time.sleep(0.05)
         raise AssertionError(f"the service did not start:\n{self.log.read_text()[-3000:]}")
 
+    def log_end(self) -> str:
+        return self.log.read_text()[-4000:] if self.log.is_file() else ""
+
     def kill(self) -> None:
         """SIGKILL of the service process alone."""
         assert self.process is not None
@@ -94,18 +98,20 @@ def running_service(
     data: Path, *, worker: bool = True, terminal: int | None = None, **settings: str
 ) -> Iterator[RunningService]:
     """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given, and there are no pages,
-    which take their time to import. A test that fails shows the end of the log."""
+    which take their time to import. A test that fails shows the end of the logs of ``running``."""
     chosen = {"work": "tests.support.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
     environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
     service = RunningService(data, environment, free_port(), worker)
+    running.append(service)
     try:
         service.start(terminal)
         yield service
-    except BaseException:
-        sys.stdout.write(f"{service.log}:\n{service.log.read_text()[-4000:]}")
+    except BaseException:  # of a test; what a test of its fixture's service raises does not come by here
+        sys.stdout.write(f"{service.log}:\n{service.log_end()}")
         raise
     finally:
         service.stop()
+        running.remove(service)
 
 
 def worker_pids(service: RunningService) -> list[int]:
