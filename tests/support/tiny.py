@@ -21,7 +21,7 @@ def work(
     seconds = float(os.environ.get("EIGENHEAD_TINY_S", "0.2"))
     mode = settings.get("front") or ""
     if mode in ("long", "deaf"):
-        seconds = 20.0
+        seconds = 120.0  # a slow machine needs 30 s to start a service again under it
     if mode == "fail":
         raise InputError("capture", ["cam00 sees nobody", "cam01 sees nobody"])
     if mode == "crash":
