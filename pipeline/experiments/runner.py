@@ -22,6 +22,7 @@ from pipeline.experiments.levels import levels
 from pipeline.experiments.light import light
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
+from pipeline.experiments.planted import planted
 from pipeline.experiments.posterior_check import posterior_check
 from pipeline.experiments.repeat import repeat
 from pipeline.experiments.robustness import robustness
@@ -222,6 +223,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "detail": _detail,
     "hidden": _hidden,
     "expressions": _expressions,
+    "planted": _drawn(planted),
     "visible": _visible,
     "surfaces": _surfaces,
     "texture": _texture,

@@ -307,8 +307,8 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, surfaces, "
-            "texture, light or real."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, planted, "
+            "surfaces, texture, light or real."
         ),
     ],
     folders: Annotated[
