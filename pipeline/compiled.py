@@ -12,7 +12,8 @@ runs on the next: in a container, from a wheel, out of a CI's cache. Code for th
 with AVX-512 a job took as many processor seconds.
 
 Numba has no public interface for that. What is used of its inside: ``Dispatcher._cache`` (an object with
-``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``.
+``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``, the option
+``_nrt``.
 """
 
 import hashlib
@@ -62,16 +63,21 @@ def _choose_processor() -> None:
 _choose_processor()
 
 
-def njit(*, cache: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``numba.njit`` that keeps what it compiles in ``cache_folder()``.
 
     Args:
         cache: whether to keep it.
+        allocates: whether the function, or one that it calls, makes arrays. One that makes none does without counts of
+            references: otherwise every further name of an array, a row or a field too, costs an atomic instruction,
+            which was three quarters of the dense stage's sweep, and which cores wait for each other at.
         options: of ``numba.njit``.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
         chosen: dict[str, Any] = {"no_cfunc_wrapper": True, **options}  # nothing in C calls them: 8 % of compiling
+        if not allocates:
+            chosen["_nrt"] = False
         dispatcher = numba.njit(**chosen)(function)
         if cache and isinstance(dispatcher, Dispatcher):  # with NUMBA_DISABLE_JIT it is the function itself
             dispatcher._cache = KeptFunction(dispatcher)  # type: ignore[assignment]

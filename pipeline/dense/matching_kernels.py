@@ -38,6 +38,21 @@ class Sight(NamedTuple):
     contrast: float  # shades at which a sample counts half
 
 
+class Scratch(NamedTuple):
+    """Where one view's loops keep what they look at, for they make no arrays."""
+
+    window: np.ndarray  # zero-mean shades, weights
+    scores: np.ndarray  # of the views that it is compared with
+    place: np.ndarray  # by ``place_window``
+    found: np.ndarray  # by ``correlate_and_slide``, for each of the views
+
+
+def make_scratch(sight: Sight) -> Scratch:
+    """For a sight, and for one thread."""
+    count, samples = len(sight.ways), sight.pattern.shape[1]
+    return Scratch(np.empty((2, samples), np.float32), np.empty(count), np.empty(8), np.empty((count, 3)))
+
+
 class Loaded(NamedTuple):
     """The window about one pixel, by ``load_window``."""
 
@@ -48,7 +63,16 @@ class Loaded(NamedTuple):
     energy: float  # of the weighted squares
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(cache=True, nogil=True, error_model="numpy", allocates=False)
+def farthest(pattern):
+    """The farthest that a sample lies from a window's middle, across or down, px."""
+    reach = np.float32(0.0)
+    for i in range(pattern.shape[1]):
+        reach = max(reach, abs(pattern[0, i]), abs(pattern[1, i]))
+    return reach
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def load_window(sight, width, height, column, row, window):
     """Fills ``window`` (zero-mean shades, weights) with the samples that the pattern has about a pixel;
     returns the sums of the weights and of the weighted squares.
@@ -152,7 +176,7 @@ def match(way, sight, loaded, z, z_x, z_y, reach, place):
     return correlate(way, place, sight, loaded)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def correlate_and_slide(way, place, sight, loaded, found):
     """``correlate``, and how the window would slide along the ray: fills ``found`` with the correlation, and with
     gradient (1 / mm) and information (1 / mm^2) of the depth.

@@ -8,6 +8,7 @@ from pipeline.dense.matching_kernels import (
     Loaded,
     correlate_and_slide,
     distance_there,
+    farthest,
     load_window,
     place_window,
 )
@@ -17,15 +18,14 @@ LEAST_LIKENESS = 0.3  # correlation of a view that may speak
 BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken for hidden
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def propagate(sight, parity, steps, same_mm, depth, slopes, cost):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
+def propagate(sight, scratch, parity, steps, same_mm, depth, slopes, cost):
     """Every pixel of one colour of the chequerboard tries the planes of its neighbours of the other colour, ``steps``
     pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known. Planes that differ by
     less than ``same_mm``, in depth and a pixel beside it, are the same."""
     height, width = depth.shape
-    ways, window = sight.ways, np.empty((2, sight.pattern.shape[1]), np.float32)
-    scores, place = np.empty(len(ways)), np.empty(8)
-    reach = np.abs(sight.pattern).max()
+    window, scores, place = scratch.window, scratch.scores, scratch.place
+    reach = farthest(sight.pattern)
     for row in range(height):
         for column in range((row + parity) % 2, width, 2):
             if depth[row, column] <= 0.0:
@@ -58,17 +58,16 @@ def propagate(sight, parity, steps, same_mm, depth, slopes, cost):
             slopes[row, column, 1] = best_y
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def slide(sight, most_px, depth, slopes, place_mm, information, likeness):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
+def slide(sight, scratch, most_px, depth, slopes, place_mm, information, likeness):
     """One step of least squares on the depth of every pixel, over all views that show it alike.
 
     Fills ``place_mm`` (where the depth should be; at most ``most_px`` of the most sensitive view away), its
     ``information`` (1 / mm^2 of independent samples; 0 where nothing is known) and the mean ``likeness``.
     """
     height, width = depth.shape
-    ways, window = sight.ways, np.empty((2, sight.pattern.shape[1]), np.float32)
-    place, found = np.empty(8), np.empty((len(ways), 3))
-    reach = np.abs(sight.pattern).max()
+    ways, window, place, found = sight.ways, scratch.window, scratch.place, scratch.found
+    reach = farthest(sight.pattern)
     for row in range(height):
         for column in range(width):
             z = depth[row, column]

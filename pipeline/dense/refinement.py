@@ -13,6 +13,7 @@ from jaxtyping import Float32, Int
 from pipeline.dense.crops import UNSEEN_MOST_PX
 from pipeline.dense.field import Field
 from pipeline.dense.field_kernels import double, fit_planes
+from pipeline.dense.matching_kernels import make_scratch
 from pipeline.dense.refine_kernels import propagate, slide
 from pipeline.dense.stack import Stack
 from pipeline.parallel_for import map_in_threads
@@ -71,17 +72,18 @@ def _refined(
     rounds: int,
 ) -> Field:
     sight = stack.sight(view, neighbours, pattern, settings.contrast_levels)
+    scratch = make_scratch(sight)
     depth, slopes, live = field.depth.copy(), field.slopes.copy(), field.depth > 0.0
     pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
     if steps_px:
         cost = np.full(depth.shape, -1.0, np.float32)
         for parity in (0, 1):
-            propagate(sight, parity, np.array(steps_px), SAME_PX * pixel_mm, depth, slopes, cost)
+            propagate(sight, scratch, parity, np.array(steps_px), SAME_PX * pixel_mm, depth, slopes, cost)
     before, known = depth, field.information + LEAST_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
     for _ in range(rounds):
         place, seen, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
-        slide(sight, MOST_SLIDE_PX, depth, slopes, place, seen, likeness)
+        slide(sight, scratch, MOST_SLIDE_PX, depth, slopes, place, seen, likeness)
         seen = seen / (settings.match_factor**2 + settings.match_floor_mm**2 * seen)
         information = seen + known
         joined = np.where(live, (seen * place + known * before) / information, 0.0).astype(np.float32)

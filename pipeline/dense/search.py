@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Int, Int32
 
 from pipeline.dense.field import Field
+from pipeline.dense.matching_kernels import make_scratch
 from pipeline.dense.room import Room
 from pipeline.dense.stack import Stack
 from pipeline.dense.sweep_kernels import aggregate, sweep_view
@@ -35,7 +36,7 @@ def first_fields(
         room = rooms[view]
         cost, strides = np.empty((*room.near.shape, settings.labels), np.float32), label_strides(room, settings)
         sight = stack.sight(view, neighbours[view], pattern, settings.contrast_levels)
-        sweep_view(sight, room.near, room.far, room.slopes, strides, cost)
+        sweep_view(sight, make_scratch(sight), room.near, room.far, room.slopes, strides, cost)
         return _cheapest(cost, room, strides)
 
     return map_in_threads(work, len(stack))

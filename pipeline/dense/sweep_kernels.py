@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.compiled import njit
-from pipeline.dense.matching_kernels import AGAINST, NO_SAY, Loaded, load_window, match
+from pipeline.dense.matching_kernels import AGAINST, NO_SAY, Loaded, farthest, load_window, match
 
 NOT_COMPARED = 1.0  # cost of a place that no pair of views says anything about: that of no likeness
 ALONE = 0.15  # cost of a place that a single other view speaks for
@@ -42,17 +42,16 @@ def cost_of(sight, loaded, z, z_x, z_y, reach, place, scores):
     return score_best_half(scores, count)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def sweep_view(sight, near, far, slopes, strides, cost):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
+def sweep_view(sight, scratch, near, far, slopes, strides, cost):
     """Fills ``cost`` (h, w, labels): 1 minus the likeness at ``near + share (far - near)``, mm.
 
     ``slopes`` (h, w, 4): of near by x and y, of far by x and y, mm a pixel. ``strides`` (h, w): one in so many labels
     is matched, and the last; costs run linearly between.
     """
     height, width, labels = cost.shape
-    window = np.empty((2, sight.pattern.shape[1]), np.float32)
-    scores, place = np.empty(len(sight.ways)), np.empty(8)
-    reach = np.abs(sight.pattern).max()
+    window, scores, place = scratch.window, scratch.scores, scratch.place
+    reach = farthest(sight.pattern)
     for row in range(height):
         for column in range(width):
             if far[row, column] <= 0.0:
