@@ -5,7 +5,7 @@ import numpy as np
 from pipeline.compiled import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def rasterise(
     pixels: np.ndarray, depths: np.ndarray, faces: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -29,11 +29,11 @@ def rasterise(
         y_low, y_high = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
         if x_low > x_high or y_low > y_high:
             continue
-        ia, ib, ic = 1.0 / za, 1.0 / zb, 1.0 / zc
+        ia, ib, ic, share = 1.0 / za, 1.0 / zb, 1.0 / zc, 1.0 / area
         for y in range(int(y_low), int(y_high) + 1):
             for x in range(int(x_low), int(x_high) + 1):
-                wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
-                wb = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
+                wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) * share
+                wb = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) * share
                 wc = 1.0 - wa - wb
                 if wa < 0.0 or wb < 0.0 or wc < 0.0:
                     continue
