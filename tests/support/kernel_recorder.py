@@ -59,5 +59,6 @@ def kernels_of(captures: list[Path], settings: Mapping[str, object]) -> set[Kern
 
 if __name__ == "__main__":
     target, *captures = map(Path, sys.argv[1:])
+    target.write_text("")  # a job begins by compiling what its list has, and loops may take other arguments now
     parts = [sorted(kernel.line for kernel in kernels_of(captures, settings)) for settings in (PLAIN, {})]
     target.write_text("\n\n".join(map("\n".join, parts)) + "\n", encoding="utf-8")
