@@ -18,7 +18,7 @@ from pipeline.dense.part_votes import SKIN, UNSEEN, PartVotes, part_codes, part_
 from pipeline.dense.surface.contradiction import silence_contradicted
 from pipeline.dense.surface.crossings import without_crossings
 from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
-from pipeline.dense.surface.quality import deviation_mm
+from pipeline.dense.surface.quality import deviation_mm, without_islands
 from pipeline.dense.surface.refinement import refine_vertices
 from pipeline.dense.surface.signed_distance import Level, NoSurface, solve
 from pipeline.dense.surface.skin import drawn_to_skin
@@ -94,6 +94,7 @@ def fuse(
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
+    measured = without_islands(mesh, measured)
     seen = measured.views > 0
     mesh = without_bias(mesh, seen, bias)
     if head_skin_world is not None:
