@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import math
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -199,6 +200,7 @@ class BustSettings:
 
 FORMATS = ("glb", "ply", "obj", "usdz", "stl", "3mf")
 TEXTURE_SIZES = (1024, 2048, 4096, 8192)
+TEMPLATE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")  # it becomes part of a file's name
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +216,7 @@ class OutputSettings:
     ply_texture: bool = False  # head.ply names head.png and has texture coordinates
     neutral: bool = False  # neutral.glb, the head without its expression
     morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names
+    template: str | None = None  # head-NAME.obj: the head in the vertex order of a registered template, too
     obj: bool = False  # of earlier versions: "obj" among the formats
     atlas: bool = False  # of earlier versions: head.glb has a texture now
 
@@ -269,6 +272,9 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
     size = settings.outputs.texture_size
     if size is not None and size not in TEXTURE_SIZES:
         faults.append(f"outputs.texture_size is {size}, wanted {', '.join(map(str, TEXTURE_SIZES))} or null")
+    template = settings.outputs.template
+    if template is not None and not TEMPLATE_NAME.fullmatch(template):
+        faults.append(f"outputs.template: {template!r:.60} is no name: letters, digits, - and _, 40 at most")
     if faults:
         raise InputError(subject, faults)
     return settings

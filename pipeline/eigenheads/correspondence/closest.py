@@ -33,15 +33,27 @@ class SurfaceIndex:
         samples, self._owner = _samples(self.corners, spacing)
         self._tree = KDTree(samples, balanced_tree=False, compact_nodes=False)
 
-    def closest(self, points: Float[np.ndarray, "N 3"], candidates: int = _CANDIDATES) -> Hits:
-        """Closest surface point of each query point."""
+    def closest(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        candidates: int = _CANDIDATES,
+        *,
+        facing: Float[np.ndarray, "N 3"] | None = None,
+        facing_mm: float = 10.0,
+    ) -> Hits:
+        """Closest surface point of each query point. With unit normals ``facing`` of the points, a triangle that faces
+        the other way is chosen only where it is nearer by ``facing_mm``: lips that meet are told apart."""
         count = min(candidates, len(self._owner))
         nearest = self._tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)
         triangles = self._owner[nearest]
         repeated = np.repeat(points, count, 0)
         found, weights = closest_on_triangles(repeated, self.corners[triangles.ravel()])
         distance = np.linalg.norm(repeated - found, axis=1).reshape(len(points), count)
-        best = distance.argmin(1)
+        cost = distance
+        if facing is not None:
+            turned = np.einsum("nx,ncx->nc", facing, self.normals(triangles.ravel()).reshape(*triangles.shape, 3))
+            cost = distance + 0.5 * facing_mm * (1.0 - turned)
+        best = cost.argmin(1)
         row = np.arange(len(points))
         triangle = triangles[row, best]
         return Hits(

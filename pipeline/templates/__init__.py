@@ -1,0 +1,1 @@
+"""Results in the vertex order of somebody else's mesh: registered once to a head model, carried by it ever after."""

@@ -1,0 +1,120 @@
+"""How a head carries the vertices of another mesh.
+
+A vertex on the skin keeps its triangle, its barycentric coordinates there and what it is off the triangle, in the
+triangle's own frame. What lies deeper (mouth, sockets, lashes) follows the skin about it by the smooth map of
+``landmark_warp``; closed parts (eyeballs, teeth) move as wholes and grow, so that a ball stays one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.alignment.procrustes import procrustes
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
+from pipeline.eigenheads.correspondence.warp import landmark_warp
+from pipeline.eigenheads.gaussian_process import spread_nodes
+
+CANDIDATES = 16  # triangles about a vertex that are looked at
+ANCHORS = 360  # vertices of the skin that lead what lies deeper: 3 mm apart along lids and lips
+ALL_OVER = 60  # ... of them spread over all of the skin
+WHOLE_ANCHORS = 40  # that lead a closed part
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attachment:
+    """Points on a triangle surface."""
+
+    triangles: Int[np.ndarray, " n"]  # rows of the surface's faces
+    weights: Float[np.ndarray, "n 3"]  # barycentric
+    offsets: Float[np.ndarray, "n 3"]  # mm, in the triangle's frame (``frames``)
+
+    def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
+        """The points on the same surface with other vertices."""
+        corners = vertices[faces[self.triangles]]
+        off = np.einsum("nax,na->nx", frames(corners), self.offsets)
+        return np.einsum("nk,nkx->nx", self.weights, corners) + off
+
+
+def attach(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+) -> tuple[Attachment, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Points attached where the surface is nearest and faces as they do; their distances (mm), and the cosine between
+    their unit normals and the surface's."""
+    surface = SurfaceIndex(vertices, faces)
+    hits = surface.closest(points, CANDIDATES, facing=normals)
+    offsets = np.einsum("nax,nx->na", frames(vertices[faces[hits.triangles]]), points - hits.points)
+    cosine = np.einsum("nx,nx->n", normals, hits.normals)
+    return Attachment(hits.triangles, hits.weights, offsets), hits.distances, cosine
+
+
+def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """Rows: along the first edge, across it in the plane, the normal. Zero rows where a triangle has no area."""
+    along, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(along, other)
+    axes = np.stack([along, np.cross(normal, along), normal], axis=1)
+    return axes / np.maximum(np.linalg.norm(axes, axis=2, keepdims=True), 1e-12)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Carrier:
+    """All vertices of a mesh as a model's surface carries them. Rows are the mesh's vertices."""
+
+    rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
+    skin: Int[np.ndarray, " n"]  # rows that the surface carries, as ``attachment`` says
+    attachment: Attachment
+    anchors: Int[np.ndarray, " a"]  # of ``skin``, rows of the mesh, that lead the rest
+    wholes: Int[np.ndarray, " t"]  # number of the closed part that a vertex belongs to, -1 of none
+    whole_anchors: Int[np.ndarray, "w k"]  # rows of the mesh that lead each closed part
+
+    def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "t 3"]:
+        """The mesh's vertices on a head: the model's full level, in any frame, mm."""
+        out = np.empty_like(self.rest)
+        out[self.skin] = self.attachment.on(vertices, faces)
+        deep = self.wholes < 0
+        deep[self.skin] = False
+        if deep.any():
+            out[deep] = landmark_warp(self.rest[self.anchors], out[self.anchors], self.rest[deep])
+        for number, anchors in enumerate(self.whole_anchors):
+            part = self.wholes == number
+            out[part] = procrustes(self.rest[anchors], out[anchors]).apply(self.rest[part])
+        return out
+
+
+def carrier(
+    rest: Float[np.ndarray, "t 3"],
+    skin: Int[np.ndarray, " n"],
+    attachment: Attachment,
+    wholes: Int[np.ndarray, " t"],
+) -> Carrier:
+    """A Carrier with its anchors chosen: the skin nearest to what lies deeper, and some of all of it."""
+    tree = KDTree(rest[skin])
+    deep = wholes < 0
+    deep[skin] = False
+    led = np.unique(np.asarray(tree.query(rest[deep])[1], int)) if deep.any() else np.zeros(0, int)
+    near = led[spread_nodes(rest[skin[led]], min(ANCHORS - ALL_OVER, len(led)))] if len(led) else led
+    over = spread_nodes(rest[skin], min(ALL_OVER, len(skin)))
+    count = int(wholes.max(initial=-1)) + 1
+    wanted = min(WHOLE_ANCHORS, len(skin))
+    leads = [skin[_nearest(tree, rest[wholes == number], wanted)] for number in range(count)]
+    return Carrier(
+        rest=rest,
+        skin=skin,
+        attachment=attachment,
+        anchors=skin[np.union1d(near, over)],
+        wholes=wholes,
+        whole_anchors=np.array(leads, int).reshape(count, wanted),
+    )
+
+
+def _nearest(tree: KDTree, part: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " k"]:
+    """The points of a tree that lie nearest to any of a part's: about an eyeball, the edges of its lids."""
+    distance, row = tree.query(part, k=count)
+    distance, row = np.ravel(distance), np.ravel(row)
+    order = np.argsort(distance, kind="stable")
+    _, first = np.unique(row[order], return_index=True)
+    return row[order][np.sort(first)[:count]]

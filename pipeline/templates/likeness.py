@@ -1,0 +1,173 @@
+"""The head of a model that is most like a foreign mesh: shape and place together.
+
+Gauss-Newton from the model's vertices to the planes of the mesh that they meet (Chen and Medioni 1992), under the
+prior z ~ N(0, I), with eigenheads and the smooth deformations of ``gaussian_process`` beyond them: section 3.2's
+search, with a size and without landmarks. Model to mesh, so that what else the mesh has, its shoulders say, pulls at
+nothing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
+from pipeline.eigenheads.gaussian_process import with_kernel
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.templates.placement import Surface, samples
+from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import vertex_normals
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """Some steps of the search. Lengths in mm."""
+
+    steps: int
+    modes: int | None  # the first ones; None: all, the smooth deformations too
+    reach_mm: float  # a point of the mesh farther than this is another part
+    normal_mm: float  # a right angle between normals counts as much as this many mm; 0: the nearest point of the mesh
+    plane_mm: float  # residual that weighs as much as a standard deviation of a mode, per cm2
+
+
+# Normals lead while the shape is millimetres off, or lids and lips meet their neighbours; then nearness decides.
+STAGES = (
+    Stage(5, 10, 25.0, 12.0, 2.0),
+    Stage(5, 40, 15.0, 12.0, 1.0),
+    Stage(6, None, 10.0, 12.0, 0.4),
+    Stage(10, None, 5.0, 0.0, 0.05),
+)
+FACING = 0.6  # cosine between normals of what meets
+ROBUST, LEAST_MM = 5.0, 0.05  # scale of Geman and McClure's weight, by the median residual; and its least
+MET_MM = 10.0  # what is nearer in the end was met
+MARK_MM = 0.5  # to which a landmark is marked, an axis
+BULGE = 0.75  # of the way to the tangent planes at a triangle's corners, as its authors have it
+CANDIDATES = 16
+ROWS = 6000  # vertices of the model that look for the mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Likeness:
+    """The model as the mesh has it."""
+
+    vertices: Float[np.ndarray, "v 3"]  # of the full level, in the frame that the search began in
+    distances: Float[np.ndarray, " s"]  # mm, of some vertices of the model from the mesh; inf where nothing was met
+    areas: Float[np.ndarray, " s"]  # that these vertices stand for, mm2
+    in_face: Bool[np.ndarray, " s"]  # which of them lie in the face region
+    deviation: float  # root mean square of the eigenheads' coefficients, standard deviations
+
+
+def likeness(
+    model: HeadModel, mesh: Surface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] = MappingProxyType({})
+) -> Likeness:
+    """The model fitted to a mesh that lies about where the model does (mm), and to landmarks of the mesh."""
+    wide = with_kernel(model, len(model.modes))
+    full, count = model.levels["full"], len(model.modes)
+    rows = np.arange(0, len(model.mean), max(1, len(model.mean) // ROWS))  # of the cage: even over the surface
+    marked = np.array([model.landmarks[name] for name in landmarks], int)
+    marks = np.array([*landmarks.values(), np.zeros(3)])[:-1]
+    every = np.concatenate([rows, np.repeat(marked, 3)])
+    modes = np.ascontiguousarray(wide.basis("full", len(wide.modes), every).transpose(1, 2, 0))
+    areas = vertex_areas(model.vertices(np.zeros(0)), full.faces)[rows]
+    areas *= vertex_areas(model.vertices(np.zeros(0)), full.faces).sum() / areas.sum()
+    target, z, place = _Mesh(mesh), np.zeros(len(wide.modes)), Similarity.identity()
+    for stage in STAGES:
+        active = min(count, stage.modes) if stage.modes else len(z)
+        for _ in range(stage.steps):
+            head = place.apply(wide.vertices(z))
+            normals = vertex_normals(head, full.faces)[rows]
+            met, planes, _, weight = target.meet(head[rows], normals, stage)
+            information = np.concatenate(
+                [weight * areas / 100.0 / stage.plane_mm**2, np.full(3 * len(marked), MARK_MM**-2)]
+            )
+            met = np.concatenate([met, np.repeat(marks, 3, axis=0)])
+            planes = np.concatenate([planes, np.tile(np.eye(3), (len(marked), 1))])  # a landmark is three planes
+            z, place = _step(modes[:, :, :active], head[every], met, planes, information, z, place)
+    head = place.apply(wide.vertices(z))
+    normals = vertex_normals(head, full.faces)[rows]
+    _, _, off, weight = target.meet(head[rows], normals, replace(STAGES[-1], reach_mm=MET_MM))
+    deviation = float(np.sqrt(np.mean(z[:count] ** 2)))
+    return Likeness(head, np.where(weight > 0, off, np.inf), areas, full.face_region[rows], deviation)
+
+
+class _Mesh:
+    """The mesh to be met: its surface, and points of it by position and normal together."""
+
+    def __init__(self, mesh: Surface) -> None:
+        self._mesh, self._surface = mesh, SurfaceIndex(mesh.vertices, mesh.faces)
+        self._places, self._normals = samples(mesh)
+        self._trees: dict[float, KDTree] = {}
+
+    def meet(
+        self, points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], stage: Stage
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Where points meet the mesh, its normals there, the distances, and weights: 0 where it faces another way, is
+        too far, or ends (there the nearest point lies sideways)."""
+        places, planes = self._nearest(points, normals, stage.normal_mm)
+        apart = places - points
+        off = np.linalg.norm(apart, axis=1)
+        met = (off < stage.reach_mm) & (np.einsum("nx,nx->n", normals, planes) > FACING)
+        if not stage.normal_mm:
+            along = np.einsum("nx,nx->n", apart, planes)
+            met &= np.sqrt(np.maximum(off**2 - along**2, 0.0)) < np.maximum(1.0, 0.5 * off)
+        usual = float(np.median(off[met])) if met.any() else stage.reach_mm
+        robust = np.clip(ROBUST * usual, LEAST_MM, 0.5 * stage.reach_mm)
+        return places, planes, off, met / (1.0 + (off / robust) ** 2) ** 2
+
+    def _nearest(
+        self, points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], normal_mm: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if normal_mm:
+            if normal_mm not in self._trees:
+                self._trees[normal_mm] = KDTree(np.concatenate([self._places, normal_mm * self._normals], axis=1))
+            query = np.concatenate([points, normal_mm * normals], axis=1)
+            row = np.asarray(self._trees[normal_mm].query(query)[1], int)
+            return self._places[row], self._normals[row]
+        hits = self._surface.closest(points, CANDIDATES, facing=normals)
+        rows = self._mesh.faces[hits.triangles]
+        corners, normals = self._mesh.vertices[rows], self._mesh.normals[rows]
+        # Phong tessellation (Boubekeur and Alexa 2008): vertices of a coarse mesh lie on the skin, its triangles within
+        above = np.einsum("nkx,nkx->nk", hits.points[:, None] - corners, normals)
+        bulge = np.einsum("nk,nk,nkx->nx", hits.weights, above, normals)
+        planes = np.einsum("nk,nkx->nx", hits.weights, normals)
+        planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-12)
+        return hits.points - BULGE * bulge, planes
+
+
+def _step(
+    modes: Float[np.ndarray, "s 3 m"],
+    points: Float[np.ndarray, "s 3"],
+    met: Float[np.ndarray, "s 3"],
+    planes: Float[np.ndarray, "s 3"],
+    information: Float[np.ndarray, " s"],
+    z: Float[np.ndarray, " k"],
+    place: Similarity,
+) -> tuple[Float[np.ndarray, " k"], Similarity]:
+    """One Gauss-Newton step over the active modes, turn, shift and size."""
+    active = modes.shape[2]
+    turned = (place.scale * planes @ place.rotation).astype(np.float32)  # n^T s R
+    along = sum(turned[:, axis, None] * modes[:, axis] for axis in range(3))
+    centre = points.mean(axis=0)
+    arm = points - centre
+    swell = np.einsum("nx,nx->n", arm, planes)[:, None]
+    columns = np.concatenate([along, np.cross(arm, planes), planes, swell], axis=1)
+    root = np.sqrt(information)[:, None]
+    weighted = (columns * root).astype(np.float32)
+    residual = np.einsum("nx,nx->n", met - points, planes) * root[:, 0]
+    system = (weighted.T @ weighted).astype(float)
+    system[range(active), range(active)] += 1.0
+    system[range(active, active + 7), range(active, active + 7)] += 1e-3 * np.trace(system) / len(system) * 1e-3
+    right = weighted.T.astype(float) @ residual
+    right[:active] -= z[:active]
+    delta = np.linalg.solve(system, right)
+    new = z.copy()
+    new[:active] += delta[:active]
+    turn, shift, growth = np.split(delta[active:], [3, 6])
+    twist = rotation_from_vector(turn)
+    grown = float(np.exp(np.clip(growth[0], -0.1, 0.1)))
+    moved = grown * twist @ (place.translation - centre) + centre + shift
+    return new, Similarity(grown * place.scale, twist @ place.rotation, moved)

@@ -1,0 +1,52 @@
+"""Templates by name: what a job loads before its work, and what ``eigenhead template add`` makes."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.templates.names import template_path
+from pipeline.templates.registration import Registration, Report, register
+from pipeline.templates.template_file import Template, read_template
+from rig.formats.polygon_obj import PolygonMesh, read_polygons
+
+
+def load_template(name: str | None, model: HeadModel) -> Template | None:
+    """The template of this name for a job with this model; None for none.
+
+    Raises UnknownTemplate, BadTemplate, OtherModel."""
+    if name is None:
+        return None
+    template = read_template(template_path(name))
+    template.check_model(model.name, model.sha256)
+    return template
+
+
+def make_template(
+    path: Path,
+    name: str,
+    model: HeadModel,
+    *,
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
+    report: Report,
+) -> tuple[Template, Registration]:
+    """The mesh of an OBJ file, registered to a model. Raises InputError naming every fault of the file."""
+    mesh = read_polygons(path)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    found = register(mesh, model, name=path.name, landmarks=landmarks, report=report)
+    kept = PolygonMesh(found.carrier.rest, mesh.sizes, mesh.corners, mesh.uv, mesh.corner_uv, mesh.statements)
+    template = Template(
+        name=name,
+        source=path.name,
+        source_sha256=digest,
+        model_name=model.name,
+        model_sha256=model.sha256,
+        mesh=kept,
+        carrier=found.carrier,
+        figures=found.figures(),
+    )
+    return template, found

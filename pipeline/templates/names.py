@@ -1,0 +1,68 @@
+"""Which templates are at hand, and the files behind their names. Loads nothing: settings and the command line ask it.
+
+Templates lie in the data folder's ``templates``, each with its picture.
+"""
+
+from pathlib import Path
+
+from pipeline.eigenheads.data_folder import data_folder
+from pipeline.settings import TEMPLATE_NAME
+from rig.errors import EigenheadError
+
+
+class UnknownTemplate(EigenheadError):
+    """A name that no template has."""
+
+    def __init__(self, name: str) -> None:
+        known = ", ".join(list_templates()) or "none"
+        super().__init__(
+            f"no template {name!r:.60}: known are {known}. Register one with `eigenhead template add FILE.obj`"
+        )
+
+
+class WrongName(EigenheadError):
+    """A name that no template can have."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(
+            f"{name!r:.60} cannot be a template's name (letters, digits, - and _, 40 at most): give one with --name"
+        )
+
+
+def is_name(name: str) -> bool:
+    return TEMPLATE_NAME.fullmatch(name) is not None
+
+
+def templates_folder() -> Path:
+    """The folder of registered templates. It need not exist."""
+    return data_folder() / "templates"
+
+
+def list_templates() -> dict[str, Path]:
+    """Templates at hand by name."""
+    folder = templates_folder()
+    found = sorted(folder.glob("*.npz")) if folder.is_dir() else []
+    return {path.stem: path for path in found if is_name(path.stem)}
+
+
+def template_path(name: str) -> Path:
+    """The file behind a name. Raises UnknownTemplate."""
+    found = list_templates().get(name)
+    if found is None:
+        raise UnknownTemplate(name)
+    return found
+
+
+def new_path(name: str) -> Path:
+    """Where a template of this name lies, or would. Raises WrongName."""
+    if not is_name(name):
+        raise WrongName(name)
+    return templates_folder() / f"{name}.npz"
+
+
+def remove_template(name: str) -> Path:
+    """Removes a template and its picture; returns where it was. Raises UnknownTemplate."""
+    path = template_path(name)
+    path.unlink()
+    path.with_suffix(".png").unlink(missing_ok=True)
+    return path

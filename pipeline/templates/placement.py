@@ -1,0 +1,178 @@
+"""Where a foreign mesh lies: head_from_template, a similarity, from landmarks or by a search.
+
+The search tries millimetres, centimetres, decimetres and metres, every axis convention, three starts each, and iterates
+closest points (Besl and McKay 1992; Umeyama's scale) from the model's surface to the mesh: whatever else the mesh has,
+teeth, eyeballs, shoulders, attracts nothing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.alignment.procrustes import procrustes
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.regions import head_regions
+from rig.errors import InputError
+from rig.geometry import Similarity
+from rig.mesh import vertex_normals
+
+UNITS = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
+EXTENT_MM = (110.0, 750.0)  # of a face alone, and of a bust
+COARSE, FINE = 400, 3000  # points of the model that look for the mesh
+SAMPLES = 20_000  # of the mesh's points that are found
+COARSE_STEPS, FINE_STEPS = 8, 30
+TRIED = 4  # coarse places that are looked at closely
+NORMAL_MM = 20.0  # what a normal that is off by a unit counts
+FAR_MM = 20.0  # no place is worse
+SCALE_RANGE = (0.7, 1.45)  # of adults' and children's heads by the model's
+UNLIKE_MM = 8.0  # mean distance of the face beyond which a place is none
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A triangle mesh with its unit normals, mm once it is placed."""
+
+    vertices: Float[np.ndarray, "t 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "t 3"]
+
+    def placed(self, place: Similarity) -> "Surface":
+        return Surface(place.apply(self.vertices), self.faces, self.normals @ place.rotation.T)
+
+
+def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
+    """The mesh with faces that look outwards: those of a file that has them inside out are turned over."""
+    corners = vertices[faces] - vertices[np.unique(faces)].mean(axis=0)
+    if np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
+        faces = faces[:, ::-1]
+    return Surface(vertices, faces, vertex_normals(vertices, faces))
+
+
+def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:
+    """head_from_template from landmarks of the mesh. Raises InputError."""
+    names = [each for each in landmarks if each in model.landmarks]
+    if len(names) < 4:
+        raise InputError(name, [f"{len(names)} landmarks are known, 4 are needed: {', '.join(names) or 'none'}"])
+    ours = model.vertices(np.zeros(0))[[model.landmarks[each] for each in names]]
+    try:
+        return procrustes(np.array([landmarks[each] for each in names]), ours)
+    except ValueError as error:
+        raise InputError(name, [f"its landmarks cannot place it: {error}"]) from None
+
+
+def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
+    """head_from_template by search. Raises InputError where the mesh looks like no head."""
+    used = mesh.vertices[np.unique(mesh.faces)]
+    extent = float(np.ptp(used, axis=0).max())
+    factors = [f for f in UNITS.values() if EXTENT_MM[0] < extent * f < EXTENT_MM[1]]
+    if not factors:
+        told = f"is {extent:.3g} units large, which is no head in {', '.join(UNITS)}"
+        raise InputError(name, [f"{told}: scale it, or give its landmarks (--landmarks)"])
+    points, normals, weights = _model_points(model, FINE)
+    some = slice(None, None, max(1, len(points) // COARSE))
+    there = [part[:: max(1, len(part) // SAMPLES)] for part in samples(mesh)]
+    tree = KDTree(np.concatenate([there[0] * factors[0], there[1] * NORMAL_MM], axis=1))
+    coarse = []
+    for factor, turn in product(factors, _axis_turns()):
+        for start in _starts(model, points, Similarity(factor, turn, np.zeros(3)), used):
+            found = _closest_points(
+                mesh, tree, factors[0], points[some], normals[some], weights[some], start, COARSE_STEPS
+            )
+            coarse.append(found)
+    coarse.sort(key=lambda found: found[0])
+    fine = [
+        _closest_points(mesh, tree, factors[0], points, normals, weights, place, FINE_STEPS)
+        for _, place in coarse[:TRIED]
+    ]
+    off_mm, place = min(fine, key=lambda found: found[0])
+    if off_mm > UNLIKE_MM:
+        why = f"lies {off_mm:.0f} mm off the model's face at best"
+        raise InputError(name, [f"{why}, so it is no head, or one turned askew: give its landmarks (--landmarks)"])
+    return place
+
+
+def _model_points(model: HeadModel, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of the model without its neck, their normals, and their weights: the face counts most, for masks."""
+    vertices, regions = model.vertices(np.zeros(0)), head_regions(model)
+    rows = np.flatnonzero(~regions["neck"])
+    rows = rows[:: max(1, len(rows) // count)]
+    weights = np.where(regions["face"][rows], 1.0, 0.3)
+    return vertices[rows], vertex_normals(vertices, model.levels["full"].faces)[rows], weights / weights.sum()
+
+
+def samples(mesh: Surface) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points of a mesh and its unit normals there: the vertices that faces use, and the middles of the faces."""
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    normal = mesh.normals[mesh.faces].sum(axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    used = np.unique(mesh.faces)
+    return np.concatenate([mesh.vertices[used], middle]), np.concatenate([mesh.normals[used], normal])
+
+
+def _axis_turns() -> list[Float[np.ndarray, "3 3"]]:
+    """The 24 rotations that take axes to axes."""
+    turns = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        matrix = np.eye(3)[list(order)] * np.array(signs)[:, None]
+        if np.linalg.det(matrix) > 0:
+            turns.append(matrix)
+    return turns
+
+
+def _starts(
+    model: HeadModel, points: np.ndarray, turned: Similarity, used: Float[np.ndarray, "t 3"]
+) -> list[Similarity]:
+    """Shifts that bring nose to nose, crown to crown, and middle to middle."""
+    here, ours = turned.apply(used), model.vertices(np.zeros(0))
+    low, high = here.min(axis=0), here.max(axis=0)
+    nose, crown = here[here[:, 2].argmax()], np.array([*(low + high)[[0]] / 2, high[1], (low + high)[2] / 2])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    our_crown = np.array([middle[0], points[:, 1].max(), middle[2]])
+    shifts = (ours[model.landmarks["pronasale"]] - nose, our_crown - crown, middle - (low + high) / 2)
+    return [Similarity(turned.scale, turned.rotation, shift) for shift in shifts]
+
+
+def _closest_points(
+    mesh: Surface,
+    tree: KDTree,
+    factor: float,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    weights: Float[np.ndarray, " n"],
+    place: Similarity,
+    steps: int,
+) -> tuple[float, Similarity]:
+    """What the model's points are off the mesh (weighted mean, mm, none more than ``FAR_MM``), and the place found.
+
+    ``tree`` holds the mesh's points times ``factor``, and their normals."""
+    start = place.scale
+    found = (FAR_MM, place)
+    for step in range(steps + 1):
+        back = place.inverse()
+        query = np.concatenate([back.apply(points) * factor, normals @ place.rotation * NORMAL_MM], axis=1)
+        near = tree.data[np.asarray(tree.query(query)[1], int)]
+        there = place.apply(near[:, :3] / factor)
+        off = np.linalg.norm(there - points, axis=1)
+        facing = np.einsum("nx,nx->n", query[:, 3:], near[:, 3:]) / NORMAL_MM**2
+        cost = float(weights @ np.minimum(np.where(facing > 0.3, off, FAR_MM), FAR_MM))
+        if cost < found[0]:
+            found = (cost, place)
+        if step == steps:
+            break
+        keep = weights * (facing > 0.3) / (1.0 + (off / max(3.0, 2.0 * cost)) ** 2) ** 2
+        if np.count_nonzero(keep) < 20:
+            break
+        try:
+            moved = procrustes(near[:, :3] / factor, points, keep)
+        except ValueError:
+            break
+        low, high = (limit * start for limit in SCALE_RANGE)
+        scale = float(np.clip(moved.scale, low, high))
+        share = keep / keep.sum()
+        shift = share @ points - scale * moved.rotation @ (share @ near[:, :3] / factor)
+        place = Similarity(scale, moved.rotation, shift)
+    return found

@@ -1,0 +1,266 @@
+"""A foreign mesh registered to a head model, once (section 3.2, the other way round).
+
+The model is made as like the mesh as it can be (``likeness``), then the mesh's skin is drawn onto that head by the
+non-rigid refinement of ``correspondence``: what the two differ in is not carried on to results. Every vertex of the
+skin then has its place on the model's surface, everything deeper follows (``carrying``).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
+from pipeline.eigenheads.correspondence.correspondence import Search, Target, refined
+from pipeline.eigenheads.correspondence.warp import landmark_warp
+from pipeline.eigenheads.gaussian_process import spread_nodes
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.templates.carrying import Attachment, Carrier, attach, carrier
+from pipeline.templates.likeness import CANDIDATES, Likeness, likeness
+from pipeline.templates.placement import Surface, find_place, outward, place_by_landmarks
+from rig.errors import InputError
+from rig.formats.polygon_obj import PolygonMesh
+from rig.geometry import Similarity
+from rig.mesh import boundary_edges, vertex_normals
+
+Report = Callable[[str, float], None]
+
+DRAWN = Search(steps=0, reach_mm=5.0, normal_mm=2.0, plane_mm=0.0)
+MARK_WEIGHT = 30.0  # of a landmark, beside 1 of a vertex that meets the head: it must move its neighbours along
+STIFFNESS = (10.0, 3.0, 1.0, 0.5, 0.2, 0.05, 0.05)
+SKIN_SHARE = 0.02  # of the model's area that a part of the mesh must show to be skin ...
+SKIN_REACH_MM = 15.0  # ... no farther than this from the model's mean head
+ROUND = 0.6  # shortest by longest axis of a closed part that moves as a whole: eyeballs, no teeth
+OFF_MM, FACING = 1.5, 0.4  # a vertex farther off the skin, or facing away from it, lies deeper
+PATCH_SHARE = 0.005  # of the skin: smaller patches of it, alone among what lies deeper, are none
+TEST_HEADS = 6
+EDGE_RINGS = 2
+PARTING_MM = 0.7  # between a vertex and the middle of its neighbours, on another head: 3 sigma of 3 mm edges on skin
+COVERED_SHARE = 0.5  # of the model's face region that the mesh must show
+STRANGE = 4.0  # standard deviations: ICT-FaceKit's mean is 2.2 from the default's, and a ball 5.0
+LIKE_MM = 2.0  # median distance of the fitted face from the mesh
+
+
+class NotRegistered(InputError):
+    """A mesh that cannot be registered; ``faults`` says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """A mesh on a model's surface, and how well it lies there."""
+
+    carrier: Carrier
+    place: Similarity  # head_from_template, from the start
+    placed: Float[np.ndarray, "t 3"]  # the mesh there, in its own shape, mm
+    head: Float[np.ndarray, "v 3"]  # the model as like it as it can be, full level, mm
+    off_mm: Float[np.ndarray, " n"]  # skin to that head, after the mesh was drawn to it
+    unlike_mm: Float[np.ndarray, " n"]  # and before
+    covered: float  # share of the model's face region that the mesh shows
+
+    def figures(self) -> dict[str, float]:
+        """What is printed of it."""
+        return {
+            "vertices": float(len(self.carrier.rest)),
+            "skin_share": len(self.carrier.skin) / len(self.carrier.rest),
+            "off_median_mm": float(np.median(self.off_mm)),
+            "off_p95_mm": float(np.percentile(self.off_mm, 95)),
+            "unlike_median_mm": float(np.median(self.unlike_mm)),
+            "unlike_p95_mm": float(np.percentile(self.unlike_mm, 95)),
+            "face_covered_share": self.covered,
+        }
+
+
+def register(
+    mesh: PolygonMesh,
+    model: HeadModel,
+    *,
+    name: str,
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
+    report: Report,
+) -> Registration:
+    """Registers a mesh, in any unit and any axis convention or with landmarks in its frame, to a model.
+
+    Raises InputError where the mesh is no head, and NotRegistered where it is none that the model can follow."""
+    report("placing", 0.0)
+    own = outward(mesh.vertices, mesh.triangles())
+    place = place_by_landmarks(model, landmarks, name) if landmarks else find_place(model, own, name)
+    placed = own.placed(place)
+    welded, joined = weld(placed)
+    parts = components(welded)
+    skin = skin_parts(welded, parts, _head(model, model.vertices(np.zeros(0))))
+    report("likeness", 0.2)
+    marks = {mark: place.apply(point) for mark, point in (landmarks or {}).items() if mark in model.landmarks}
+    like = likeness(model, welded, marks)
+    covered = _check(like, name, marked=bool(landmarks))
+    head, faces = _head(model, like.vertices), model.levels["full"].faces
+    report("drawing", 0.7)
+    pairs = {mark: (point, head.vertices[model.landmarks[mark]]) for mark, point in marks.items()}
+    rest = _drawn(welded, skin[parts], head, list(pairs.values()))
+    attachment, off, facing = attach(rest, vertex_normals(rest, welded.faces), head.vertices, faces)
+    on_skin = skin[parts] & (off < OFF_MM) & (facing > FACING) & _used(welded)
+    on_skin &= ~parting(attachment, rest, on_skin, welded.faces, model)
+    on_skin = without_specks(without_edge(on_skin, welded.faces), welded.faces)
+    if not on_skin.any():
+        raise NotRegistered(name, ["no part of it lies on the model's skin: give its landmarks (--landmarks)"])
+    rest = _followed(welded.vertices, rest, on_skin)
+    rows = np.flatnonzero(on_skin[joined])
+    carried = carrier(
+        rest[joined], rows, _rows_of(attachment, joined[rows]), balls(welded, parts, ~skin)[joined]
+    )  # fmt: skip
+    unlike = SurfaceIndex(head.vertices, faces).closest(placed.vertices[rows], CANDIDATES).distances
+    report("drawing", 1.0)
+    return Registration(carried, place, placed.vertices, head.vertices, off[joined[rows]], unlike, covered)
+
+
+def _check(like: Likeness, name: str, *, marked: bool) -> float:
+    """The share of the face that was met. Raises NotRegistered; who marks a strange head's landmarks may have it."""
+    met, area = np.isfinite(like.distances), np.where(like.in_face, like.areas, 0.0)
+    covered = float(area[met].sum() / area.sum())
+    faults = []
+    if covered < COVERED_SHARE:
+        faults.append(f"shows {covered:.0%} of the model's face, {COVERED_SHARE:.0%} are needed")
+    face = like.distances[met & like.in_face]
+    if len(face) and np.median(face) > LIKE_MM:
+        faults.append(f"lies {np.median(face):.1f} mm (median) off every face that the model can make")
+    if like.deviation > STRANGE and not marked:
+        faults.append(f"is {like.deviation:.1f} standard deviations (RMS) from the model's mean, which no head is")
+    if faults:
+        raise NotRegistered(name, [*faults, "give its landmarks (--landmarks), or a mesh that is a human head"])
+    return covered
+
+
+def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
+    """Vertices at one place made one where the surface ends there, for files tear it along texture seams; and which one
+    each became. Lashes that begin on a lid stay parts of their own: the lid does not end there."""
+    ends = np.zeros(len(mesh.vertices), bool)
+    ends[boundary_edges(mesh.faces)] = True
+    own = np.where(ends, -1, np.arange(len(ends)))[:, None]
+    _, first, joined = np.unique(
+        np.concatenate([mesh.vertices + 0.0, own], axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    joined = joined.ravel()
+    faces, vertices = joined[mesh.faces].astype(np.int32), mesh.vertices[first]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    return Surface(vertices, faces, vertex_normals(vertices, faces)), joined
+
+
+def components(mesh: Surface) -> Int[np.ndarray, " t"]:
+    """The connected part that each vertex belongs to."""
+    return connected_components(_graph(mesh.faces, len(mesh.vertices)), directed=False)[1]
+
+
+def _graph(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_array:
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return sparse.csr_array((np.ones(len(pairs), np.int32), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+
+
+def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bool[np.ndarray, " p"]:
+    """Which parts are skin: those that enough of the head's area meets before anything else of the mesh."""
+    rows = slice(None, None, max(1, len(head.vertices) // 6000))
+    hits = SurfaceIndex(mesh.vertices, mesh.faces).closest(head.vertices[rows], CANDIDATES, facing=head.normals[rows])
+    part = parts[mesh.faces[hits.triangles, 0]]
+    met = np.where(hits.distances < SKIN_REACH_MM, vertex_areas(head.vertices, head.faces)[rows], 0.0)
+    shown = np.bincount(part, met, minlength=int(parts.max()) + 1)
+    return shown > SKIN_SHARE * shown.sum()
+
+
+def balls(mesh: Surface, parts: Int[np.ndarray, " t"], among: Bool[np.ndarray, " p"]) -> Int[np.ndarray, " t"]:
+    """A number for every vertex of a closed, round part of those ``among`` which are looked at; -1 for all others."""
+    closed = among.copy()
+    closed[parts[boundary_edges(mesh.faces).ravel()]] = False
+    closed[parts[~_used(mesh)]] = False
+    for part in np.flatnonzero(closed):
+        axes = np.linalg.svd(mesh.vertices[parts == part] - mesh.vertices[parts == part].mean(axis=0), compute_uv=False)
+        closed[part] = axes[-1] > ROUND * axes[0]
+    number = np.where(closed, np.cumsum(closed) - 1, -1)
+    return number[parts]
+
+
+def _of_parts(mesh: Surface, skin: Bool[np.ndarray, " t"]) -> Surface:
+    return Surface(mesh.vertices, mesh.faces[skin[mesh.faces].all(axis=1)], mesh.normals)
+
+
+def _head(model: HeadModel, vertices: Float[np.ndarray, "v 3"]) -> Surface:
+    faces = model.levels["full"].faces
+    return Surface(vertices, faces, vertex_normals(vertices, faces))
+
+
+def _used(mesh: Surface) -> Bool[np.ndarray, " t"]:
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    return used
+
+
+def parting(
+    attachment: Attachment,
+    rest: Float[np.ndarray, "t 3"],
+    skin: Bool[np.ndarray, " t"],
+    faces: Int[np.ndarray, "f 3"],
+    model: HeadModel,
+) -> Bool[np.ndarray, " t"]:
+    """Vertices that leave their neighbours on some head: they were attached to another sheet of the surface, the inside
+    of a lid or the eyeball, than these."""
+    graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
+    graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
+    degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]
+    rng, full = np.random.default_rng(0), model.levels["full"].faces
+    heads = [np.zeros(0), *rng.standard_normal((TEST_HEADS, len(model.modes)))]
+    moves = [attachment.on(model.vertices(z), full) - rest for z in heads]
+    reach = np.linalg.norm(graph @ rest / degree - rest, axis=1)
+    apart = np.max([np.linalg.norm(graph @ move / degree - move, axis=1) for move in moves], axis=0)
+    return skin & (apart > PARTING_MM + reach)
+
+
+def without_edge(skin: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
+    """The skin less its vertices next to what lies deeper: where a lid turns inwards it is a matter of chance which
+    vertex still meets the model's, and all of them follow more evenly."""
+    out = skin.copy()
+    for _ in range(EDGE_RINGS):
+        out[faces[~out[faces].all(axis=1)]] = False
+    return out
+
+
+def without_specks(mask: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
+    """The mask without its small connected patches."""
+    inside = faces[mask[faces].all(axis=1)]
+    _, patch = connected_components(_graph(inside, len(mask)), directed=False)
+    size = np.bincount(patch[mask], minlength=int(patch.max()) + 1)
+    return mask & (size[patch] > PATCH_SHARE * mask.sum())
+
+
+def _drawn(
+    mesh: Surface, skin: Bool[np.ndarray, " t"], head: Surface, marks: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> Float[np.ndarray, "t 3"]:
+    """The mesh with its skin drawn onto the head, and its landmarks onto the head's; other parts stay."""
+    rows = np.flatnonzero(skin)
+    place = np.full(len(skin), -1)
+    place[rows] = np.arange(len(rows))
+    faces = place[mesh.faces[skin[mesh.faces].all(axis=1)]]
+    target = Target(head.vertices, head.normals, np.zeros((0, 3)))
+    out = mesh.vertices.copy()
+    own = mesh.vertices[rows]
+    pulled = {}
+    for here, there in marks:
+        nearest = int(np.linalg.norm(own - here, axis=1).argmin())
+        pulled[nearest] = there + own[nearest] - here
+    out[rows] = refined(own, faces, target, DRAWN, STIFFNESS, pulled, MARK_WEIGHT)
+    return out
+
+
+def _followed(
+    before: Float[np.ndarray, "t 3"], after: Float[np.ndarray, "t 3"], skin: Bool[np.ndarray, " t"]
+) -> Float[np.ndarray, "t 3"]:
+    """``after`` on the skin, and everything else moved from ``before`` as the skin about it was."""
+    rows = np.flatnonzero(skin)
+    rows = rows[spread_nodes(before[rows], min(400, len(rows)))]
+    out = after.copy()
+    out[~skin] = landmark_warp(before[rows], after[rows], before[~skin])
+    return out
+
+
+def _rows_of(attachment: Attachment, rows: Int[np.ndarray, " n"]) -> Attachment:
+    return Attachment(attachment.triangles[rows], attachment.weights[rows], attachment.offsets[rows])

@@ -1,0 +1,140 @@
+"""Templates as files (npz with a JSON ``meta``): a mesh of somebody's, and how a head model carries it."""
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.templates.carrying import Attachment, Carrier
+from rig.atomic_write import write_atomically
+from rig.errors import EigenheadError
+from rig.formats.polygon_obj import PolygonMesh
+
+FORMAT = "eigenhead-template/1"
+MESH = {"sizes": "i", "corners": "i", "uv": "f", "corner_uv": "i"}
+ATTACHMENT = {"triangles": "i", "weights": "f", "offsets": "f"}
+CARRIER = {"rest": "f", "skin": "i", "anchors": "i", "wholes": "i", "whole_anchors": "i"}
+
+
+class BadTemplate(EigenheadError):
+    """A file that is no template of this project, or a damaged one."""
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(
+            f"{path} cannot be used as a template: {why}. Register it again: eigenhead template add FILE.obj "
+            f"--name {path.stem} --overwrite"
+        )
+
+
+class OtherModel(EigenheadError):
+    """A template that another model carries than the one in use."""
+
+    def __init__(self, template: "Template", model_name: str) -> None:
+        same = " of another version" if template.model_name == model_name else ""
+        super().__init__(
+            f"the template {template.name!r} was registered to the model {template.model_name!r}{same}, and the job's "
+            f"is {model_name!r}: use that model (--model), or register the mesh to this one: eigenhead template add "
+            f"{template.source} --name {template.name[:20]}-2 --model {model_name}"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Template:
+    """A mesh registered to a head model. ``mesh.vertices`` is ``carrier.rest``."""
+
+    name: str
+    source: str  # the OBJ file's name
+    source_sha256: str
+    model_name: str
+    model_sha256: str
+    mesh: PolygonMesh
+    carrier: Carrier
+    figures: Mapping[str, float] = field(default_factory=dict)  # of the registration
+
+    def check_model(self, model_name: str, model_sha256: str) -> None:
+        """Raises OtherModel."""
+        if model_sha256 != self.model_sha256:
+            raise OtherModel(self, model_name)
+
+
+def save_template(path: Path, template: Template) -> None:
+    """Writes a template file, atomically. Raises OSError."""
+    meta = {
+        "format": FORMAT,
+        "name": template.name,
+        "source": template.source,
+        "source_sha256": template.source_sha256,
+        "model_name": template.model_name,
+        "model_sha256": template.model_sha256,
+        "statements": [list(entry) for entry in template.mesh.statements],
+        "figures": dict(template.figures),
+    }
+    arrays: dict[str, Any] = {"meta": np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8)}
+    parts = ((template.mesh, MESH), (template.carrier.attachment, ATTACHMENT), (template.carrier, CARRIER))
+    for part, kinds in parts:
+        arrays |= {name: np.asarray(getattr(part, name), _stored(kind)) for name, kind in kinds.items()}
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)
+    write_atomically(path, packed.getvalue())
+
+
+def _stored(kind: str) -> type:
+    return np.int32 if kind == "i" else np.float32
+
+
+def read_template(path: Path) -> Template:
+    """A template from its file. Raises BadTemplate."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if "meta" not in file:
+                raise BadTemplate(path, "it does not carry this project's template format")
+            meta = json.loads(file["meta"].tobytes())
+            if meta.get("format") != FORMAT:
+                raise BadTemplate(path, f"format {meta.get('format')!r:.40}, wanted {FORMAT!r}")
+            kinds = MESH | ATTACHMENT | CARRIER
+            arrays = {name: np.asarray(file[name], int if kinds[name] == "i" else float) for name in kinds}
+        template = _template(meta, arrays)
+    except OSError as error:
+        raise BadTemplate(path, error.strerror or "cannot be read") from None
+    except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
+        raise BadTemplate(path, f"damaged or incomplete ({fault})") from None
+    _check(path, template)
+    return template
+
+
+def _template(meta: dict, arrays: Mapping[str, np.ndarray]) -> Template:
+    statements = tuple((int(before), str(line)) for before, line in meta["statements"])
+    mesh = PolygonMesh(
+        arrays["rest"], arrays["sizes"], arrays["corners"], arrays["uv"], arrays["corner_uv"], statements
+    )
+    carrier = Carrier(
+        rest=arrays["rest"],
+        skin=arrays["skin"],
+        attachment=Attachment(*(arrays[name] for name in ATTACHMENT)),
+        anchors=arrays["anchors"],
+        wholes=arrays["wholes"],
+        whole_anchors=arrays["whole_anchors"],
+    )
+    words = ("name", "source", "source_sha256", "model_name", "model_sha256")
+    return Template(**{word: str(meta[word]) for word in words}, mesh=mesh, carrier=carrier, figures=meta["figures"])
+
+
+def _check(path: Path, template: Template) -> None:
+    """Rows that lie outside what they index would fail a job at its end."""
+    mesh, carrier = template.mesh, template.carrier
+    count = len(carrier.rest)
+    rows = (mesh.corners, carrier.skin, carrier.anchors, carrier.whole_anchors)
+    if any(part.size and (part.min() < 0 or part.max() >= count) for part in rows):
+        raise BadTemplate(path, "it names vertices that it does not have")
+    same = len(carrier.skin) == len(carrier.attachment.triangles) == len(carrier.attachment.weights)
+    if not same or len(carrier.wholes) != count or mesh.sizes.sum() != len(mesh.corners) != len(mesh.corner_uv):
+        raise BadTemplate(path, "its arrays do not fit each other")
+    numbers = (carrier.rest, carrier.attachment.weights, carrier.attachment.offsets, mesh.uv)
+    if not all(np.isfinite(part).all() for part in numbers):
+        raise BadTemplate(path, "it holds values that are not finite")
