@@ -6,6 +6,7 @@
     turntable.png       the head from the right to the left profile
     head.obj head.mtl head.png, head.usdz, head.stl, head.3mf     on request (settings.outputs.formats)
     neutral.glb         on request: the head without its expression; posed.glb, with morphs to make others
+    head-NAME.obj       on request: the head in the vertex order of the template NAME, with its texture
 
 Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
 """
@@ -23,6 +24,8 @@ from pipeline.results.overlays import contact_sheet, difference, overlay, turnta
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.write_expression import write_expression
+from pipeline.results.write_template import write_template
+from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, refiled
 from rig.formats.glb import write_glb
@@ -35,9 +38,9 @@ SHEET_ROWS = 4  # cameras on the contact sheet
 THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and every file waits for the disk
 
 
-def write_result(folder: Path, result: Reconstruction, capture: Capture) -> None:
-    """Writes every file of the result of ``capture``, as it was read; each under a temporary name first. Raises OSError
-    where the disk is full."""
+def write_result(folder: Path, result: Reconstruction, capture: Capture, template: Template | None = None) -> None:
+    """Writes every file of the result of ``capture``, as it was read, and in the order of ``template``; each under a
+    temporary name first. Raises OSError where the disk is full."""
     capture = refiled(capture, pictures=result.pictures)
     head = head_mesh(result)
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
@@ -45,6 +48,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture) -> None
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
             *([] if result.posable is None else [pool.submit(write_expression, folder, result, result.posable)]),
+            *([] if template is None else [pool.submit(write_template, folder, result, template)]),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
         ]

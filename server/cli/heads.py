@@ -83,6 +83,9 @@ def reconstruct(
     morphs: Annotated[
         bool, typer.Option("--morphs", help="Write posed.glb too, with morph targets under Apple's names.")
     ] = False,
+    template: Annotated[
+        str | None, typer.Option(help="Write head-NAME.obj too, in the vertex order of this template.", metavar="NAME")
+    ] = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
     json_out: Json = False,
@@ -93,13 +96,14 @@ def reconstruct(
     switches = {"obj": obj, "atlas": atlas, "delight": delight, "neutral": neutral, "morphs": morphs}
     outputs: dict[str, object] = {name: True for name, asked in switches.items() if asked}
     outputs |= {"surface": surface} if surface else {}
+    outputs |= {"template": template} if template else {}
     outputs |= {"formats": formats.split(",")} if formats else {}
     document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
     for warning in written["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
-    made = [out / name for name in ("head.ply", "bust.ply") if (out / name).is_file()]
+    made = [out / name for name in ("head.ply", "bust.ply", f"head-{template}.obj") if (out / name).is_file()]
     answer(written, json_out, [str(path) for path in made])
 
 
@@ -308,7 +312,7 @@ def experiments(
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
             "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, planted, "
-            "surfaces, texture, light or real."
+            "surfaces, texture, light, templates or real."
         ),
     ],
     folders: Annotated[

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from rig.errors import EigenheadError
-from server.cli import cameras, heads, models, rig, service
+from server.cli import cameras, heads, models, rig, service, templates
 from server.cli.answers import fail
 
 app = typer.Typer(
@@ -19,7 +19,8 @@ app = typer.Typer(
 )
 for room in (service, heads, cameras):
     app.add_typer(room.app)
-for group, name in ((service.keys_app, "keys"), (rig.rig_app, "rig"), (models.model_app, "model")):
+groups = {"keys": service.keys_app, "rig": rig.rig_app, "model": models.model_app, "template": templates.template_app}
+for name, group in groups.items():
     app.add_typer(group, name=name)
 
 

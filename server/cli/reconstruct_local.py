@@ -68,6 +68,7 @@ def _reconstruct_folder(
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
+    from pipeline.templates.load import load_template
     from rig.render.renderer import Renderer
     from server.tasks.stage_durations import StageDurations
 
@@ -80,12 +81,13 @@ def _reconstruct_folder(
 
     tell("read", 0.0)
     head_model = load_model(model or "default")
+    template = load_template(chosen.outputs.template, head_model)
     with Renderer.create() as renderer:
         segment = partial(keep_masks, kept)
         done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=segment)
     done = replace(done, warnings=(*prepared.warnings, *done.warnings))
     tell("write", 0.0)
-    write_result(out, done, shot)
+    write_result(out, done, shot, template)
     durations.learn(chosen, progress.finish())
 
 

@@ -19,12 +19,13 @@ class Work:
     webhook: JobWebhook | None = None
 
     def check(self) -> None:
-        """Raises InputError naming an unknown model and every wrong setting, before a job fails by it hours later."""
+        """Raises InputError naming an unknown model or template and every wrong setting, before a job fails by it hours
+        later."""
         from pipeline.eigenheads.model_names import list_models
 
         known, settings_fault = list_models(), None
         try:
-            settings_from_document(self.settings or {})
+            _check_template(settings_from_document(self.settings or {}).outputs.template)
         except InputError as error:
             settings_fault = error
         if self.model is not None and self.model != "default" and self.model not in known:
@@ -34,3 +35,10 @@ class Work:
             raise InputError("request", [f"model: {fault}", *(f"settings: {f}" for f in settings_fault.faults)])
         if settings_fault is not None:
             raise settings_fault
+
+
+def _check_template(name: str | None) -> None:
+    from pipeline.templates.names import UnknownTemplate, list_templates
+
+    if name is not None and name not in list_templates():
+        raise InputError("settings", [f"outputs.template: {UnknownTemplate(name)}"])

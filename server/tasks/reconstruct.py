@@ -48,6 +48,7 @@ def reconstruct_capture(
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
     from pipeline.settings import settings_from_document
+    from pipeline.templates.load import load_template
     from rig.formats.capture_folder import read_capture
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
@@ -58,6 +59,7 @@ def reconstruct_capture(
     bench.keep(f"loops {kind}", lambda: prepare_kernels(lambda _, share: report("compiling", share), chosen))
     name = model or "default"
     head_model = bench.keep(f"model {name}", lambda: load_model(name))
+    template = load_template(chosen.outputs.template, head_model)
     renderer = bench.keep("renderer", Renderer.create)
     shot, rig = read_capture(Path(capture))
 
@@ -67,4 +69,4 @@ def reconstruct_capture(
 
     done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=once)
     report("write", 0.0)
-    write_result(Path(result), done, shot)
+    write_result(Path(result), done, shot, template)

@@ -91,7 +91,7 @@ def test_a_model_of_the_users_own_is_removed_and_no_other_file(run: Run, tmp_pat
     assert sorted(path.name for path in (tmp_path / "heads").rglob("*")) == ["models", "other.npz"]
 
 
-@pytest.mark.parametrize("group", [[], ["keys"], ["rig"], ["model"]])
+@pytest.mark.parametrize("group", [[], ["keys"], ["rig"], ["model"], ["template"]])
 def test_no_summary_of_a_command_is_cut_off(run: Run, group: list[str]) -> None:
     listed = run(*group, "--help").out.partition("Commands:")[2]
     assert listed.strip()

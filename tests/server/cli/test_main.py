@@ -28,6 +28,7 @@ COMMANDS = [
     ),
     *("keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
     *("model list", "model info", "model import", "model remove"),
+    *("template add", "template list", "template remove"),
 ]
 
 

@@ -1,0 +1,37 @@
+"""A registered template beside the model that carries it, to be looked at before it is used."""
+
+import numpy as np
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.results.clay import SKIN, clay
+from pipeline.results.overlays import ImageRgb, contact_sheet
+from pipeline.templates.registration import Registration
+from pipeline.templates.template_file import Template
+from rig.mesh import Mesh
+
+DEEP, WHOLE = (120, 150, 214), (120, 204, 150)  # what follows the skin, and what moves as a whole
+AZIMUTHS_DEG = (0.0, 55.0)
+
+
+def template_picture(template: Template, found: Registration, model: HeadModel) -> ImageRgb:
+    """From the front and the side: the mesh as it came, the model made like it, the mesh drawn onto that (blue: follows
+    the skin about it; green: moves as a whole), the mesh on the model's mean head, and that head."""
+    faces, triangles = model.levels["full"].faces, template.mesh.triangles()
+    mean = model.vertices(np.zeros(0))
+    kinds = np.tile(np.array(DEEP), (len(found.carrier.rest), 1))
+    kinds[found.carrier.skin] = SKIN
+    kinds[found.carrier.wholes >= 0] = WHOLE
+    panels = (
+        ("as it came", Mesh(found.placed, triangles), None),
+        ("the model like it", Mesh(found.head, faces), None),
+        ("registered", Mesh(found.carrier.rest, triangles), kinds.astype(np.uint8)),
+        ("on the mean head", Mesh(found.carrier.on(mean, faces), triangles), None),
+        ("the mean head", Mesh(mean, faces), None),
+    )
+    low = np.min([mesh.vertices.min(axis=0) for _, mesh, _ in panels[1:2]] + [mean.min(axis=0)], axis=0)
+    high = np.max([mesh.vertices.max(axis=0) for _, mesh, _ in panels[1:2]] + [mean.max(axis=0)], axis=0)
+    rows = [
+        [(text, clay(mesh, colours=kind, azimuth_deg=turn, box=(low, high))) for text, mesh, kind in panels]
+        for turn in AZIMUTHS_DEG
+    ]
+    return contact_sheet(rows)

@@ -1,0 +1,92 @@
+"""``head-NAME.obj`` of a result: the head in a template's vertex order, polygons, groups and texture coordinates.
+
+World frame, mm, as head.ply and head.obj are. With a texture and texture coordinates of the template, its skin has one
+(head-NAME.mtl, head-NAME.jpg, a tile more a file); else vertices have their colours.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.results.head_files import ENCODINGS
+from pipeline.results.metadata import ply_comments
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.templates.template_file import Template
+from pipeline.texture.template_texture import Tile, corner_tiles, skin_polygons, template_textures
+from rig.atomic_write import write_atomically
+from rig.formats.obj import MATERIAL
+from rig.formats.polygon_obj import PolygonMesh, polygon_obj_bytes
+from rig.mesh import vertex_normals
+
+NO_SKIN = 200  # grey of what no photograph shows
+SKIN_SHARE = 0.1  # of a material's polygons on the skin, beyond which it shows the texture: shoulders may be the rest
+
+
+def write_template(folder: Path, result: Reconstruction, template: Template) -> None:
+    """Writes the files. Raises OSError."""
+    head, carrier, name = result.mesh_world, template.carrier, f"head-{template.name}"
+    vertices = carrier.on(head.vertices, head.faces)
+    textures = {} if result.atlas is None else template_textures(result.atlas, template.mesh, carrier)
+    suffix, _, options = ENCODINGS["png" if result.settings.outputs.image == "png" else "jpeg"]
+    files = {tile: f"{name}{_tile_suffix(tile)}{suffix}" for tile in textures}
+    for tile, image in textures.items():
+        _, data = cv2.imencode(suffix, np.ascontiguousarray(image[:, :, ::-1]), list(options))
+        write_atomically(folder / files[tile], data.tobytes())
+    mesh, library = template.mesh, None
+    if textures:
+        mesh, materials = _materials(template, files)
+        library = f"{name}.mtl"
+        write_atomically(folder / library, materials)
+    comments = [
+        *(line for line in ply_comments(result) if not line.startswith("quality")),
+        f"template {template.name} sha256 {template.source_sha256}",
+    ]
+    data = polygon_obj_bytes(
+        mesh,
+        vertices,
+        vertex_normals(vertices, mesh.triangles()),
+        colours=None if textures else _colours(result, template),
+        comments=comments,
+        library=library,
+    )
+    write_atomically(folder / f"{name}.obj", data)
+
+
+def _tile_suffix(tile: Tile) -> str:
+    """UDIM's number, of all tiles but the first."""
+    return "" if tile == (0, 0) else f"-{1001 + tile[0] + 10 * tile[1]}"
+
+
+def _colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
+    attached = template.carrier.attachment
+    corners = result.colours[result.mesh_world.faces[attached.triangles]].astype(float)
+    out = np.full((len(template.carrier.rest), 3), NO_SKIN, np.uint8)
+    out[template.carrier.skin] = np.clip(np.rint(np.einsum("nk,nkc->nc", attached.weights, corners)), 0, 255)
+    return out
+
+
+def _materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
+    """The mesh with a material wherever its file had one, or one in all where it had none; and the library: materials
+    of the skin show the image of the tile in which they lie."""
+    mesh = template.mesh
+    tiles, skin = corner_tiles(mesh), skin_polygons(mesh, template.carrier)
+    used = [(before, line.partition(" ")[2]) for before, line in mesh.statements if line.startswith("usemtl ")]
+    if not used or used[0][0] > 0:
+        used.insert(0, (0, MATERIAL))
+        statements = ((0, f"usemtl {MATERIAL}"), *mesh.statements)
+        mesh = PolygonMesh(mesh.vertices, mesh.sizes, mesh.corners, mesh.uv, mesh.corner_uv, statements)
+    ends = [before for before, _ in used[1:]] + [len(mesh.sizes)]
+    shown: dict[str, str | None] = {}
+    for (first, material), last in zip(used, ends, strict=True):
+        part = slice(first, last)
+        counted: dict[Tile, int] = {tile: int((skin[part] & (tiles[part] == tile).all(axis=1)).sum()) for tile in files}
+        best = max(counted, key=lambda tile, of=counted: of[tile])
+        image = files[best] if counted[best] > SKIN_SHARE * (last - first) else None
+        shown[material] = shown.get(material) or image
+    lines = []
+    for material, image in shown.items():
+        lines += [f"newmtl {material}", "Ka 1 1 1", "Kd 1 1 1" if image else "Kd 0.8 0.8 0.8", "Ks 0.04 0.04 0.04"]
+        lines += ["Ns 20", "illum 2", *([f"map_Kd {image}"] if image else []), ""]
+    return mesh, "\n".join(lines).encode()

@@ -1,0 +1,104 @@
+"""Commands about templates, meshes in whose vertex order results are written: template add, list, remove."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, prepare_file, progress_bar
+
+template_app = typer.Typer(
+    help="Meshes in whose vertex order results are written.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+@template_app.command("add", epilog="Example: eigenhead template add flame.obj --name flame --model default")
+def template_add(
+    file: Annotated[Path, typer.Argument(help="The mesh, an OBJ file of a human head.", exists=True, dir_okay=False)],
+    name: Annotated[str | None, typer.Option(help="What to call it; by default the file's name.")] = None,
+    model: Annotated[str, typer.Option(help="The head model that carries it, a name or file.")] = "default",
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of the mesh, .json, .pp or .ljson: 4 or more of docs/models.md. By default the file beside it.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Register a mesh to a head model, once.
+
+    Its unit and axes are found, or told by landmarks. Look at the picture that is written beside it: skin must lie on
+    skin. `reconstruct --template NAME` then writes heads in its vertex order, with its polygons and texture
+    coordinates. The file stays under its own licence."""
+    from pipeline.templates.names import new_path
+
+    path = new_path(name or file.stem)
+    if path.exists() and not overwrite:
+        raise Overwrites(path)
+    prepare_file(path)
+    from pipeline.eigenheads.correspondence.scans import landmark_file, read_landmarks
+    from pipeline.eigenheads.model import load_model
+    from pipeline.results.template_picture import template_picture
+    from pipeline.templates.load import make_template
+    from pipeline.templates.template_file import save_template
+    from rig.formats.images import write_image
+
+    marked = landmarks or landmark_file(file)
+    points = read_landmarks(marked) if marked else None
+    head_model = load_model(model)
+    with progress_bar() as report:
+        template, found = make_template(file, path.stem, head_model, landmarks=points, report=report)
+        picture = path.with_suffix(".png")
+        write_image(picture, template_picture(template, found, head_model))
+        save_template(path, template)
+    document = {"name": path.stem, "file": str(path), "picture": str(picture), "model": head_model.name}
+    answer(
+        document | {"figures": template.figures},
+        json_out,
+        [f"{path.stem}  {path}", *_told(template.figures), str(picture)],
+    )
+
+
+def _told(figures: Mapping[str, float]) -> list[str]:
+    count, unlike = figures["vertices"], figures["unlike_median_mm"]
+    return [
+        f"{count:.0f} vertices, {figures['skin_share']:.0%} of them on the model's skin; the others follow it",
+        f"shows {figures['face_covered_share']:.0%} of the model's face",
+        f"the model comes as near as {unlike:.2f} mm (median), {figures['unlike_p95_mm']:.2f} (95 %)",
+        f"drawn onto it: {figures['off_median_mm']:.3f} mm (median), {figures['off_p95_mm']:.3f} (95 %)",
+    ]
+
+
+@template_app.command("list", epilog="Example: eigenhead template list")
+def template_list(data: Data = None, json_out: Json = False) -> None:
+    """List the templates at hand, and the models that carry them."""
+    from pipeline.templates.names import list_templates
+    from pipeline.templates.template_file import BadTemplate, read_template
+
+    found, lines = {}, []
+    for name, path in list_templates().items():
+        try:
+            template = read_template(path)
+        except BadTemplate as error:
+            found[name], told = {"file": str(path), "fault": str(error)}, "damaged"
+        else:
+            found[name] = {"file": str(path), "model": template.model_name, "vertices": len(template.carrier.rest)}
+            told = template.model_name
+        lines.append(f"{name}  {told}  {path}")
+    answer({"templates": found}, json_out, lines)
+
+
+@template_app.command("remove", epilog="Example: eigenhead template remove flame")
+def template_remove(
+    name: Annotated[str, typer.Argument(help="A template of the list.")], data: Data = None, json_out: Json = False
+) -> None:
+    """Remove a template and its picture."""
+    from pipeline.templates.names import remove_template
+
+    path = remove_template(name)
+    answer({"name": name, "file": str(path)}, json_out, [f"removed {path}"])

@@ -1,0 +1,64 @@
+"""Commands about templates."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.eigenheads.model import load_model
+from rig.errors import EigenheadError, InputError
+from rig.formats.ply import read_head_ply
+from rig.formats.polygon_obj import read_polygons
+from server.cli.main import app
+from tests.support.shared_data import shared
+
+
+def command(*words: str, data: Path) -> subprocess.CompletedProcess[str]:
+    given = [sys.executable, "-m", "server.cli", *words]
+    environment = {**os.environ, "EIGENHEAD_DATA": str(data)}
+    return subprocess.run(given, capture_output=True, text=True, timeout=600, env=environment)
+
+
+def test_wrong_files_and_names_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.obj"
+    bad.write_text("v 0 0 nan\n")
+    here = ["--data", str(tmp_path / "data")]
+    for words, kind, told in (
+        (["template", "add", str(bad)], InputError, "holds no faces"),
+        (["template", "add", str(bad), "--name", "../x"], EigenheadError, "cannot be a template's name"),
+        (["template", "remove", "nobody"], EigenheadError, "known are none"),
+    ):
+        done = CliRunner().invoke(app, [*words, *here])
+        assert isinstance(done.exception, kind)
+        assert told in str(done.exception)
+    assert not list((tmp_path / "data").rglob("*.npz"))
+    assert json.loads(CliRunner().invoke(app, ["template", "list", "--json", *here]).stdout) == {"templates": {}}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_head_is_written_in_a_templates_order(tmp_path: Path) -> None:
+    """The model's own 5 % level is the foreign mesh: its vertices are vertices of head.ply."""
+    model, data = load_model(), tmp_path / "data"
+    level, order = model.levels["p95"], np.random.default_rng(5).permutation(model.levels["p95"].count)
+    shape, faces = model.vertices(np.zeros(0), "p95")[order] / 10.0, np.argsort(order)[level.faces] + 1
+    lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in shape] + [f"f {a} {b} {c}" for a, b, c in faces]
+    (tmp_path / "low.obj").write_text("\n".join(lines))
+    added = command("template", "add", str(tmp_path / "low.obj"), "--json", data=data)
+    assert added.returncode == 0, added.stderr
+    told = json.loads(added.stdout)
+    assert told["figures"]["skin_share"] > 0.9
+    assert {path.name for path in (data / "templates").iterdir()} == {"low.npz", "low.png"}
+    again = command("template", "add", str(tmp_path / "low.obj"), data=data)
+    assert (again.returncode, "--overwrite" in again.stderr) == (1, True)
+    given = ["reconstruct", str(shared("data/captures/scan-a")), "--detail", "span", "--surface", "head"]
+    done = command(*given, "--template", "low", "--formats", "ply", "--out", str(tmp_path / "out"), data=data)
+    assert done.returncode == 0, done.stderr
+    head = read_head_ply(tmp_path / "out" / "head.ply")[0].vertices[level.rows[order]]
+    written = read_polygons(tmp_path / "out" / "head-low.obj")
+    assert np.median(np.linalg.norm(written.vertices - head, axis=1)) < 0.15  # chords of 9 mm sag by 0.1 mm
