@@ -27,6 +27,7 @@ from pipeline.experiments.posterior_check import posterior_check
 from pipeline.experiments.repeat import repeat
 from pipeline.experiments.robustness import robustness
 from pipeline.experiments.surfaces import surfaces
+from pipeline.experiments.templates import templates
 from pipeline.experiments.texture import texture
 from pipeline.experiments.views import views
 from pipeline.experiments.visible import visible
@@ -197,6 +198,12 @@ def _surfaces(task: Task) -> Outcome:
         )
 
 
+def _templates(task: Task) -> Outcome:
+    count = {"draws": task.subjects} if task.subjects else {}
+    facekit = _facekit(task.shared)
+    return templates({"default": task.head}, facekit, report=task.report, folder=task.folder, **count)
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
@@ -228,6 +235,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "surfaces": _surfaces,
     "texture": _texture,
     "light": _drawn(light),
+    "templates": _templates,
 }
 
 
