@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
-from rig.formats.capture_folder import capture_root
+from rig.formats.capture_folder import BESIDE_PICTURES, capture_root
 from rig.formats.images import IMAGE_SUFFIXES
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
@@ -38,7 +38,8 @@ def find_photographs(folder: Path) -> Photographs:
     root = capture_root(folder)
     root = root / "images" if (root / "images").is_dir() else root
     flat = _pictures(root)
-    folders = {path.name: _pictures(path) for path in sorted(root.iterdir()) if path.is_dir()}
+    beside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name not in BESIDE_PICTURES]
+    folders = {path.name: _pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:
         told = "photographs beside folders of photographs: put one picture a camera, or one folder a camera"

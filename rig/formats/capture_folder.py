@@ -30,6 +30,7 @@ from rig.plausibility import rig_faults
 from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera
+BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
 
 
 def read_capture(folder: Path) -> tuple[Capture, Rig]:
@@ -66,7 +67,7 @@ def capture_root(folder: Path) -> Path:
 def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
     """The images of a folder for a known rig; appends every fault to ``faults``."""
     jobs: list[tuple[str, str, Path]] = []
-    pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in ("masks", "background"))
+    pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
     for camera in rig:
         image = _image_file(pictures, camera.name, faults) or _only_picture(pictures / camera.name, faults)
         mask = _image_file(folder / "masks", camera.name, faults)

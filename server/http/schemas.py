@@ -160,6 +160,13 @@ class FaultOut(Answer):
     remedy: str
 
 
+class WarningOut(Answer):
+    """As in report.json."""
+
+    code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")
+    message: str
+
+
 class CaptureOut(Answer):
     id: str
     created: Moment
@@ -178,6 +185,9 @@ class CaptureOut(Answer):
         None, description="good: no fault; poor: shoot again; null: not judged (of the board, or of an earlier version)"
     )
     faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
+    warnings: list[WarningOut] = Field(
+        default_factory=list, description="of cameras that were found from the photographs; report.json repeats them"
+    )
 
 
 class SessionOut(Answer):

@@ -6,7 +6,7 @@ calibration.html; then masks/. A second run with the same photographs takes them
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -68,10 +68,8 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Re
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Report) -> tuple[ReportWarning, ...]:
     """Leaves cameras.json and its report in ``kept``, unless they are there and of the same photographs."""
     made_of = _made_of(root, front)
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
-        if document["made_of"] == made_of and document["cameras_sha256"] == _sha256(kept / CAMERAS):
-            return tuple(ReportWarning(told["code"], told["message"]) for told in document["told"])
+    if (told_before := calibration_warnings(kept, made_of)) is not None:
+        return told_before
     from calibration.scene.report import write_scene_report
     from calibration.scene.scene import calibrate_scene
 
@@ -95,6 +93,17 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     }
     write_atomically(kept / FIGURES, json.dumps(document, indent=1).encode())
     return tuple(told)
+
+
+def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -> tuple[ReportWarning, ...] | None:
+    """What was said when the cameras beside it were found, as ``calibrate_photographs`` left it; None where they were
+    not found from photographs, or not from those of ``made_of``."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
+        same = made_of is None or document["made_of"] == made_of
+        if same and document["cameras_sha256"] == _sha256(kept / CAMERAS):
+            return tuple(ReportWarning(told["code"], told["message"]) for told in document["told"])
+    return None
 
 
 def keep_masks(

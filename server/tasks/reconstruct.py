@@ -1,6 +1,7 @@
 """What a job runs in a worker's child process: files in, ``reconstruct()``, files out."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -51,6 +52,7 @@ def reconstruct_capture(
     from rig.formats.capture_folder import read_capture
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
+    from server.tasks.photographs import calibration_warnings
     from server.tasks.prepare import prepare_kernels
 
     chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
@@ -67,4 +69,6 @@ def reconstruct_capture(
 
     done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=once)
     report("write", 0.0)
+    told = calibration_warnings(Path(capture)) or ()
+    done = replace(done, warnings=(*told, *done.warnings))
     write_result(Path(result), done, shot)
