@@ -23,6 +23,7 @@ from pipeline.eigenheads.model import load_model
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.formats.scale_json import read_scale
+from rig.formats.serials import with_serials
 from rig.rig import Rig
 
 Report = Callable[[str, float], None]
@@ -62,7 +63,9 @@ def calibrate_scene(
     report("scale", 0.0)
     head = np.zeros((0, 3)) if known is not None else load_model().cage(np.zeros(0))
     found = find_scale(structure, known, photographs, head)
-    return placed(structure, found, matches, left_out, front)
+    calibration = placed(structure, found, matches, left_out, front)
+    first = {name: next(iter(photographs.files[name].values())) for name in calibration.rig.names}
+    return replace(calibration, rig=with_serials(calibration.rig, first))
 
 
 def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, str]]:

@@ -7,14 +7,17 @@ features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
 
 Without background/ and masks/ altogether the subject is found from the photographs. Without images/ the pictures lie
-beside cameras.json; a folder of a camera's name may hold its one picture, whatever that is called.
+beside cameras.json; a folder of a camera's name may hold its one picture, whatever that is called; and so may a picture
+be called whose EXIF has the serial number of a camera (``rig.formats.serials``).
 """
 
 import hashlib
 import json
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -25,6 +28,7 @@ from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_f
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, write_image
+from rig.formats.serials import pictures_by_serial
 from rig.formats.unread_keys import unread_keys
 from rig.plausibility import rig_faults
 from rig.rig import Rig
@@ -46,7 +50,7 @@ def read_capture(folder: Path) -> tuple[Capture, Rig]:
     except InputError as error:
         raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
     faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
-    capture = read_shot(folder, rig, faults)
+    capture = read_shot(folder, rig, faults, by_serial(folder, rig, faults))
     if faults:
         raise InputError("capture", faults)
     digests = dict(capture.digests)
@@ -64,14 +68,25 @@ def capture_root(folder: Path) -> Path:
     return entries[0] if len(entries) == 1 and entries[0].is_dir() and entries[0].name != "sparse" else folder
 
 
-def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
-    """The images of a folder for a known rig; appends every fault to ``faults``."""
+def by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, dict[str, Path]]:
+    """Pictures and plates that do not have their camera's name but its body's serial number, by kind and camera."""
+    folders = {"images": picture_folder(folder), "background": folder / "background"}
+    return {kind: pictures_by_serial(inner, rig, faults) for kind, inner in folders.items() if inner.is_dir()}
+
+
+def read_shot(
+    folder: Path, rig: Rig, faults: list[str], filed: Mapping[str, Mapping[str, Path]] = MappingProxyType({})
+) -> Capture:
+    """The images of a folder for a known rig; appends every fault to ``faults``. ``filed``: files that do not have
+    their camera's name, as ``by_serial`` finds them."""
     jobs: list[tuple[str, str, Path]] = []
     pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
     for camera in rig:
         image = _image_file(pictures, camera.name, faults) or _only_picture(pictures / camera.name, faults)
+        image = image or filed.get("images", {}).get(camera.name)
         mask = _image_file(folder / "masks", camera.name, faults)
         plates = _plate_files(folder / "background", camera.name, faults)
+        plates = plates or [path for name, path in filed.get("background", {}).items() if name == camera.name]
         if image is None:
             faults.append(f"{_inside(folder, pictures)}{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)")
         if not plates and mask is None and not alone:

@@ -106,7 +106,7 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
         with _raw(data) as raw:
             return (raw.sizes.width, raw.sizes.height), b""
     if suffix in HEIC_SUFFIXES:
-        header = _heif(data)
+        header = heif_header(data)
         return header.size, header.info.get("icc_profile") or b""
     with Image.open(BytesIO(data), formats=IMAGE_FORMATS) as header:  # reads the header only
         return header.size, header.info.get("icc_profile") or b""
@@ -118,7 +118,7 @@ def _decoded(data: bytes, suffix: str, *, grey: bool) -> np.ndarray:
             # As the camera balanced it, no brightness of each picture's own: eleven cameras must stay comparable.
             pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8, user_flip=0)
     elif suffix in HEIC_SUFFIXES:
-        pixels = np.asarray(_heif(data).to_pillow().convert("RGB"))
+        pixels = np.asarray(heif_header(data).to_pillow().convert("RGB"))
     else:
         flags = (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB) | cv2.IMREAD_IGNORE_ORIENTATION
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -139,7 +139,8 @@ def _raw(data: bytes) -> Iterator[Any]:
         raise ValueError(str(error)) from error
 
 
-def _heif(data: bytes) -> Any:
+def heif_header(data: bytes) -> Any:
+    """A HEIC file, of which nothing is decoded yet. Raises InputError without the extra."""
     try:
         import pi_heif
     except ModuleNotFoundError:

@@ -23,6 +23,7 @@ from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import (
     BESIDE_PICTURES,
+    by_serial,
     capture_root,
     picture_folder,
     read_shot,
@@ -53,6 +54,7 @@ def ingest_archive(
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
     told = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
+    _name_by_camera(root)
     described = check_capture(root, image_pixels, report)
     if told is not None:
         described = _with_calibration(described, root, told)
@@ -80,6 +82,28 @@ def _calibrate(root: Path, image_pixels: int, report: Report) -> tuple[ReportWar
         raise InputError("capture", [told, *refusal.reasons]) from refusal
     _leave_out(root, read_rig(root / CAMERAS))
     return told
+
+
+def _name_by_camera(root: Path) -> None:
+    """Gives pictures that have their body's serial number the name of their camera, by which the service asks for
+    them. Raises InputError where that cannot be told."""
+    for files in filed_by_serial(root).values():
+        for name, path in files.items():
+            path.rename(path.with_name(name + path.suffix.lower()))
+
+
+def filed_by_serial(root: Path) -> dict[str, dict[str, Path]]:
+    """``by_serial`` of a capture folder; nothing where its cameras cannot be read, which ``check_capture`` tells.
+    Raises InputError."""
+    rig_file, faults = find_rig_file(root), list[str]()
+    try:
+        rig = None if rig_file is None else read_rig_file(rig_file)
+    except InputError:
+        return {}
+    found = {} if rig is None else by_serial(root, rig, faults)
+    if faults:
+        raise InputError("capture", faults)
+    return found
 
 
 def _leave_out(root: Path, rig: Rig) -> None:
