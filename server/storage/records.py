@@ -77,13 +77,14 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRecord:
-    """``pictures``: their number by camera."""
+    """``pictures``: their number by camera; ``kind``: of what, board or scene."""
 
     id: str
     created: str
     source: str
     label: str
     pictures: dict[str, int]
+    kind: str = "board"
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ from rig.plausibility import rig_faults
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import Bench, Report
-from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, photographs_alone
+from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, check_sizes, photographs_alone
 
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -71,10 +71,7 @@ def _calibrate(root: Path, image_pixels: int, report: Report) -> tuple[ReportWar
     from calibration.result import CalibrationRefused
 
     files = [path for path in picture_folder(root).rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
-    sizes = {path: picture_size(path) for path in files}  # headers, before anything is decoded
-    huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
-    if huge:
-        raise InputError("capture", [f"{fault}; at most {image_pixels:,} pixels are accepted" for fault in huge])
+    check_sizes(files, image_pixels)
     try:
         told = calibrate_photographs(root, root, front=None, report=report)
     except CalibrationRefused as refusal:

@@ -6,7 +6,7 @@ calibration.html; then masks/. A second run with the same photographs takes them
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file
 from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.capture_folder import capture_root, picture_folder, read_capture, read_shot
-from rig.formats.images import IMAGE_SUFFIXES, write_image
+from rig.formats.images import IMAGE_SUFFIXES, picture_size, write_image
 from rig.rig import Rig
 
 Report = Callable[[str, float], None]
@@ -104,6 +104,14 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
         if same and document["cameras_sha256"] == _sha256(kept / CAMERAS):
             return tuple(ReportWarning(told["code"], told["message"]) for told in document["told"])
     return None
+
+
+def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
+    """Sizes as the headers say, before anything is decoded. Raises InputError naming every one that is too large."""
+    sizes = {path: picture_size(path) for path in files}
+    huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
+    if huge:
+        raise InputError("capture", [f"{fault}; at most {image_pixels:,} pixels are accepted" for fault in huge])
 
 
 def keep_masks(
