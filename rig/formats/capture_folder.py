@@ -131,7 +131,7 @@ def _inside(folder: Path, pictures: Path) -> str:
 
 def _only_picture(folder: Path, faults: list[str]) -> Path | None:
     """The picture in a camera's own folder."""
-    found = _listed(folder)
+    found = listed_pictures(folder)
     if len(found) > 1:
         told = f"{folder.name}/ holds {len(found)} pictures; a capture is one shot: leave one of them"
         faults.append(f"{told}, and give all to calibrate --from scene")
@@ -194,7 +194,7 @@ def size_fault(where: str, size: tuple[int, int], wanted: tuple[int, int]) -> st
 
 def stray_faults(folder: Path, rig: Rig) -> list[str]:
     """Pictures, masks and clean plates that belong to no camera of the rig."""
-    files = [path for kind in ("images", "masks", "background") for path in _listed(folder / kind)]
+    files = [path for kind in ("images", "masks", "background") for path in listed_pictures(folder / kind)]
     return [
         f"{path.relative_to(folder).as_posix()} has no camera: the rig has {', '.join(rig.names)}"
         for path in files
@@ -203,7 +203,7 @@ def stray_faults(folder: Path, rig: Rig) -> list[str]:
 
 
 def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
-    found = [path for path in _listed(folder) if path.stem == stem and path.is_file()]
+    found = [path for path in listed_pictures(folder) if path.stem == stem and path.is_file()]
     if len(found) > 1:
         faults.append(f"{folder.name}/ holds {' and '.join(path.name for path in found)}: which one is meant?")
     return found[0] if found else None
@@ -211,11 +211,12 @@ def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
 
 def _plate_files(folder: Path, stem: str, faults: list[str]) -> list[Path]:
     single = _image_file(folder, stem, faults)
-    several = _listed(folder / stem)[:PLATES_MOST]
+    several = listed_pictures(folder / stem)[:PLATES_MOST]
     return [single] if single is not None else several
 
 
-def _listed(folder: Path) -> list[Path]:
+def listed_pictures(folder: Path) -> list[Path]:
+    """The pictures in a folder; none where there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))

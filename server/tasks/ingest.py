@@ -7,6 +7,7 @@ import hashlib
 import json
 import shutil
 from dataclasses import replace
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from rig.formats.capture_folder import (
     BESIDE_PICTURES,
     by_serial,
     capture_root,
+    listed_pictures,
     picture_folder,
     read_shot,
     size_fault,
@@ -82,11 +84,19 @@ def _calibrate(root: Path, image_pixels: int, report: Report) -> tuple[ReportWar
 
 
 def _name_by_camera(root: Path) -> None:
-    """Gives pictures that have their body's serial number the name of their camera, by which the service asks for
-    them. Raises InputError where that cannot be told."""
+    """Gives pictures the names by which the service asks for them, images/<camera>.<ext>, wherever the archive has them
+    and whatever it calls those that have their body's serial number. Raises InputError where that cannot be told."""
     for files in filed_by_serial(root).values():
         for name, path in files.items():
             path.rename(path.with_name(name + path.suffix.lower()))
+    pictures, images = picture_folder(root), root / "images"
+    images.mkdir(exist_ok=True)
+    for path in [*pictures.iterdir()]:
+        own = listed_pictures(path) if path.is_dir() and path.name not in (*BESIDE_PICTURES, "images") else []
+        if len(own) == 1 and not any(images.glob(f"{escape(path.name)}.*")):  # a camera's folder
+            own[0].rename(images / (path.name + own[0].suffix))
+        elif path.parent != images and path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
+            path.rename(images / path.name)
 
 
 def filed_by_serial(root: Path) -> dict[str, dict[str, Path]]:

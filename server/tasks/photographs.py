@@ -77,7 +77,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     found = calibrate_scene(root, scale=scale if scale.is_file() else None, front=front, report=report)
     told = [ReportWarning("view-left-out", why) for why in found.left_out.values()]
     if found.scale.assumed:
-        told.append(ReportWarning("scale-assumed", f"the scale is {found.scale.told}; give scale.json to know it"))
+        told.append(ReportWarning("scale-assumed", f"the scale is {found.scale.told}"))
     rig = found.rig
     if len(rig) > CAMERAS_MOST:
         rig = rig.subset(spread_views(rig, CAMERAS_MOST))

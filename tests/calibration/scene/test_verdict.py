@@ -1,4 +1,4 @@
-"""Whether a rig should be given what its photographs told: by the weakest camera, and never good on an assumed scale."""
+"""Whether a rig should be given what its photographs told: by the weakest camera, never good on an assumed scale."""
 
 from dataclasses import replace
 

@@ -1,6 +1,7 @@
 """Uploads of photographs alone, over HTTP: calibrated at the door, told as on the command line, or refused by name."""
 
 import json
+import shutil
 from pathlib import Path
 
 import httpx
@@ -45,6 +46,14 @@ def test_the_cameras_of_photographs_are_found_and_what_was_assumed_is_told(http:
     assert http.get(f"/v1/captures/{capture['id']}").json()["warnings"] == capture["warnings"]
     assert await_state(http, http.post("/v1/jobs", json={"capture_id": capture["id"]}).json()["id"], ("succeeded",))
 
+    assert http.get(f"/v1/captures/{capture['id']}/images/cam00").status_code == 200
+    for path in [*(photos / "images").iterdir()]:  # beside scale.json
+        path.rename(photos / path.name)
+    (photos / "images").rmdir()
+    (photos / "dark.png").unlink()
+    shutil.rmtree(photos / "masks")
     (photos / "scale.json").write_text(json.dumps({"tag": {"dictionary": "DICT_4X4_50", "size_mm": TAG_MM}}))
     known = upload(http, packed(photos)).json()
-    assert [warning["code"] for warning in known["warnings"]] == ["view-left-out"]
+    assert known["warnings"] == []
+    assert "images/cam00.png" in known["inputs"]
+    assert http.get(f"/v1/captures/{known['id']}/images/cam00").status_code == 200
