@@ -27,9 +27,10 @@ from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, write_image
+from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, picture_size, write_image
 from rig.formats.serials import pictures_by_serial
 from rig.formats.unread_keys import unread_keys
+from rig.formats.work_size import at_share, work_features, work_rig, work_share
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 
@@ -37,8 +38,9 @@ PLATES_MOST = 32  # clean plates read per camera
 BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
 
 
-def read_capture(folder: Path) -> tuple[Capture, Rig]:
-    """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Raises InputError
+def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
+    """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Pictures of more
+    than ``pixels_most`` pixels come smaller, and so do their cameras (``rig.formats.work_size``). Raises InputError
     that names every fault in it."""
     faults: list[str] = []
     folder = capture_root(folder)
@@ -50,14 +52,14 @@ def read_capture(folder: Path) -> tuple[Capture, Rig]:
     except InputError as error:
         raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
     faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
-    capture = read_shot(folder, rig, faults, by_serial(folder, rig, faults))
+    capture = read_shot(folder, rig, faults, by_serial(folder, rig, faults), pixels_most=pixels_most)
     if faults:
         raise InputError("capture", faults)
     digests = dict(capture.digests)
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
-    return replace(capture, digests=ordered, remarks=unread_keys(rig_file)), rig
+    return replace(capture, digests=ordered, remarks=unread_keys(rig_file)), work_rig(rig, pixels_most)
 
 
 def capture_root(folder: Path) -> Path:
@@ -75,10 +77,15 @@ def by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, dict[str, 
 
 
 def read_shot(
-    folder: Path, rig: Rig, faults: list[str], filed: Mapping[str, Mapping[str, Path]] = MappingProxyType({})
+    folder: Path,
+    rig: Rig,
+    faults: list[str],
+    filed: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
+    *,
+    pixels_most: int | None = None,
 ) -> Capture:
-    """The images of a folder for a known rig; appends every fault to ``faults``. ``filed``: files that do not have
-    their camera's name, as ``by_serial`` finds them."""
+    """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``. ``filed``:
+    files that do not have their camera's name, as ``by_serial`` finds them."""
     jobs: list[tuple[str, str, Path]] = []
     pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
     for camera in rig:
@@ -96,7 +103,7 @@ def read_shot(
         found = [("images", image), ("masks", mask), *(("background", plate) for plate in plates)]
         jobs += [(kind, camera.name, path) for kind, path in found if path is not None]
     with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
-        decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig), jobs))
+        decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig, pixels_most=pixels_most), jobs))
     images: dict[str, np.ndarray] = {}
     masks: dict[str, np.ndarray] = {}
     backgrounds: dict[str, list[np.ndarray]] = {}
@@ -117,6 +124,7 @@ def read_shot(
         data = (folder / "features.json").read_bytes()
         digests["features.json"] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
+        features = work_features(features, rig, work_rig(rig, pixels_most))
     return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
 
 
@@ -168,21 +176,28 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
     return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
 
 
-def _decode(folder: Path, kind: str, name: str, path: Path, *, rig: Rig) -> tuple[np.ndarray | None, str, str]:
-    k = rig[name].intrinsics
-    where = path.relative_to(folder).as_posix()
-    pixels, digest, fault = decode_image_file(path, where, grey=kind == "masks")
-    if pixels is not None and pixels.shape[:2] != (k.height, k.width):
-        height, width = pixels.shape[:2]
-        return None, "", size_fault(where, (width, height), (k.width, k.height))
-    if pixels is not None and (lens := rig[name].recorded) is not None:
-        pixels = lens.undistort(pixels, k.matrix(), smooth=kind != "masks")
-    if pixels is not None and kind == "masks":
-        pixels = pixels > 0
+def _decode(
+    folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None
+) -> tuple[np.ndarray | None, str, str]:
+    camera = rig[name]
+    wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
+    where, whole = path.relative_to(folder).as_posix(), kind == "masks"
+    pixels, digest, fault = decode_image_file(path, where, grey=whole, share=1.0 if whole else share)
+    if pixels is None:
+        return None, digest, fault
+    size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
+    if size != wanted:
+        return None, "", size_fault(where, size, wanted)
+    if whole:  # whatever is not zero is the subject, so that it is told before pixels are averaged
+        pixels = at_share((pixels > 0).astype(np.uint8) * np.uint8(255), size, share)
+    if camera.recorded is not None:
+        matrix = work_rig(rig.subset([name]), pixels_most)[name].intrinsics.matrix()
+        pixels = camera.recorded.undistort(pixels, matrix, smooth=not whole)
+    if whole:
+        pixels = pixels > 127
         if not pixels.any():
             return None, "", f"{where} is empty: no pixel belongs to the subject"
-    if pixels is not None:
-        pixels.setflags(write=False)
+    pixels.setflags(write=False)
     return pixels, digest, fault
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypedDict
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
 from rig.formats.capture_folder import capture_root, read_capture
+from rig.formats.work_size import WORK_PIXELS
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
 from server.tasks.ingest import check_capture, filed_by_serial
@@ -107,7 +108,7 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[
     from pipeline.silhouettes.segment import segment
     from pipeline.silhouettes.usable_views import usable_views
 
-    shot, rig = read_capture(folder)
+    shot, rig = read_capture(folder, pixels_most=WORK_PIXELS)
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
 
     def segmented(capture: Capture) -> dict[str, "Silhouette"]:

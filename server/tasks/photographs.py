@@ -11,19 +11,23 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.spread_views import spread_views
 from pipeline.settings import SegmentationSettings
 from rig.atomic_write import write_atomically
+from rig.camera import Intrinsics
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file
 from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.capture_folder import capture_root, picture_folder, read_capture, read_shot
 from rig.formats.images import IMAGE_SUFFIXES, picture_size, write_image
+from rig.formats.work_size import WORK_PIXELS, work_rig
 from rig.rig import Rig
 
 Report = Callable[[str, float], None]
@@ -53,16 +57,16 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Re
 
     Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
     if not photographs_alone(folder):
-        return Prepared(*read_capture(folder), ())
+        return Prepared(*read_capture(folder, pixels_most=WORK_PIXELS), ())
     root = capture_root(folder)
     kept.mkdir(parents=True, exist_ok=True)
     warnings = calibrate_photographs(root, kept, front=front, report=report)
     rig, faults = read_rig(kept / CAMERAS), list[str]()
-    capture = read_shot(root, rig, faults)
+    capture = read_shot(root, rig, faults, pixels_most=WORK_PIXELS)
     if faults:
         raise InputError("capture", faults)
     digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
-    return Prepared(replace(capture, digests=dict(sorted(digests.items()))), rig, warnings)
+    return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Report) -> tuple[ReportWarning, ...]:
@@ -126,6 +130,7 @@ def keep_masks(
         return segment(capture, rig, settings, report=report)
     masks = kept / "masks"
     masks.mkdir(parents=True, exist_ok=True)
+    full = read_rig(kept / CAMERAS) if (kept / CAMERAS).is_file() else rig
     before = set(masks.glob(f"*{SUFFIX}"))
     found = segment_once(masks, capture, rig, settings, report=report)
     made = set(masks.glob(f"*{SUFFIX}")) - before
@@ -133,8 +138,14 @@ def keep_masks(
         path.unlink(missing_ok=True)
     for name, silhouette in found.items():
         if made or not (masks / f"{name}.png").is_file():
-            write_image(masks / f"{name}.png", silhouette.mask.astype(np.uint8) * 255)
+            write_image(masks / f"{name}.png", _of_file(silhouette.mask, full[name].intrinsics))
     return found
+
+
+def _of_file(mask: Bool[np.ndarray, "h w"], k: Intrinsics) -> UInt8[np.ndarray, "y x"]:
+    """A mask of the size of its picture's file, which was perhaps read smaller."""
+    large = cv2.resize(mask.astype(np.uint8) * np.uint8(255), (k.width, k.height), interpolation=cv2.INTER_LINEAR)
+    return (large > 127).astype(np.uint8) * np.uint8(255)
 
 
 def _made_of(root: Path, front: str | None) -> dict[str, str]:

@@ -50,6 +50,7 @@ def reconstruct_capture(
     from pipeline.results.write import write_result
     from pipeline.settings import settings_from_document
     from rig.formats.capture_folder import read_capture
+    from rig.formats.work_size import WORK_PIXELS
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
     from server.tasks.photographs import calibration_warnings
@@ -61,7 +62,7 @@ def reconstruct_capture(
     name = model or "default"
     head_model = bench.keep(f"model {name}", lambda: load_model(name))
     renderer = bench.keep("renderer", Renderer.create)
-    shot, rig = read_capture(Path(capture))
+    shot, rig = read_capture(Path(capture), pixels_most=WORK_PIXELS)
 
     def tell(stage: str, fraction: float) -> None:
         if stage != DONE:  # the files are still to be written

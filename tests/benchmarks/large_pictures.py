@@ -53,14 +53,15 @@ def _enlarged(picture: ImageRgb, size: tuple[int, int]) -> ImageRgb:
     return cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
 
 
-def cost(capture: Path, *options: str) -> tuple[float, float]:
-    """Seconds, and GB of memory at most, of ``eigenhead reconstruct``."""
+def cost(capture: Path, *options: str) -> tuple[float, float, float]:
+    """Seconds, seconds of all cores together, and GB of memory at most, of ``eigenhead reconstruct``."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "server.cli", "reconstruct", str(capture), "--out", f"{folder}/head", *options]
         start = time.perf_counter()
         subprocess.run(command, check=True, env=python_environment())
         took = time.perf_counter() - start
-    return took, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return took, used.ru_utime + used.ru_stime, used.ru_maxrss / 1e6
 
 
 if __name__ == "__main__":
@@ -72,5 +73,5 @@ if __name__ == "__main__":
         found = write(given.capture)
         sys.stdout.write(f"{len(found)} cameras of {found.cameras[0].intrinsics.width} pixels across\n")
     else:
-        took_s, most_gb = cost(given.capture, *options)
-        sys.stdout.write(f"{took_s:.1f} s, {most_gb:.2f} GB\n")
+        took_s, cpu_s, most_gb = cost(given.capture, *options)
+        sys.stdout.write(f"{took_s:.1f} s, {cpu_s:.1f} s of all cores together, {most_gb:.2f} GB\n")
