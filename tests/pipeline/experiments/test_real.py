@@ -21,9 +21,10 @@ from rig.studio.sensor.preset import CLEAN
 from server.tasks.subjects import drawn_subject
 from tests.support.scenes import ellipsoid
 
-CAMERA = Camera("cam00", Intrinsics(320, 240, 400.0, 400.0, 159.5, 119.5), RigidTransform(np.eye(3), [0.0, 0.0, 600.0]))
+AWAY = RigidTransform(np.eye(3), np.array([0.0, 0.0, 600.0]))
+CAMERA = Camera("cam00", Intrinsics(320, 240, 400.0, 400.0, 159.5, 119.5), AWAY)
 AROUND = (*((a, e) for a in (-80, -40, 0, 40, 80) for e in (-15, 20)), (0, 40), (20, 0), (-20, 0), (180, 0), (150, 10))
-SILENT = Settings(detail="span", outputs=OutputSettings(surface="head"))
+HEAD_OF_SPAN = Settings(detail="span", outputs=OutputSettings(surface="head"))
 
 
 def quiet(stage: str, share: float) -> None:
@@ -72,8 +73,9 @@ def test_a_studio_subject_is_judged_by_the_views_that_were_held_out(renderer: Re
     taken = simulate(drawn_subject(model, rng), rig_from_directions(AROUND).scaled(0.4), CLEAN, rng, renderer=renderer)
     masks = taken.masks
     given = RealCapture("anna", Capture(taken.capture.images, masks=masks), taken.rig, masks, "cam04")
-    found = real(model, [given], renderer=renderer, settings=SILENT, report=quiet)
+    found = real(model, [given], renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
     (row,) = found["rows"]
+    assert isinstance(row, dict)
     assert (row["views"], row["held_out"], row["surface"]) == (15, 2, "head")
     assert len(row["used"]) == 11
     figures = found["figures"]
@@ -82,4 +84,4 @@ def test_a_studio_subject_is_judged_by_the_views_that_were_held_out(renderer: Re
     assert figures["anna_points_mm"] < 3.0
     few = replace(given, rig=taken.rig.subset(taken.rig.names[:11]))
     with pytest.raises(InputError, match="11 views of use on the front side; more than 11 are needed"):
-        real(model, [few], renderer=renderer, settings=SILENT, report=quiet)
+        real(model, [few], renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
