@@ -8,10 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool
+
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
-from rig.formats.capture_folder import BESIDE_PICTURES, capture_root
-from rig.formats.images import IMAGE_SUFFIXES
+from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, size_fault
+from rig.formats.images import IMAGE_SUFFIXES, decode_image_file
+from rig.rig import Rig
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
 
@@ -57,6 +61,29 @@ def find_photographs(folder: Path) -> Photographs:
     if folders:
         return Photographs({name: {path.stem: path for path in paths} for name, paths in folders.items()})
     return Photographs({path.stem: {ONE_SHOT: path} for path in flat})
+
+
+def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
+    """The masks (True = subject) that lie beside one shot's photographs, in masks/. Raises InputError for one that is
+    damaged or of another size."""
+    inside = capture_root(folder) / "masks"
+    if photographs.shots != (ONE_SHOT,) or not inside.is_dir():
+        return {}
+    masks, faults = {}, []
+    for path in _pictures(inside):
+        if path.stem not in rig:
+            continue
+        pixels, _, fault = decode_image_file(path, f"masks/{path.name}", grey=True)
+        k = rig[path.stem].intrinsics
+        if pixels is None:
+            faults.append(fault)
+        elif pixels.shape != (k.height, k.width):
+            faults.append(size_fault(f"masks/{path.name}", (pixels.shape[1], pixels.shape[0]), (k.width, k.height)))
+        else:
+            masks[path.stem] = pixels > 0
+    if faults:
+        raise InputError(folder.name, faults)
+    return masks
 
 
 def _pictures(folder: Path) -> list[Path]:

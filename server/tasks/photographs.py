@@ -153,6 +153,7 @@ def _made_of(root: Path, front: str | None) -> dict[str, str]:
     from importlib.metadata import version
 
     files = [path for path in sorted(picture_folder(root).rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES]
+    files += sorted((root / "masks").glob("*"))
     files += [root / SCALE] if (root / SCALE).is_file() else []
     digests = {path.relative_to(root).as_posix(): _sha256(path) for path in files}
     return {**digests, "front": front or "", "version": version("eigenhead"), "pycolmap": version("pycolmap")}
