@@ -18,8 +18,8 @@ BOARD = "board.toml"
 STAGES_S = {"detection": 0.055, "lenses": 0.03, "pose graph": 0.005, "bundle": 0.03, "checks": 0.02}
 """Seconds a picture of each stage, in their order: 104 pictures of 640 x 480 from four cameras on a busy machine."""
 SCENE_STAGES_S = {"features": 0.5, "matches": 1.0, "structure": 0.65, "scale": 0.05}
-"""The same of a scene: thirty photographs of 1024 x 768 take 67 s together; how they divide is a guess, which the work's
-own pace corrects. Matching goes by pairs, so that more of them take longer."""
+"""The same of a scene: thirty photographs of 1024 x 768 take 67 s together; how they divide is a guess, which the pace
+of the work corrects. Matching goes by pairs, so that more of them take longer."""
 
 
 def expected(folder: Path) -> dict[str, float]:
