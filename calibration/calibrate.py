@@ -25,7 +25,15 @@ from calibration.adjustment.state import (
 from calibration.adjustment.timing import TimeOffsets, board_velocities, estimate_offsets
 from calibration.adjustment.world import in_world_frame
 from calibration.board.board import Board
-from calibration.board.detection import Detections, Report, View, WrongBoard, detect_folder, ignore_progress
+from calibration.board.detection import (
+    Detections,
+    Report,
+    View,
+    WrongBoard,
+    detect_folder,
+    ignore_progress,
+    list_pictures,
+)
 from calibration.quality.checks import (
     check_against_previous,
     check_cheirality,
@@ -37,6 +45,7 @@ from calibration.quality.checks import (
 )
 from calibration.quality.outliers import CORNER_SIGMAS, Dropped, bad_views, drop_blurred, drop_misread, explain_shot
 from calibration.result import Calibration, CalibrationRefused
+from rig.formats.serials import with_serials
 from rig.geometry import RigidTransform
 from rig.rig import Rig
 
@@ -61,7 +70,9 @@ def calibrate(
     ``previous`` is the rig's last calibration, against which names, layout, scale and lenses are checked; ``cache`` a
     folder that keeps detections by the pictures' content."""
     detections = detect_folder(images, board, cache=cache, workers=workers, report=report)
-    return calibrate_detections(detections, front=front, previous=previous, report=report)
+    calibration = calibrate_detections(detections, front=front, previous=previous, report=report)
+    first = {name: next(iter(shots.values())) for name, shots in list_pictures(images).items()}
+    return replace(calibration, rig=with_serials(calibration.rig, first))
 
 
 def calibrate_detections(

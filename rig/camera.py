@@ -95,7 +95,8 @@ class Intrinsics:
 class Camera:
     """A calibrated camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm), of a left perturbation.
 
-    ``recorded``: the lens of its picture files where ``intrinsics`` is the pinhole that they are undistorted to.
+    ``recorded``: the lens of its picture files where ``intrinsics`` is the pinhole that they are undistorted to;
+    ``serial``: of its body, as its picture files have it.
     """
 
     name: str
@@ -103,6 +104,7 @@ class Camera:
     camera_from_world: RigidTransform
     covariance: Float[np.ndarray, "6 6"] | None = None
     recorded: RecordedLens | None = None
+    serial: str | None = None
 
     @property
     def centre_world(self) -> Float[np.ndarray, " 3"]:

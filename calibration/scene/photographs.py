@@ -8,10 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Bool
+
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
-from rig.formats.capture_folder import capture_root
-from rig.formats.images import IMAGE_SUFFIXES
+from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, size_fault
+from rig.formats.images import IMAGE_SUFFIXES, decode_image_file
+from rig.rig import Rig
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
 
@@ -38,7 +42,8 @@ def find_photographs(folder: Path) -> Photographs:
     root = capture_root(folder)
     root = root / "images" if (root / "images").is_dir() else root
     flat = _pictures(root)
-    folders = {path.name: _pictures(path) for path in sorted(root.iterdir()) if path.is_dir()}
+    beside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name not in BESIDE_PICTURES]
+    folders = {path.name: _pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:
         told = "photographs beside folders of photographs: put one picture a camera, or one folder a camera"
@@ -56,6 +61,29 @@ def find_photographs(folder: Path) -> Photographs:
     if folders:
         return Photographs({name: {path.stem: path for path in paths} for name, paths in folders.items()})
     return Photographs({path.stem: {ONE_SHOT: path} for path in flat})
+
+
+def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
+    """The masks (True = subject) that lie beside one shot's photographs, in masks/. Raises InputError for one that is
+    damaged or of another size."""
+    inside = capture_root(folder) / "masks"
+    if photographs.shots != (ONE_SHOT,) or not inside.is_dir():
+        return {}
+    masks, faults = {}, []
+    for path in _pictures(inside):
+        if path.stem not in rig:
+            continue
+        pixels, _, fault = decode_image_file(path, f"masks/{path.name}", grey=True)
+        k = rig[path.stem].intrinsics
+        if pixels is None:
+            faults.append(fault)
+        elif pixels.shape != (k.height, k.width):
+            faults.append(size_fault(f"masks/{path.name}", (pixels.shape[1], pixels.shape[0]), (k.width, k.height)))
+        else:
+            masks[path.stem] = pixels > 0
+    if faults:
+        raise InputError(folder.name, faults)
+    return masks
 
 
 def _pictures(folder: Path) -> list[Path]:

@@ -23,6 +23,7 @@ def scene_page(calibration: SceneCalibration) -> str:
         "it was named)."
     )
     told = f"Scale: <span class='{mark}'>{escape(scale.told)}</span>, good to {100 * scale.share:.2g} %."
+    refined = "" if calibration.refinement is None else f"<p>Silhouettes: {escape(calibration.refinement)}.</p>"
     head = ("camera", "points", "RMS px", "uncertainty at the subject px", "focal length px", "centre mm")
     rows = [
         (
@@ -38,7 +39,7 @@ def scene_page(calibration: SceneCalibration) -> str:
     return "\n".join(
         [
             "<!doctype html><html lang='en'><meta charset='utf-8'><title>Calibration from the scene</title>",
-            f"<style>{STYLE}</style><h1>Calibration from the scene</h1><p>{summary}</p><p>{told}</p>",
+            f"<style>{STYLE}</style><h1>Calibration from the scene</h1><p>{summary}</p><p>{told}</p>{refined}",
             listed("Views that did not join", calibration.left_out.values()),
             listed("Warnings", calibration.warnings),
             "<h2>Cameras</h2>",

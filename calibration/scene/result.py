@@ -47,6 +47,7 @@ class SceneDocument(TypedDict):
     lenses: str
     scale: ScaleDocument
     left_out: dict[str, str]
+    refinement: str | None
     warnings: list[str]
     rig: CamerasDocument
 
@@ -55,7 +56,7 @@ class SceneDocument(TypedDict):
 class SceneCalibration:
     """``rig``: with covariances, mm, world frame; ``structure``: the same cameras with their points; ``left_out``:
     views that did not join, and why; ``features``: keypoints found in each view; ``matched``: how many of them in all
-    are found in another view too."""
+    are found in another view too; ``refinement``: what silhouettes made of the poses, where there were masks."""
 
     rig: Rig
     structure: Structure
@@ -66,6 +67,7 @@ class SceneCalibration:
     features: dict[str, int]
     matched: int
     warnings: tuple[str, ...]
+    refinement: str | None = None
 
     def figures(self) -> SceneFigures:
         """The numbers of ``calibrate --from scene --json``."""
@@ -103,6 +105,7 @@ class SceneCalibration:
                 "share_sigma": self.scale.share,
             },
             "left_out": dict(self.left_out),
+            "refinement": self.refinement,
             "warnings": list(self.warnings),
             "rig": document_from_rig(self.rig),
         }

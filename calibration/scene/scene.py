@@ -5,24 +5,30 @@ with skin and hair in view of cameras 10 to 25 degrees apart, a table with thing
 """
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from calibration.result import CalibrationRefused
 from calibration.scene.covariance import uncertainty
 from calibration.scene.matching import Matches, match_photographs
-from calibration.scene.photographs import find_photographs
+from calibration.scene.photographs import find_masks, find_photographs
 from calibration.scene.result import SceneCalibration
 from calibration.scene.scale import HEAD_SHARE, Scale, find_scale
 from calibration.scene.structure import Structure, solve_structure, why_not
 from calibration.scene.upright import in_guessed_frame
+from calibration.silhouette_refinement.single import VIEWS_LEAST, refine_one
 from pipeline.eigenheads.model import load_model
+from pipeline.settings import SegmentationSettings
+from pipeline.silhouettes.segment import segment
+from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.formats.scale_json import read_scale
+from rig.formats.serials import with_serials
 from rig.rig import Rig
 
 Report = Callable[[str, float], None]
@@ -62,7 +68,11 @@ def calibrate_scene(
     report("scale", 0.0)
     head = np.zeros((0, 3)) if known is not None else load_model().cage(np.zeros(0))
     found = find_scale(structure, known, photographs, head)
-    return placed(structure, found, matches, left_out, front)
+    calibration = placed(structure, found, matches, left_out, front)
+    report("silhouettes", 0.0)
+    calibration = refined_by_masks(calibration, find_masks(folder, photographs, calibration.rig))
+    first = {name: next(iter(photographs.files[name].values())) for name in calibration.rig.names}
+    return replace(calibration, rig=with_serials(calibration.rig, first))
 
 
 def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, str]]:
@@ -112,6 +122,19 @@ def placed(
         matches.matched_keypoints,
         tuple(warnings),
     )
+
+
+def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
+    """The calibration with the poses that the subject's silhouettes agree on, if pairs of views that were held out do;
+    the calibration itself where there are too few masks."""
+    rig = calibration.rig
+    known = [name for name in rig.names if name in masks]
+    if len(known) < VIEWS_LEAST:
+        return calibration
+    own = Capture({}, masks={name: masks[name] for name in known})
+    silhouettes = segment(own, rig.subset(known), SegmentationSettings(), report=lambda stage, share: None)
+    done = refine_one(silhouettes, rig)
+    return calibration if done is None else replace(calibration, rig=done.rig, refinement=done.reason)
 
 
 def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:

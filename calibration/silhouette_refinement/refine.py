@@ -47,6 +47,8 @@ SETTLED_PX = 1e-2
 FOLDS = 5
 GAIN_SIGMAS = 2.0  # by how many of its standard deviations the held-out residuals must shrink
 
+Pairs = Callable[[tuple[str, str]], bool]  # whether the tangencies of two cameras take part
+
 
 class TooFewCaptures(EigenheadError):
     """Nothing would be left to refine from."""
@@ -118,8 +120,8 @@ def refine(
         parts.append((residuals(held_out, rig), residuals(held_out, without)))
         report("refine", (fold + 2) / (folds + 1))
     before, after = (_joined(side) for side in zip(*parts, strict=True))
-    noise = _noise(after.px)
-    gain, deviation = _gain(before.px, after.px, noise)
+    noise = noise_of(after.px)
+    gain, deviation = gain_of(before.px, after.px, noise)
     before_px, after_px = robust_rms(before.px, noise), robust_rms(after.px, noise)
     kept = gain > GAIN_SIGMAS * deviation
     words = "shrink" if kept else "do not shrink"
@@ -147,9 +149,10 @@ def _joined(parts: Sequence[Residuals]) -> Residuals:
     return Residuals(cameras, np.concatenate([part.px for part in parts]))
 
 
-def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig) -> Residuals:
-    """Residuals of all captures' outer tangencies: the same ones whatever the rig, so that two rigs compare."""
-    found = [_tangencies(capture, rig, outer=True) for capture in captures]
+def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig, pairs: Pairs | None = None) -> Residuals:
+    """Residuals of all captures' outer tangencies, or of those of some ``pairs`` of cameras: the same ones whatever the
+    rig, so that two rigs compare."""
+    found = [_tangencies(capture, rig, pairs, outer=True) for capture in captures]
     misses = [tangency_residuals(PackedTangencies.of(tangencies, rig), rig) for tangencies in found]
     return Residuals(tuple(t.cameras for tangencies in found for t in tangencies), np.concatenate(misses))
 
@@ -163,11 +166,12 @@ def _forgiven(misses: Float[np.ndarray, " n"], noise_px: float) -> Float[np.ndar
     return noise_px**2 * GemanMcClure(ROBUST_SIGMAS).cost((misses / noise_px) ** 2)
 
 
-def _noise(misses: Float[np.ndarray, " n"]) -> float:
+def noise_of(misses: Float[np.ndarray, " n"]) -> float:
+    """Robust standard deviation, px."""
     return max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(misses)))) if len(misses) else NOISE_LEAST_PX
 
 
-def _gain(before: np.ndarray, after: np.ndarray, noise: float) -> tuple[float, float]:
+def gain_of(before: np.ndarray, after: np.ndarray, noise: float) -> tuple[float, float]:
     """By how much the mean robust cost falls, and the standard deviation of that."""
     one, two = _forgiven(before, noise), _forgiven(after, noise)
     if len(one) != len(two):  # a tangency at the image's border came or went
@@ -184,10 +188,12 @@ def minimise_tangencies(
     focal: bool,
     prior_px: float,
     heads: Heads | None,
+    pairs: Pairs | None = None,
 ) -> Rig:
     """The cameras of least tangency cost over all captures, with the start as prior; then of that and the rims of the
-    heads. The result's covariances are those of the last step, in the subject's gauge."""
-    here = _Refining(captures, start, focal, prior_px)
+    heads. Only the tangencies of ``pairs`` of cameras count where they are given. The result's covariances are those of
+    the last step, in the subject's gauge."""
+    here = _Refining(captures, start, focal, prior_px, pairs)
     correction = here.prior.centre
     solution = None
     for k in range(STEPS):
@@ -213,8 +219,15 @@ def minimise_tangencies(
 class _Refining:
     """What stays the same while the tangencies of a refinement are found again and again."""
 
-    def __init__(self, captures: Sequence[Mapping[str, Silhouette]], start: Rig, focal: bool, prior_px: float) -> None:
-        self.captures, self.start, self.focal = captures, start, focal
+    def __init__(
+        self,
+        captures: Sequence[Mapping[str, Silhouette]],
+        start: Rig,
+        focal: bool,
+        prior_px: float,
+        pairs: Pairs | None,
+    ) -> None:
+        self.captures, self.start, self.focal, self.pairs = captures, start, focal, pairs
         self.projection = _projection(start, focal=focal)
         information = gauge_free(_prior(start, focal=focal, prior_px=prior_px), self.projection)
         self.prior = Quadratic.prior(information, np.zeros(len(information)))
@@ -231,9 +244,9 @@ class _Refining:
     def tangency_term(self, correction: Float[np.ndarray, " p"], *, outer: bool) -> TangencyTerm:
         """The tangencies of all captures as the corrected cameras find them, and their robust noise."""
         rig = self.rig(correction)
-        found = [t for capture in self.captures for t in _tangencies(capture, rig, outer=outer)]
+        found = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
         seen = PackedTangencies.of(found, rig)
-        return TangencyTerm(seen, self.start, self.focal, _noise(tangency_residuals(seen, rig)))
+        return TangencyTerm(seen, self.start, self.focal, noise_of(tangency_residuals(seen, rig)))
 
     def rim_terms(self, correction: Float[np.ndarray, " p"], heads: Heads) -> list[Quadratic]:
         """What the rim of each capture's head says of the cameras."""
@@ -252,9 +265,10 @@ def _with_covariances(rig: Rig, covariance: Float[np.ndarray, "p p"], *, focal: 
     return Rig(tuple(replace(c, covariance=0.5 * (b + b.T)) for c, b in zip(rig, blocks, strict=True)))
 
 
-def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, *, outer: bool) -> list[Tangency]:
+def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, pairs: Pairs | None, *, outer: bool) -> list[Tangency]:
     usable = rig.subset(name for name in rig.names if name in capture and capture[name].quality.usable)
-    return find_tangencies(capture, usable) if outer else find_frontier(capture, usable)
+    found = find_tangencies(capture, usable) if outer else find_frontier(capture, usable)
+    return found if pairs is None else [tangency for tangency in found if pairs(tangency.cameras)]
 
 
 def _pose_places(rig: Rig, *, focal: bool) -> Int[np.ndarray, " q"]:

@@ -15,6 +15,7 @@ from rig.rig import Rig
 
 FORMAT = "eigenhead-cameras/1"
 CAMERAS_LEAST, CAMERAS_MOST = 3, 64
+SERIAL_MOST = 64
 PIXELS_MOST = 20_000  # a side; larger is a damaged or hostile file, not a camera
 
 
@@ -24,7 +25,7 @@ class PoseDocument(TypedDict):
 
 
 class CameraDocument(TypedDict):
-    """``covariance``: 6 x 6, rotation (rad) then translation (mm)."""
+    """``covariance``: 6 x 6, rotation (rad) then translation (mm); ``serial``: of the body, as EXIF has it."""
 
     name: str
     width: int
@@ -33,6 +34,7 @@ class CameraDocument(TypedDict):
     distortion: dict[str, str | float]
     camera_from_world: PoseDocument
     covariance: NotRequired[list[list[float]]]
+    serial: NotRequired[str]
 
 
 class CamerasDocument(TypedDict):
@@ -75,7 +77,7 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     cameras = [_read_camera(entry, f"cameras[{i}]", faults) for i, entry in enumerate(entries[:CAMERAS_MOST])]
     found = [camera for camera in cameras if camera is not None]
     names = [camera.name for camera in found]
-    faults += _repeated(names)
+    faults += _repeated(names) + _shared_serials(found)
     if faults:
         raise InputError(subject, faults)
     return Rig(tuple(found))
@@ -88,6 +90,15 @@ def _repeated(names: list[str]) -> list[str]:
         return []
     first = f"camera {repeated[0]!r} occurs {names.count(repeated[0])} times"
     return [first if len(repeated) == 1 else f"{first}, and {len(repeated) - 1} more names occur several times"]
+
+
+def _shared_serials(cameras: list[Camera]) -> list[str]:
+    owners: dict[str, list[str]] = {}
+    for camera in cameras:
+        if camera.serial is not None:
+            owners.setdefault(camera.serial, []).append(camera.name)
+    told = "one body is one camera: correct or leave out their serials"
+    return [f"{' and '.join(own)} have the serial {serial!r}: {told}" for serial, own in owners.items() if len(own) > 1]
 
 
 def name_fault(name: Any) -> str | None:
@@ -114,6 +125,8 @@ def _camera_document(camera: Camera) -> CameraDocument:
     }
     if camera.covariance is not None:
         document["covariance"] = camera.covariance.tolist()
+    if camera.serial is not None:
+        document["serial"] = camera.serial
     return document
 
 
@@ -159,13 +172,16 @@ def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
             faults.append(f"{where}.covariance is not symmetric and positive semi-definite")
     if rotation is not None:
         faults += _rotation_faults(rotation, where)
+    serial = entry.get("serial")
+    if serial is not None and not (isinstance(serial, str) and 0 < len(serial) <= SERIAL_MOST):
+        faults.append(f"{where}.serial is {serial!r:.80}, wanted text of 1 to {SERIAL_MOST} characters")
     if len(faults) == before and not (fx > 0 and fy > 0):
         faults.append(f"{where}.intrinsics: fx and fy must be positive")
     if len(faults) > before or rotation is None or translation is None or not width or not height:
         return None
     intrinsics = Intrinsics(width, height, fx, fy, cx, cy, distortion)
     pose = RigidTransform(nearest_rotation(rotation), translation)
-    return Camera(entry["name"], intrinsics, pose, covariance, recorded)
+    return Camera(entry["name"], intrinsics, pose, covariance, recorded, serial)
 
 
 def _rotation_faults(rotation: np.ndarray, where: str) -> list[str]:

@@ -7,14 +7,17 @@ features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
 
 Without background/ and masks/ altogether the subject is found from the photographs. Without images/ the pictures lie
-beside cameras.json; a folder of a camera's name may hold its one picture, whatever that is called.
+beside cameras.json; a folder of a camera's name may hold its one picture, whatever that is called; and so may a picture
+be called whose EXIF has the serial number of a camera (``rig.formats.serials``).
 """
 
 import hashlib
 import json
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -24,16 +27,20 @@ from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, write_image
+from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, picture_size, write_image
+from rig.formats.serials import pictures_by_serial
 from rig.formats.unread_keys import unread_keys
+from rig.formats.work_size import at_share, work_features, work_rig, work_share
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera
+BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
 
 
-def read_capture(folder: Path) -> tuple[Capture, Rig]:
-    """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Raises InputError
+def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
+    """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Pictures of more
+    than ``pixels_most`` pixels come smaller, and so do their cameras (``rig.formats.work_size``). Raises InputError
     that names every fault in it."""
     faults: list[str] = []
     folder = capture_root(folder)
@@ -45,14 +52,14 @@ def read_capture(folder: Path) -> tuple[Capture, Rig]:
     except InputError as error:
         raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
     faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
-    capture = read_shot(folder, rig, faults)
+    capture = read_shot(folder, rig, faults, by_serial(folder, rig, faults), pixels_most=pixels_most)
     if faults:
         raise InputError("capture", faults)
     digests = dict(capture.digests)
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
-    return replace(capture, digests=ordered, remarks=unread_keys(rig_file)), rig
+    return replace(capture, digests=ordered, remarks=unread_keys(rig_file)), work_rig(rig, pixels_most)
 
 
 def capture_root(folder: Path) -> Path:
@@ -63,14 +70,30 @@ def capture_root(folder: Path) -> Path:
     return entries[0] if len(entries) == 1 and entries[0].is_dir() and entries[0].name != "sparse" else folder
 
 
-def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
-    """The images of a folder for a known rig; appends every fault to ``faults``."""
+def by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, dict[str, Path]]:
+    """Pictures and plates that do not have their camera's name but its body's serial number, by kind and camera."""
+    folders = {"images": picture_folder(folder), "background": folder / "background"}
+    return {kind: pictures_by_serial(inner, rig, faults) for kind, inner in folders.items() if inner.is_dir()}
+
+
+def read_shot(
+    folder: Path,
+    rig: Rig,
+    faults: list[str],
+    filed: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
+    *,
+    pixels_most: int | None = None,
+) -> Capture:
+    """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``. ``filed``:
+    files that do not have their camera's name, as ``by_serial`` finds them."""
     jobs: list[tuple[str, str, Path]] = []
-    pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in ("masks", "background"))
+    pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
     for camera in rig:
         image = _image_file(pictures, camera.name, faults) or _only_picture(pictures / camera.name, faults)
+        image = image or filed.get("images", {}).get(camera.name)
         mask = _image_file(folder / "masks", camera.name, faults)
         plates = _plate_files(folder / "background", camera.name, faults)
+        plates = plates or [path for name, path in filed.get("background", {}).items() if name == camera.name]
         if image is None:
             faults.append(f"{_inside(folder, pictures)}{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)")
         if not plates and mask is None and not alone:
@@ -80,7 +103,7 @@ def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
         found = [("images", image), ("masks", mask), *(("background", plate) for plate in plates)]
         jobs += [(kind, camera.name, path) for kind, path in found if path is not None]
     with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
-        decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig), jobs))
+        decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig, pixels_most=pixels_most), jobs))
     images: dict[str, np.ndarray] = {}
     masks: dict[str, np.ndarray] = {}
     backgrounds: dict[str, list[np.ndarray]] = {}
@@ -101,6 +124,7 @@ def read_shot(folder: Path, rig: Rig, faults: list[str]) -> Capture:
         data = (folder / "features.json").read_bytes()
         digests["features.json"] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
+        features = work_features(features, rig, work_rig(rig, pixels_most))
     return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
 
 
@@ -115,7 +139,7 @@ def _inside(folder: Path, pictures: Path) -> str:
 
 def _only_picture(folder: Path, faults: list[str]) -> Path | None:
     """The picture in a camera's own folder."""
-    found = _listed(folder)
+    found = listed_pictures(folder)
     if len(found) > 1:
         told = f"{folder.name}/ holds {len(found)} pictures; a capture is one shot: leave one of them"
         faults.append(f"{told}, and give all to calibrate --from scene")
@@ -152,21 +176,28 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
     return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
 
 
-def _decode(folder: Path, kind: str, name: str, path: Path, *, rig: Rig) -> tuple[np.ndarray | None, str, str]:
-    k = rig[name].intrinsics
-    where = path.relative_to(folder).as_posix()
-    pixels, digest, fault = decode_image_file(path, where, grey=kind == "masks")
-    if pixels is not None and pixels.shape[:2] != (k.height, k.width):
-        height, width = pixels.shape[:2]
-        return None, "", size_fault(where, (width, height), (k.width, k.height))
-    if pixels is not None and (lens := rig[name].recorded) is not None:
-        pixels = lens.undistort(pixels, k.matrix(), smooth=kind != "masks")
-    if pixels is not None and kind == "masks":
-        pixels = pixels > 0
+def _decode(
+    folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None
+) -> tuple[np.ndarray | None, str, str]:
+    camera = rig[name]
+    wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
+    where, whole = path.relative_to(folder).as_posix(), kind == "masks"
+    pixels, digest, fault = decode_image_file(path, where, grey=whole, share=1.0 if whole else share)
+    if pixels is None:
+        return None, digest, fault
+    size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
+    if size != wanted:
+        return None, "", size_fault(where, size, wanted)
+    if whole:  # whatever is not zero is the subject, so that it is told before pixels are averaged
+        pixels = at_share((pixels > 0).astype(np.uint8) * np.uint8(255), size, share)
+    if camera.recorded is not None:
+        matrix = work_rig(rig.subset([name]), pixels_most)[name].intrinsics.matrix()
+        pixels = camera.recorded.undistort(pixels, matrix, smooth=not whole)
+    if whole:
+        pixels = pixels > 127
         if not pixels.any():
             return None, "", f"{where} is empty: no pixel belongs to the subject"
-    if pixels is not None:
-        pixels.setflags(write=False)
+    pixels.setflags(write=False)
     return pixels, digest, fault
 
 
@@ -178,7 +209,7 @@ def size_fault(where: str, size: tuple[int, int], wanted: tuple[int, int]) -> st
 
 def stray_faults(folder: Path, rig: Rig) -> list[str]:
     """Pictures, masks and clean plates that belong to no camera of the rig."""
-    files = [path for kind in ("images", "masks", "background") for path in _listed(folder / kind)]
+    files = [path for kind in ("images", "masks", "background") for path in listed_pictures(folder / kind)]
     return [
         f"{path.relative_to(folder).as_posix()} has no camera: the rig has {', '.join(rig.names)}"
         for path in files
@@ -187,7 +218,7 @@ def stray_faults(folder: Path, rig: Rig) -> list[str]:
 
 
 def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
-    found = [path for path in _listed(folder) if path.stem == stem and path.is_file()]
+    found = [path for path in listed_pictures(folder) if path.stem == stem and path.is_file()]
     if len(found) > 1:
         faults.append(f"{folder.name}/ holds {' and '.join(path.name for path in found)}: which one is meant?")
     return found[0] if found else None
@@ -195,11 +226,12 @@ def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
 
 def _plate_files(folder: Path, stem: str, faults: list[str]) -> list[Path]:
     single = _image_file(folder, stem, faults)
-    several = _listed(folder / stem)[:PLATES_MOST]
+    several = listed_pictures(folder / stem)[:PLATES_MOST]
     return [single] if single is not None else several
 
 
-def _listed(folder: Path) -> list[Path]:
+def listed_pictures(folder: Path) -> list[Path]:
+    """The pictures in a folder; none where there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))

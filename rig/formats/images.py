@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 from rig.atomic_write import write_atomically
 from rig.capture import ImageRgb
 from rig.errors import InputError
+from rig.formats.work_size import at_share, halvings
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")  # JPEG covers the MPO that many phones write into a .jpg
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
@@ -26,6 +27,19 @@ HEIC_SUFFIXES = (".heic", ".heif")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *RAW_SUFFIXES, *HEIC_SUFFIXES)
 
 
+JPEG = b"\xff\xd8\xff"
+GREY_FLAGS = (
+    cv2.IMREAD_GRAYSCALE,
+    cv2.IMREAD_REDUCED_GRAYSCALE_2,
+    cv2.IMREAD_REDUCED_GRAYSCALE_4,
+    cv2.IMREAD_REDUCED_GRAYSCALE_8,
+)
+COLOUR_FLAGS = (  # those that reduce know no order but OpenCV's own
+    cv2.IMREAD_COLOR_RGB,
+    cv2.IMREAD_REDUCED_COLOR_2,
+    cv2.IMREAD_REDUCED_COLOR_4,
+    cv2.IMREAD_REDUCED_COLOR_8,
+)
 PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
 
 
@@ -69,8 +83,9 @@ def open_picture(path: Path) -> Image.Image:
         return Image.open(path, formats=IMAGE_FORMATS)
 
 
-def decode_image_file(path: Path, where: str, *, grey: bool) -> tuple[np.ndarray | None, str, str]:
-    """Pixels (RGB, or one channel), the sha256 of the file, and the fault (then no pixels) as a sentence."""
+def decode_image_file(path: Path, where: str, *, grey: bool, share: float = 1.0) -> tuple[np.ndarray | None, str, str]:
+    """Pixels (RGB, or one channel) at ``share`` of their number across, the sha256 of the file, and the fault (then no
+    pixels) as a sentence."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     try:
         with _faults_of(where):
@@ -78,7 +93,8 @@ def decode_image_file(path: Path, where: str, *, grey: bool) -> tuple[np.ndarray
         if width * height > PIXELS_MOST:
             raise InputError(where, [f"is {width} x {height} pixels; at most {PIXELS_MOST:,} are read"])
         with _faults_of(where, "its pixels cannot be decoded"):
-            pixels = _decoded(data, suffix, grey=grey)
+            pixels = _decoded(data, suffix, grey=grey, halved=halvings(share, (width, height)))
+            pixels = at_share(pixels, (width, height), share)
     except InputError as error:
         return None, "", f"{where} {error.faults[0]}"
     if suffix == ".png" and b"IEND" not in data[-16:]:
@@ -106,25 +122,27 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
         with _raw(data) as raw:
             return (raw.sizes.width, raw.sizes.height), b""
     if suffix in HEIC_SUFFIXES:
-        header = _heif(data)
+        header = heif_header(data)
         return header.size, header.info.get("icc_profile") or b""
     with Image.open(BytesIO(data), formats=IMAGE_FORMATS) as header:  # reads the header only
         return header.size, header.info.get("icc_profile") or b""
 
 
-def _decoded(data: bytes, suffix: str, *, grey: bool) -> np.ndarray:
+def _decoded(data: bytes, suffix: str, *, grey: bool, halved: int) -> np.ndarray:
+    """``halved``: how often a JPEG is, which costs its decoder less than none at all; others come as they are."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
             # As the camera balanced it, no brightness of each picture's own: eleven cameras must stay comparable.
             pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8, user_flip=0)
     elif suffix in HEIC_SUFFIXES:
-        pixels = np.asarray(_heif(data).to_pillow().convert("RGB"))
+        pixels = np.asarray(heif_header(data).to_pillow().convert("RGB"))
     else:
-        flags = (cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB) | cv2.IMREAD_IGNORE_ORIENTATION
+        halved = halved if data.startswith(JPEG) else 0
+        flags = (GREY_FLAGS if grey else COLOUR_FLAGS)[halved] | cv2.IMREAD_IGNORE_ORIENTATION
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         if pixels is None:
             raise ValueError("not decoded")
-        return pixels
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if halved and not grey else pixels
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if grey else np.ascontiguousarray(pixels)
 
 
@@ -139,7 +157,8 @@ def _raw(data: bytes) -> Iterator[Any]:
         raise ValueError(str(error)) from error
 
 
-def _heif(data: bytes) -> Any:
+def heif_header(data: bytes) -> Any:
+    """A HEIC file, of which nothing is decoded yet. Raises InputError without the extra."""
     try:
         import pi_heif
     except ModuleNotFoundError:

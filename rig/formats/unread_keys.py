@@ -12,7 +12,7 @@ from rig.recorded_lens import COEFFICIENTS
 
 READ = {
     "": {"format", "unit", "cameras"},
-    "cameras": {"name", "width", "height", "intrinsics", "distortion", "camera_from_world", "covariance"},
+    "cameras": {"name", "width", "height", "intrinsics", "distortion", "camera_from_world", "covariance", "serial"},
     "cameras.intrinsics": {"fx", "fy", "cx", "cy"},
     "cameras.camera_from_world": {"rotation", "translation"},
 }

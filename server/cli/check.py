@@ -3,17 +3,20 @@
 Files, cameras, plates and feature points are judged as at the service's door (``server.tasks.ingest``); where they are
 in order, outlines are asked what they say of pictures and cameras (``pipeline.silhouettes.usable_views``)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypedDict
 
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
 from rig.formats.capture_folder import capture_root, read_capture
+from rig.formats.work_size import WORK_PIXELS
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
-from server.tasks.ingest import check_capture
+from server.tasks.ingest import check_capture, filed_by_serial
 from server.tasks.photographs import SCALE, photographs_alone
 from server.tasks.prepare import prepare_kernels
 
@@ -52,7 +55,8 @@ def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Ch
             if photographs_alone(folder):
                 found["cameras"], found["will"] = _told_by_photographs(folder)
                 return found
-            content = check_capture(capture_root(folder), service_settings().image_pixels, report)
+            with _named_by_camera(capture_root(folder)) as named:
+                content = check_capture(named, service_settings().image_pixels, report)
             found["cameras"] = [camera.name for camera in content.cameras]
             found["front"] = content.front
             found["warnings"] = _told_by_outlines(folder, chosen, report)
@@ -61,6 +65,23 @@ def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Ch
     except EigenheadError as error:
         found["faults"] = [str(error)]
     return found
+
+
+@contextmanager
+def _named_by_camera(root: Path) -> Iterator[Path]:
+    """The folder, or links to its files under the names of the cameras that took them. Raises InputError."""
+    filed = filed_by_serial(root)
+    names = {path: name for files in filed.values() for name, path in files.items()}
+    if not names:
+        yield root
+        return
+    with TemporaryDirectory() as scratch:
+        for path in (path for path in root.rglob("*") if path.is_file()):
+            link = Path(scratch) / path.relative_to(root)
+            link = link.with_name(names[path] + path.suffix) if path in names else link
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(path.resolve())
+        yield Path(scratch)
 
 
 def _told_by_photographs(folder: Path) -> tuple[list[str], list[str]]:
@@ -87,7 +108,7 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[
     from pipeline.silhouettes.segment import segment
     from pipeline.silhouettes.usable_views import usable_views
 
-    shot, rig = read_capture(folder)
+    shot, rig = read_capture(folder, pixels_most=WORK_PIXELS)
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
 
     def segmented(capture: Capture) -> dict[str, "Silhouette"]:

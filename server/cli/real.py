@@ -44,14 +44,17 @@ def judge_folders(
     prepare_kernels(report, settings)
     with TemporaryDirectory() as scratch, Renderer.create() as renderer:
         place = kept or Path(scratch)
-        given = [_read(folder, place / folder.name, front, outlines, report) for folder in folders]
+        given = [read_real_capture(folder, place / folder.name, front, outlines, report) for folder in folders]
         found = real(load_model(model), given, renderer=renderer, settings=settings, report=report)
     if kept is not None:
         write_atomically(kept / "real.md", of_figures(found["figures"]).encode())
     return found
 
 
-def _read(folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Report) -> "RealCapture":
+def read_real_capture(
+    folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Report
+) -> "RealCapture":
+    """A folder as ``real`` takes it: masks and outlines that it has judge, and feature points are left out."""
     from pipeline.experiments.real import RealCapture
 
     prepared = read_or_calibrate(folder, kept, front=front, report=report)

@@ -27,7 +27,7 @@ from server.errors import Conflict, NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import CaptureRecord
-from server.wire.multipart import receive_board_pictures, receive_capture
+from server.wire.multipart import receive_calibration_pictures, receive_capture
 from server.wire.send_file import send_archive, send_file
 
 THUMBNAIL_WIDTH = 480
@@ -126,9 +126,9 @@ async def upload(who: Taker, request: Request) -> Response:
 
 
 @pages.post("/console/calibrations")
-async def upload_board_pictures(who: Taker, request: Request) -> Response:
+async def upload_calibration_pictures(who: Taker, request: Request) -> Response:
     try:
-        made = await receive_board_pictures(who[0], request)
+        made = await receive_calibration_pictures(who[0], request)
     except Exception as error:
         return as_problem(error).response()
     return JSONResponse({"id": made.id}, 202)

@@ -160,6 +160,13 @@ class FaultOut(Answer):
     remedy: str
 
 
+class WarningOut(Answer):
+    """As in report.json."""
+
+    code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")
+    message: str
+
+
 class CaptureOut(Answer):
     id: str
     created: Moment
@@ -178,6 +185,9 @@ class CaptureOut(Answer):
         None, description="good: no fault; poor: shoot again; null: not judged (of the board, or of an earlier version)"
     )
     faults: list[FaultOut] = Field(default_factory=list, description="every fault that the verdict follows from")
+    warnings: list[WarningOut] = Field(
+        default_factory=list, description="of cameras that were found from the photographs; report.json repeats them"
+    )
 
 
 class SessionOut(Answer):
@@ -293,56 +303,6 @@ class InfoOut(Answer):
 class Ready(Answer):
     ready: bool
     checks: dict[str, Check]
-
-
-class NewCalibration(Received):
-    """Shots that the rig took of the board."""
-
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "board": {"kind": "checkerboard", "columns": 9, "rows": 6, "square_mm": 25.0},
-                    "captures": [EXAMPLE_ID],
-                }
-            ]
-        }
-    )
-
-    board: JsonObject = Field(description="as board.toml: kind, columns, rows, square_mm, ...")
-    captures: list[Id] = Field(min_length=1, max_length=500)
-    label: Text = ""
-
-
-class UseCalibration(Received):
-    model_config = ConfigDict(json_schema_extra={"examples": [{"calibration_id": EXAMPLE_ID}]})
-
-    calibration_id: Id
-    poor: bool = Field(False, description="use it although its verdict is poor")
-
-
-class CalibrationOut(Answer):
-    id: str
-    created: Moment
-    source: Literal["upload", "rig"]
-    label: str
-    pictures: dict[str, int] = Field(description="number of pictures by camera")
-    state: State
-    stage: str | None = None
-    progress: float = Field(0.0, ge=0, le=1)
-    eta_s: float | None = None
-    error: JobError | None
-    verdict: Literal["good", "usable", "poor"] | None = Field(None, description="null: not judged")
-    missing: list[str] = Field([], description="what would make the verdict better, most urgent first")
-    figures: JsonObject
-    checks: list[JsonObject]
-    warnings: list[str]
-    front: str | None
-    in_use: bool
-
-
-class CalibrationList(Answer):
-    calibrations: list[CalibrationOut]
 
 
 class CameraOut(Answer):

@@ -1,6 +1,9 @@
-"""Calibrations: an archive of board pictures goes in, a durable job makes a rig of them, and one is put to use.
+"""Calibrations: an archive of pictures of a board, or of a scene, goes in, a durable job makes a rig of them, and one
+is put to use.
 
 <data>/calibrations/<id>/record.json  board.toml  images/<camera>/<shot>.<ext>  result/cameras.json  calibration.json
+
+A scene has no board.toml, and perhaps scale.json. It may show a subject: its images/ are removed once the work ended.
 """
 
 import hashlib
@@ -14,12 +17,15 @@ from pathlib import Path
 from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
 
 from rig.atomic_write import write_atomically
+from rig.errors import InputError
 from server.errors import Conflict, NotFound
 from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES, failure
 from server.services.records import Calibration
 from server.storage.events import EventLog
 from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
 from server.storage.store import Store, StoredFile, is_id, move_durably, new_id
+from server.tasks.calibrate import BOARD, check_scale, is_of_board
+from server.tasks.photographs import SCALE
 
 WORKFLOW = "calibrate"
 
@@ -31,11 +37,12 @@ class Calibrations:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> Calibration:
-        """Accepts ``folder`` (board.toml and images/) and queues the work."""
+        """Accepts ``folder`` (images/, and board.toml where they show one) and queues the work."""
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        record = CALIBRATION.document(CalibrationRecord(identity, created, source, label, cameras))
+        kind = "board" if is_of_board(folder) else "scene"
+        record = CALIBRATION.document(CalibrationRecord(identity, created, source, label, cameras, kind))
         write_atomically(folder / "record.json", json.dumps(record, indent=1).encode())
         move_durably(folder, self._store.folder("calibrations", identity))
         self._client.enqueue(self._options(identity), identity)
@@ -43,10 +50,26 @@ class Calibrations:
 
     def add_shots(self, board: Mapping[str, object], captures: list[str], label: str) -> Calibration:
         """Queues a calibration from shots that the rig took of the board. Raises NotFound and InputError."""
+        from calibration.board.board import board_from_document, write_board
+
+        described = board_from_document(board)
         with self._store.incoming() as folder:
             target = folder / "calibration"
             target.mkdir()
-            link_board_shots(self._store, target, board, captures)
+            link_shots(self._store, target, captures)
+            write_board(described, target / BOARD)
+            return self.add(target, "rig", label)
+
+    def add_scene(self, captures: list[str], scale: Mapping[str, object] | None, label: str) -> Calibration:
+        """Queues a calibration from captures of anything; ``scale``: a ``scale.json``. Raises NotFound and
+        InputError."""
+        with self._store.incoming() as folder:
+            target = folder / "calibration"
+            target.mkdir()
+            link_shots(self._store, target, captures)
+            if scale is not None:
+                write_atomically(target / SCALE, json.dumps(scale).encode())
+            check_scale(target)
             return self.add(target, "rig", label)
 
     def get(self, identity: str) -> Calibration:
@@ -148,11 +171,8 @@ class Calibrations:
         }
 
 
-def link_board_shots(store: Store, folder: Path, board: Mapping[str, object], captures: list[str]) -> None:
+def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
     """Makes the pictures of the named captures into ``folder``: one shot each. Raises NotFound and InputError."""
-    from calibration.board.board import board_from_document, write_board
-
-    described = board_from_document(board)
     for number, identity in enumerate(captures):
         record = store.capture(identity)
         files = store.folder("captures", identity) / "files"
@@ -161,4 +181,5 @@ def link_board_shots(store: Store, folder: Path, board: Mapping[str, object], ca
                 target = folder / "images" / Path(name).stem / f"shot{number:03}{Path(name).suffix}"
                 target.parent.mkdir(parents=True, exist_ok=True)
                 os.link(files / name, target)
-    write_board(described, folder / "board.toml")
+    if not (folder / "images").is_dir():
+        raise InputError("captures", ["have no images/: take them with the rig, or upload the pictures as an archive"])

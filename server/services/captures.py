@@ -241,6 +241,7 @@ class Captures:
             shot=shot,
             verdict=None if content.board else verdict_of(faults, [camera.name for camera in content.cameras]),
             faults=faults,
+            warnings=content.warnings,
         )
         self._store.add_capture(folder, record)
         return record

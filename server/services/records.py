@@ -85,7 +85,8 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera; ``stage``,
+    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera; ``kind``: of what they
+    are, board or scene; ``stage``,
     ``progress`` (0 to 1) and remaining seconds of one that runs; ``missing``: what would make its verdict better."""
 
     id: str
@@ -93,6 +94,7 @@ class Calibration:
     source: str
     label: str
     pictures: dict[str, int]
+    kind: str
     state: str
     stage: str | None = None
     progress: float = 0.0

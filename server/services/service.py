@@ -20,7 +20,7 @@ from server.settings import ServiceSettings
 from server.storage.database import open_database
 from server.storage.library import Library
 from server.storage.store import Store
-from server.tasks.calibrate import ingest_board_pictures
+from server.tasks.calibrate import ingest_board_pictures, ingest_photographs
 from server.tasks.child import Children
 
 
@@ -66,6 +66,16 @@ class Service:
         target.mkdir(parents=True)
         with self.children.one() as child:
             child.remote(ingest_board_pictures)(archive=str(archive), folder=str(target), limits=limits)
+        return self.calibrations.add(target, "upload", label)
+
+    def accept_photographs(self, archive: Path, folder: Path, label: str) -> Calibration:
+        """Queues a calibration from an archive of photographs of a scene. Raises InputError naming every fault."""
+        limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
+        target.mkdir(parents=True)
+        with self.children.one() as child:
+            child.remote(ingest_photographs)(
+                archive=str(archive), folder=str(target), limits=limits, image_pixels=self.settings.image_pixels
+            )
         return self.calibrations.add(target, "upload", label)
 
     def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:

@@ -10,6 +10,7 @@ from typing import Any, Generic, NotRequired, TypedDict, TypeVar
 
 from pydantic import TypeAdapter
 
+from pipeline.diagnostics import ReportWarning
 from rig.acquisition.shot import Fault
 from rig.acquisition.verdict import ViewDocument
 
@@ -29,7 +30,8 @@ class CameraSize:
 @dataclass(frozen=True, slots=True)
 class CaptureContent:
     """What is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the calibration
-    board, which show no head. ``checks``: what was measured of each camera's picture."""
+    board, which show no head. ``checks``: what was measured of each camera's picture; ``warnings``: what was said when
+    its cameras were found from the photographs."""
 
     cameras: tuple[CameraSize, ...]
     front: str
@@ -38,12 +40,14 @@ class CaptureContent:
     board: bool = False
     faults: tuple[Fault, ...] = ()
     checks: Mapping[str, ViewDocument] = field(default_factory=dict)
+    warnings: tuple[ReportWarning, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
     """A capture: where it came from, what people say of it, what is in it, the certificate of the rig's shot, and the
-    verdict on it with its faults (None of what was not judged: the board, captures of earlier versions)."""
+    verdict on it with its faults (None of what was not judged: the board, captures of earlier versions). ``warnings``:
+    what every result of it will be warned of."""
 
     id: str
     created: str
@@ -60,6 +64,7 @@ class CaptureRecord:
     board: bool = False
     verdict: str | None = None
     faults: tuple[Fault, ...] = ()
+    warnings: tuple[ReportWarning, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +77,14 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRecord:
-    """``pictures``: their number by camera."""
+    """``pictures``: their number by camera; ``kind``: of what, board or scene."""
 
     id: str
     created: str
     source: str
     label: str
     pictures: dict[str, int]
+    kind: str = "board"
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,7 +62,8 @@ def segment_once(
 
 def _key(capture: Capture, settings: SegmentationSettings) -> str:
     inputs = {name: digest for name, digest in capture.digests.items() if name != "features.json"}
-    document = [inputs, dataclasses.asdict(settings), version("eigenhead"), cv2.__version__, _code()]
+    sizes = {name: image.shape for name, image in capture.images.items()}  # large pictures are read smaller
+    document = [inputs, sizes, dataclasses.asdict(settings), version("eigenhead"), cv2.__version__, _code()]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 

@@ -1,4 +1,5 @@
-"""What a calibration runs in a child process: an archive of board pictures in, a rig and its report out."""
+"""What a calibration runs in a child process: an archive of board pictures, or of photographs of a scene, in; a rig and
+its report out. A folder with board.toml is of a board."""
 
 import hashlib
 import json
@@ -11,16 +12,65 @@ from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.capture_folder import capture_root
 from server.storage.records import CalibrationOutcome
 from server.tasks.child import Bench, Report
+from server.tasks.photographs import SCALE, check_sizes
 
+BOARD = "board.toml"
 STAGES_S = {"detection": 0.055, "lenses": 0.03, "pose graph": 0.005, "bundle": 0.03, "checks": 0.02}
 """Seconds a picture of each stage, in their order: 104 pictures of 640 x 480 from four cameras on a busy machine."""
+SCENE_STAGES_S = {"features": 0.5, "matches": 1.0, "structure": 0.65, "scale": 0.05}
+"""The same of a scene: thirty photographs of 1024 x 768 take 67 s together; how they divide is a guess, which the pace
+of the work corrects. Matching goes by pairs, so that more of them take longer."""
 
 
 def expected(folder: Path) -> dict[str, float]:
     """Seconds of each stage of a calibration, before it has begun: larger pictures take longer, which its own pace soon
     tells."""
     pictures = sum(path.is_file() for path in (folder / "images").rglob("*"))
+    if not is_of_board(folder):
+        return {stage: took * pictures for stage, took in SCENE_STAGES_S.items()}
     return {stage: took * pictures for stage, took in STAGES_S.items()}
+
+
+def is_of_board(folder: Path) -> bool:
+    return (folder / BOARD).is_file()
+
+
+def ingest_photographs(
+    bench: Bench, report: Report, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
+) -> None:
+    """Unpacks photographs of a scene, and scale.json where there is one, into ``folder`` and looks at both. Raises
+    InputError."""
+    from calibration.scene.photographs import find_photographs
+
+    target = Path(folder)
+    unpacked = target.with_name(target.name + ".unpacked")
+    extract_archive(Path(archive), unpacked, limits)
+    root = capture_root(unpacked)
+    found = find_photographs(root)
+    check_sizes((path for shots in found.files.values() for path in shots.values()), image_pixels)
+    for camera, shots in found.files.items():
+        (target / "images" / camera).mkdir(parents=True)
+        for shot, path in shots.items():
+            path.rename(target / "images" / camera / f"{shot}{path.suffix}")
+    if (root / SCALE).is_file():
+        (root / SCALE).rename(target / SCALE)
+    check_scale(target)
+    shutil.rmtree(unpacked)
+
+
+def forget_scene(folder: Path) -> None:
+    """Removes the photographs of a scene, once the work on them ended: they may show a subject, of whom captures alone
+    know and can be erased."""
+    if not is_of_board(folder):
+        shutil.rmtree(folder / "images", ignore_errors=True)
+
+
+def check_scale(folder: Path) -> None:
+    """Raises InputError for a scale.json that does not belong to the photographs beside it."""
+    from rig.formats.scale_json import read_scale
+
+    if (folder / SCALE).is_file():
+        read_scale(folder / SCALE, [path.name for path in (folder / "images").iterdir()])
 
 
 def ingest_board_pictures(bench: Bench, report: Report, *, archive: str, folder: str, limits: ArchiveLimits) -> None:
@@ -32,22 +82,24 @@ def ingest_board_pictures(bench: Bench, report: Report, *, archive: str, folder:
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
-    if not (root / "board.toml").is_file():
+    if not (root / BOARD).is_file():
         raise InputError("archive", ["holds no board.toml beside IMAGES/"])
-    read_board(root / "board.toml")
+    read_board(root / BOARD)
     pictures = next((root / name for name in ("IMAGES", "images") if (root / name).is_dir()), root)
     for camera, shots in list_pictures(pictures).items():
         (target / "images" / camera).mkdir(parents=True)
         for path in shots.values():
             path.rename(target / "images" / camera / path.name)
-    (root / "board.toml").rename(target / "board.toml")
+    (root / BOARD).rename(target / BOARD)
     shutil.rmtree(unpacked)
 
 
 def calibrate_folder(
     bench: Bench, report: Report, *, folder: str, result: str, previous: str | None, cache: str, front: str | None
 ) -> CalibrationOutcome:
-    """``calibrate()`` and its files; returns what the record shows."""
+    """``calibrate()``, or ``calibrate_scene()``, and its files; returns what the record shows."""
+    if not is_of_board(Path(folder)):
+        return _calibrate_scene(report, Path(folder), Path(result), front)
     from calibration.board.board import read_board
     from calibration.calibrate import calibrate
     from calibration.report import write_report
@@ -58,7 +110,7 @@ def calibrate_folder(
     try:
         found = calibrate(
             Path(folder) / "images",
-            read_board(Path(folder) / "board.toml"),
+            read_board(Path(folder) / BOARD),
             front=front,
             previous=known,
             cache=Path(cache),
@@ -79,4 +131,32 @@ def calibrate_folder(
         "warnings": document["warnings"],
         "front": document["front"],
         "sha256": digest,
+    }
+
+
+def _calibrate_scene(report: Report, folder: Path, result: Path, front: str | None) -> CalibrationOutcome:
+    from calibration.result import CalibrationRefused
+    from calibration.scene.report import write_scene_report
+    from calibration.scene.scene import calibrate_scene
+    from calibration.scene.verdict import judge_scene
+    from rig.formats.cameras_json import write_rig
+
+    scale = folder / SCALE
+    try:
+        found = calibrate_scene(folder / "images", scale=scale if scale.is_file() else None, front=front, report=report)
+    except CalibrationRefused as error:
+        raise InputError("calibration", error.reasons) from error
+    verdict = judge_scene(found)
+    write_scene_report(found, result / "report.html")
+    write_rig(found.rig, result / "cameras.json")
+    judged = {"verdict": verdict.word, "missing": [*verdict.missing], **found.document()}
+    write_atomically(result / "calibration.json", json.dumps(judged, indent=1).encode())
+    return {
+        "verdict": verdict.word,
+        "missing": [*verdict.missing],
+        "figures": found.figures(),
+        "checks": [],
+        "warnings": [*found.warnings],
+        "front": found.front,
+        "sha256": hashlib.sha256((result / "cameras.json").read_bytes()).hexdigest(),
     }

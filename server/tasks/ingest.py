@@ -6,11 +6,14 @@ Camera by camera, so that a rig of 64 large cameras is checked in the memory of 
 import hashlib
 import json
 import shutil
+from dataclasses import replace
+from glob import escape
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
+from pipeline.diagnostics import ReportWarning
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
@@ -18,14 +21,25 @@ from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
-from rig.formats.capture_folder import capture_root, picture_folder, read_shot, size_fault, stray_faults
+from rig.formats.cameras_json import read_rig
+from rig.formats.capture_folder import (
+    BESIDE_PICTURES,
+    by_serial,
+    capture_root,
+    listed_pictures,
+    picture_folder,
+    read_shot,
+    size_fault,
+    stray_faults,
+)
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
 from rig.plausibility import rig_faults
+from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import Bench, Report
-from server.tasks.photographs import calibrate_photographs, photographs_alone
+from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, check_sizes, photographs_alone
 
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -41,9 +55,11 @@ def ingest_archive(
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
-    if photographs_alone(root):
-        _calibrate(root, image_pixels, report)
+    told = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
+    _name_by_camera(root)
     described = check_capture(root, image_pixels, report)
+    if told is not None:
+        described = _with_calibration(described, root, told)
     for name in described.inputs:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).rename(target / name)
@@ -51,20 +67,65 @@ def ingest_archive(
     return described
 
 
-def _calibrate(root: Path, image_pixels: int, report: Report) -> None:
-    """Leaves cameras.json beside photographs that came alone. Raises InputError with the views that did not join."""
+def _calibrate(root: Path, image_pixels: int, report: Report) -> tuple[ReportWarning, ...]:
+    """Leaves cameras.json and calibration.json beside photographs that came alone, and only those that joined. Raises
+    InputError with the views that did not."""
     from calibration.result import CalibrationRefused
 
     files = [path for path in picture_folder(root).rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
-    sizes = {path: picture_size(path) for path in files}  # headers, before anything is decoded
-    huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
-    if huge:
-        raise InputError("capture", [f"{fault}; at most {image_pixels:,} pixels are accepted" for fault in huge])
+    check_sizes(files, image_pixels)
     try:
-        calibrate_photographs(root, root, front=None, report=report)
+        told = calibrate_photographs(root, root, front=None, report=report)
     except CalibrationRefused as refusal:
         told = f"{NO_RIG}, and its photographs alone do not tell the cameras"
         raise InputError("capture", [told, *refusal.reasons]) from refusal
+    _leave_out(root, read_rig(root / CAMERAS))
+    return told
+
+
+def _name_by_camera(root: Path) -> None:
+    """Gives pictures the names by which the service asks for them, images/<camera>.<ext>, wherever the archive has them
+    and whatever it calls those that have their body's serial number. Raises InputError where that cannot be told."""
+    for files in filed_by_serial(root).values():
+        for name, path in files.items():
+            path.rename(path.with_name(name + path.suffix.lower()))
+    pictures, images = picture_folder(root), root / "images"
+    images.mkdir(exist_ok=True)
+    for path in [*pictures.iterdir()]:
+        own = listed_pictures(path) if path.is_dir() and path.name not in (*BESIDE_PICTURES, "images") else []
+        if len(own) == 1 and not any(images.glob(f"{escape(path.name)}.*")):  # a camera's folder
+            own[0].rename(images / (path.name + own[0].suffix))
+        elif path.parent != images and path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
+            path.rename(images / path.name)
+
+
+def filed_by_serial(root: Path) -> dict[str, dict[str, Path]]:
+    """``by_serial`` of a capture folder; nothing where its cameras cannot be read, which ``check_capture`` tells.
+    Raises InputError."""
+    rig_file, faults = find_rig_file(root), list[str]()
+    try:
+        rig = None if rig_file is None else read_rig_file(rig_file)
+    except InputError:
+        return {}
+    found = {} if rig is None else by_serial(root, rig, faults)
+    if faults:
+        raise InputError("capture", faults)
+    return found
+
+
+def _leave_out(root: Path, rig: Rig) -> None:
+    """Removes what belongs to views that did not join, which the warnings name."""
+    for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES)):
+        for path in [*folder.iterdir()] if folder.is_dir() else ():
+            own = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
+            if own and (path.name if path.is_dir() else path.stem) not in rig and path.name not in BESIDE_PICTURES:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _with_calibration(found: CaptureContent, root: Path, told: tuple[ReportWarning, ...]) -> CaptureContent:
+    """With the figures of the calibration, of which a job reads what was said."""
+    inputs = dict(sorted({**found.inputs, FIGURES: _sha256(root / FIGURES)}.items()))
+    return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=told)
 
 
 def ingest_folder(

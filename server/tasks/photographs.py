@@ -6,24 +6,28 @@ calibration.html; then masks/. A second run with the same photographs takes them
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.spread_views import spread_views
 from pipeline.settings import SegmentationSettings
 from rig.atomic_write import write_atomically
+from rig.camera import Intrinsics
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file
 from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.capture_folder import capture_root, picture_folder, read_capture, read_shot
-from rig.formats.images import IMAGE_SUFFIXES, write_image
+from rig.formats.images import IMAGE_SUFFIXES, picture_size, write_image
+from rig.formats.work_size import WORK_PIXELS, work_rig
 from rig.rig import Rig
 
 Report = Callable[[str, float], None]
@@ -53,25 +57,23 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Re
 
     Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
     if not photographs_alone(folder):
-        return Prepared(*read_capture(folder), ())
+        return Prepared(*read_capture(folder, pixels_most=WORK_PIXELS), ())
     root = capture_root(folder)
     kept.mkdir(parents=True, exist_ok=True)
     warnings = calibrate_photographs(root, kept, front=front, report=report)
     rig, faults = read_rig(kept / CAMERAS), list[str]()
-    capture = read_shot(root, rig, faults)
+    capture = read_shot(root, rig, faults, pixels_most=WORK_PIXELS)
     if faults:
         raise InputError("capture", faults)
     digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
-    return Prepared(replace(capture, digests=dict(sorted(digests.items()))), rig, warnings)
+    return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Report) -> tuple[ReportWarning, ...]:
     """Leaves cameras.json and its report in ``kept``, unless they are there and of the same photographs."""
     made_of = _made_of(root, front)
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
-        if document["made_of"] == made_of and document["cameras_sha256"] == _sha256(kept / CAMERAS):
-            return tuple(ReportWarning(told["code"], told["message"]) for told in document["told"])
+    if (told_before := calibration_warnings(kept, made_of)) is not None:
+        return told_before
     from calibration.scene.report import write_scene_report
     from calibration.scene.scene import calibrate_scene
 
@@ -79,7 +81,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     found = calibrate_scene(root, scale=scale if scale.is_file() else None, front=front, report=report)
     told = [ReportWarning("view-left-out", why) for why in found.left_out.values()]
     if found.scale.assumed:
-        told.append(ReportWarning("scale-assumed", f"the scale is {found.scale.told}; give scale.json to know it"))
+        told.append(ReportWarning("scale-assumed", f"the scale is {found.scale.told}"))
     rig = found.rig
     if len(rig) > CAMERAS_MOST:
         rig = rig.subset(spread_views(rig, CAMERAS_MOST))
@@ -97,6 +99,25 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     return tuple(told)
 
 
+def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -> tuple[ReportWarning, ...] | None:
+    """What was said when the cameras beside it were found, as ``calibrate_photographs`` left it; None where they were
+    not found from photographs, or not from those of ``made_of``."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
+        same = made_of is None or document["made_of"] == made_of
+        if same and document["cameras_sha256"] == _sha256(kept / CAMERAS):
+            return tuple(ReportWarning(told["code"], told["message"]) for told in document["told"])
+    return None
+
+
+def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
+    """Sizes as the headers say, before anything is decoded. Raises InputError naming every one that is too large."""
+    sizes = {path: picture_size(path) for path in files}
+    huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
+    if huge:
+        raise InputError("capture", [f"{fault}; at most {image_pixels:,} pixels are accepted" for fault in huge])
+
+
 def keep_masks(
     kept: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Report
 ) -> dict[str, Silhouette]:
@@ -109,6 +130,7 @@ def keep_masks(
         return segment(capture, rig, settings, report=report)
     masks = kept / "masks"
     masks.mkdir(parents=True, exist_ok=True)
+    full = read_rig(kept / CAMERAS) if (kept / CAMERAS).is_file() else rig
     before = set(masks.glob(f"*{SUFFIX}"))
     found = segment_once(masks, capture, rig, settings, report=report)
     made = set(masks.glob(f"*{SUFFIX}")) - before
@@ -116,8 +138,14 @@ def keep_masks(
         path.unlink(missing_ok=True)
     for name, silhouette in found.items():
         if made or not (masks / f"{name}.png").is_file():
-            write_image(masks / f"{name}.png", silhouette.mask.astype(np.uint8) * 255)
+            write_image(masks / f"{name}.png", _of_file(silhouette.mask, full[name].intrinsics))
     return found
+
+
+def _of_file(mask: Bool[np.ndarray, "h w"], k: Intrinsics) -> UInt8[np.ndarray, "y x"]:
+    """A mask of the size of its picture's file, which was perhaps read smaller."""
+    large = cv2.resize(mask.astype(np.uint8) * np.uint8(255), (k.width, k.height), interpolation=cv2.INTER_LINEAR)
+    return (large > 127).astype(np.uint8) * np.uint8(255)
 
 
 def _made_of(root: Path, front: str | None) -> dict[str, str]:
@@ -125,6 +153,7 @@ def _made_of(root: Path, front: str | None) -> dict[str, str]:
     from importlib.metadata import version
 
     files = [path for path in sorted(picture_folder(root).rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES]
+    files += sorted((root / "masks").glob("*"))
     files += [root / SCALE] if (root / SCALE).is_file() else []
     digests = {path.relative_to(root).as_posix(): _sha256(path) for path in files}
     return {**digests, "front": front or "", "version": version("eigenhead"), "pycolmap": version("pycolmap")}

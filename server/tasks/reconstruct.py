@@ -1,6 +1,7 @@
 """What a job runs in a worker's child process: files in, ``reconstruct()``, files out."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -50,8 +51,10 @@ def reconstruct_capture(
     from pipeline.settings import settings_from_document
     from pipeline.templates.load import load_template
     from rig.formats.capture_folder import read_capture
+    from rig.formats.work_size import WORK_PIXELS
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
+    from server.tasks.photographs import calibration_warnings
     from server.tasks.prepare import prepare_kernels
 
     chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
@@ -61,7 +64,7 @@ def reconstruct_capture(
     head_model = bench.keep(f"model {name}", lambda: load_model(name))
     template = load_template(chosen.outputs.template, head_model)
     renderer = bench.keep("renderer", Renderer.create)
-    shot, rig = read_capture(Path(capture))
+    shot, rig = read_capture(Path(capture), pixels_most=WORK_PIXELS)
 
     def tell(stage: str, fraction: float) -> None:
         if stage != DONE:  # the files are still to be written
@@ -69,4 +72,6 @@ def reconstruct_capture(
 
     done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=once)
     report("write", 0.0)
+    told = calibration_warnings(Path(capture)) or ()
+    done = replace(done, warnings=(*told, *done.warnings))
     write_result(Path(result), done, shot, template)

@@ -158,10 +158,15 @@ async def receive_capture(service: Service, request: Request) -> tuple[CaptureRe
     return record, fields
 
 
-async def receive_board_pictures(service: Service, request: Request) -> Calibration:
-    """Receives a multipart archive of IMAGES/ and board.toml and queues a calibration."""
+async def receive_calibration_pictures(service: Service, request: Request) -> Calibration:
+    """Receives a multipart archive of IMAGES/ and board.toml, or, where ``from`` is ``scene``, of photographs, and
+    queues a calibration."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.settings, service.threads)
         label = (fields.get("label") or "")[:500]
-        return await service.threads.check(service.accept_board_pictures, archive, folder, label)
+        accept = {"board": service.accept_board_pictures, "scene": service.accept_photographs}
+        source = fields.get("from") or "board"
+        if source not in accept:
+            raise Problem(422, "invalid-request", "from is neither 'board' nor 'scene'.", [f"from: {source!r:.80}"])
+        return await service.threads.check(accept[source], archive, folder, label)

@@ -42,7 +42,7 @@ from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store, move_durably
-from server.tasks.calibrate import calibrate_folder, expected
+from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
@@ -208,6 +208,8 @@ class Worker:
             meter.tick()
             return False
 
+        for left in folder.glob("attempt-*"):  # of a worker that was killed
+            shutil.rmtree(left, ignore_errors=True)
         try:
             with self._children.one() as child:
                 result = child.remote(calibrate_folder, report=meter.report, cancelled=tick)(
@@ -221,7 +223,11 @@ class Worker:
             move_durably(attempt, folder / "result")
         except BaseException as error:
             shutil.rmtree(attempt, ignore_errors=True)
-            raise self._failure(error) from error
+            failed = self._failure(error)
+            if isinstance(failed, JobFailed):
+                forget_scene(folder)
+            raise failed from error
+        forget_scene(folder)
         return result
 
     def publish(self, job_id: str, attempt: str) -> dict[str, FileEntry]:

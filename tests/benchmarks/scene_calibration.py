@@ -1,13 +1,14 @@
 """Calibration from photographs alone, judged by published poses or by the simulated studio's truth. From the root:
 
 python -m tests.benchmarks.scene_calibration buddha [--every 2] [--size 0.5]
-python -m tests.benchmarks.scene_calibration studio [--captures 10] [--views 30]
+python -m tests.benchmarks.scene_calibration studio [--captures 10] [--views 30] [--masks]
 """
 
 import argparse
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,9 @@ from calibration.result import CalibrationRefused
 from calibration.scene.result import SceneCalibration
 from calibration.scene.scene import calibrate_scene
 from pipeline.eigenheads.model import load_model
+from pipeline.settings import SegmentationSettings
+from pipeline.silhouettes.segment import segment
+from rig.capture import Capture
 from rig.formats.capture_folder import write_capture
 from rig.formats.images import read_image, write_image
 from rig.render.renderer import Renderer
@@ -53,14 +57,19 @@ def buddha(every: int, size: float) -> tuple[SceneCalibration, Agreement]:
     return found, agreement(found.structure, read_projections(shared("data/buddha") / "projections.json", size))
 
 
-def studio(seed: int, views: int) -> tuple[SceneCalibration, Rig]:
-    """A capture of the studio, stripped of everything but its photographs, and where its cameras are."""
+def studio(seed: int, views: int, *, masks: bool = False) -> tuple[SceneCalibration, Rig]:
+    """A capture of the studio, stripped of everything but its photographs (and ``masks`` from its plates), and where
+    its cameras are."""
     rng = np.random.default_rng(seed)
     with Renderer.create() as renderer, tempfile.TemporaryDirectory() as folder:
         subject = drawn_subject(load_model(), rng)
         taken = simulate(subject, rig_from_directions(directions_deg(views)), PRESET, rng, renderer=renderer)
-        write_capture(Path(folder), type(taken.capture)(taken.capture.images), taken.rig)
-        return calibrate_scene(Path(folder) / "images"), taken.scene.true_rig
+        own = Capture(taken.capture.images)
+        if masks:
+            found = segment(taken.capture, taken.rig, SegmentationSettings(), report=lambda stage, share: None)
+            own = replace(own, masks={name: one.mask for name, one in found.items()})
+        write_capture(Path(folder), own, taken.rig)
+        return calibrate_scene(Path(folder)), taken.scene.true_rig
 
 
 def _say(text: str) -> None:
@@ -78,11 +87,11 @@ def _print_buddha(every: int, size: float) -> None:
     _say(f"against the published poses: {agrees}")
 
 
-def _print_studio(captures: int, views: int) -> None:
+def _print_studio(captures: int, views: int, *, masks: bool) -> None:
     for seed in range(1, captures + 1):
         start = time.process_time()
         try:
-            found, truth = studio(seed, views)
+            found, truth = studio(seed, views, masks=masks)
         except CalibrationRefused as refusal:
             _say(f"seed {seed}: refused: {refusal.reasons[0]}")
             continue
@@ -94,6 +103,8 @@ def _print_studio(captures: int, views: int) -> None:
             f"{away.max():.2f} worst, claimed {np.median(found.uncertainty.pose_sigma_px):.2f}; "
             f"assumed scale {sizes[0] / sizes[1]:.3f} of the true one; CPU {time.process_time() - start:.0f} s"
         )
+        if found.refinement is not None:
+            _say(f"    {found.refinement}")
 
 
 if __name__ == "__main__":
@@ -103,8 +114,9 @@ if __name__ == "__main__":
     parser.add_argument("--size", type=float, default=1.0)
     parser.add_argument("--captures", type=int, default=10)
     parser.add_argument("--views", type=int, default=30)
+    parser.add_argument("--masks", action="store_true")
     given = parser.parse_args()
     if given.what == "buddha":
         _print_buddha(given.every, given.size)
     else:
-        _print_studio(given.captures, given.views)
+        _print_studio(given.captures, given.views, masks=given.masks)

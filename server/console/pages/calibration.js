@@ -6,9 +6,9 @@ export default {
   mixins: [liveView],
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ chosen: new URLSearchParams(location.search).get("calibration"), sure: false, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000", measured_width_mm: null, inverted: false, ...kept("board") }, label: kept("calibration name") || "", busy: "", over: false, upload: null }),
+  data: () => ({ chosen: new URLSearchParams(location.search).get("calibration"), sure: false, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000", measured_width_mm: null, inverted: false, ...kept("board") }, label: kept("calibration name") || "", busy: "", source: kept("calibration source") || "board", over: false, upload: null }),
   watch: { chosen(id) { keepAddress({ calibration: id }); this.sure = false; },
-    board: { handler(board) { keepDraft("board", board); }, deep: true }, label(text) { keepDraft("calibration name", text); },
+    board: { handler(board) { keepDraft("board", board); }, deep: true }, label(text) { keepDraft("calibration name", text); }, source(of) { keepDraft("calibration source", of); },
     "state.board": { handler(board) { if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board); }, immediate: true },
     "state.rig.kind": { handler(kind) { if (kind === "real") this.look(); }, immediate: true } }, // nobody holds a board in the simulated studio
   computed: {
@@ -31,30 +31,31 @@ export default {
           <button class="b" id="use" :class="{ 'main-action': current.verdict !== 'poor' }" :disabled="!!busy || current.in_use || current.state !== 'succeeded'" @click="current.verdict === 'poor' ? (sure = true) : act('use', { id: current.id })">{{ current.in_use ? 'In use' : current.verdict === 'poor' ? 'Use this ...' : 'Use this' }}</button></template></header>
       <div class="columns" style="grid-template-columns: 19rem minmax(0, 1fr)">
         <div class="stack" style="min-height: 0">
-          <div :class="['drop', { over }]">Drop board pictures here: an archive of IMAGES/ and board.toml
-            <div style="margin-top: .4rem"><button class="b" @click="$refs.file.click()">Choose a file</button><input ref="file" type="file" hidden accept=".zip,.tar,.gz,.tgz" aria-label="Archive of board pictures" @change="take($event.target.files); $event.target.value = ''"></div></div>
+          <div :class="['drop', { over }]"><label class="field">Calibrate from<select v-model="source" id="source"><option value="board">pictures of a board</option><option value="scene">the photographs (no board)</option></select></label>
+            <div class="small" style="margin-top: .4rem">{{ source === 'board' ? 'Drop an archive of IMAGES/ and board.toml here' : 'Drop an archive of photographs here: 20 to 40, 10 to 15 degrees apart, of anything that holds still; scale.json beside them makes the scale known' }}</div>
+            <div style="margin-top: .4rem"><button class="b" @click="$refs.file.click()">Choose a file</button><input ref="file" type="file" hidden accept=".zip,.tar,.gz,.tgz" aria-label="Archive of pictures" @change="take($event.target.files); $event.target.value = ''"></div></div>
           <div v-if="upload" class="panel pad small stack" style="gap: .3rem" role="status"><div class="line"><span class="grow cut">{{ upload.name }}</span><span class="num">{{ upload.state }}</span><button class="b quiet" aria-label="Close" @click="upload = null">&times;</button></div>
             <template v-if="upload.detail"><p class="fault">{{ upload.detail }}</p><ul class="faults"><li v-for="(e, i) in upload.errors" :key="i">{{ e }}</li></ul></template></div>
           <div class="panel scroll grow" tabindex="0" role="region" aria-label="History of calibrations" data-scroll="calibrations">
             <p v-if="!state.loading && !list.length" class="muted small" style="padding: .8rem">No calibrations yet. Take board shots at the right, or drop an archive above.</p>
             <button v-for="c in list" :key="c.id" class="row-button" :data-calibration="c.id" :data-state="c.state" :aria-current="current && c.id === current.id" @click="chosen = c.id">
               <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span class="tag" :class="{ accent: c.in_use || c.state === 'running', fault: c.state === 'failed' }">{{ c.in_use ? 'in use' : c.state === 'running' ? Math.round(100 * c.progress) + ' %' : c.state === 'succeeded' && c.verdict ? c.verdict : c.state }}</span></span>
-              <span class="small muted">{{ clock(c.created) }} &middot; {{ Object.keys(c.pictures).length }} cameras<template v-if="c.figures.rms_px"> &middot; {{ fixed(c.figures.rms_px, 2) }} px</template></span></button>
+              <span class="small muted">{{ clock(c.created) }} &middot; {{ Object.keys(c.pictures).length }} cameras<template v-if="c.kind === 'scene'">, no board</template><template v-if="c.figures.rms_px"> &middot; {{ fixed(c.figures.rms_px, 2) }} px</template></span></button>
           </div>
         </div>
         <div v-if="current" class="panel pad scroll stack" tabindex="0" role="region" aria-label="Report">
           <div class="line wrap"><h2>{{ current.label || clock(current.created) }}</h2><span class="tag" :class="{ accent: current.in_use, fault: current.state === 'failed' }">{{ current.in_use ? 'in use' : current.state }}</span></div>
           <template v-if="current.error"><p class="fault">{{ current.error.detail }}</p><ul class="faults small"><li v-for="(e, i) in current.error.errors" :key="i">{{ e }}</li></ul></template>
           <ul v-if="current.warnings.length" class="faults small"><li v-for="(w, i) in current.warnings" :key="i" class="warn">{{ w }}</li></ul>
-          <div v-if="['queued', 'running'].includes(current.state)" class="stack" role="status"><div class="line"><strong class="grow">{{ current.state === 'queued' ? 'Waiting for the worker' : stageWords(current.stage || 'detection') }}</strong><span class="num">{{ Math.round(100 * current.progress) }} %</span><span v-if="current.eta_s !== null && current.state === 'running'" class="num muted">about {{ span(current.eta_s) }} left</span></div>
+          <div v-if="['queued', 'running'].includes(current.state)" class="stack" role="status"><div class="line"><strong class="grow">{{ current.state === 'queued' ? 'Waiting for the worker' : stageWords(current.stage || (current.kind === 'scene' ? 'features' : 'detection')) }}</strong><span class="num">{{ Math.round(100 * current.progress) }} %</span><span v-if="current.eta_s !== null && current.state === 'running'" class="num muted">about {{ span(current.eta_s) }} left</span></div>
             <div class="bar" role="progressbar" aria-label="Progress of the calibration" :aria-valuenow="Math.round(100 * current.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * current.progress + '%' }"></i></div></div>
           <div v-if="current.verdict" class="stack" id="calibration-verdict" role="region" aria-label="Verdict" :data-verdict="current.verdict" style="gap: .35rem"><div class="line wrap"><span class="tag" :class="{ good: 'good', usable: 'warn', poor: 'fault' }[current.verdict]">{{ { good: 'Good', usable: 'Usable', poor: 'Poor' }[current.verdict] }}</span><span>{{ { good: 'Every camera is known well enough.', usable: 'Enough for heads; better ones are had with what is missing.', poor: 'Not enough: heads made with it would be wrong.' }[current.verdict] }}</span></div>
             <ul v-if="current.missing.length" class="faults small" aria-label="What is missing"><li v-for="(m, i) in current.missing" :key="i">{{ m }}</li></ul></div>
           <div v-if="sure && current.verdict === 'poor' && !current.in_use" class="panel pad line wrap small" role="alertdialog" aria-label="Use a poor calibration" style="border-color: var(--warn)"><span class="grow warn">Every capture from now on would get cameras that are not known well enough.</span><button class="b main-action" @click="sure = false; chosen = null">Take more shots</button><button class="b" id="use-poor" :disabled="!!busy" @click="act('use', { id: current.id, poor: true })">Use it all the same</button></div>
           <template v-if="current.state === 'succeeded'">
-            <div class="line wrap" style="gap: 2rem"><div><div class="small muted">Residual</div><div class="mono" style="font-size: 1.4rem">{{ fixed(current.figures.rms_px, 2) }} px</div></div><div><div class="small muted">Corners used</div><div class="mono" style="font-size: 1.4rem">{{ fixed(100 * current.figures.used_share, 1) }} %</div></div><div><div class="small muted">Front camera</div><div class="mono" style="font-size: 1.4rem">{{ current.front }}</div></div></div>
+            <div class="line wrap" style="gap: 2rem"><div><div class="small muted">Residual</div><div class="mono" style="font-size: 1.4rem">{{ fixed(current.figures.rms_px, 2) }} px</div></div><div><div class="small muted">{{ current.kind === 'scene' ? 'Matched points used' : 'Corners used' }}</div><div class="mono" style="font-size: 1.4rem">{{ fixed(100 * current.figures.used_share, 1) }} %</div></div><div><div class="small muted">Front camera</div><div class="mono" style="font-size: 1.4rem">{{ current.front }}</div></div></div>
             <div class="columns" style="grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); flex: none">
-              <div class="stack"><h3>Checks</h3><table class="small"><tbody><tr v-for="c in current.checks" :key="c.name"><td><i role="img" :aria-label="c.passed === null ? 'not checked' : c.passed ? 'passed' : 'failed'" :class="['dot', c.passed === null ? '' : c.passed ? 'good' : 'fault']"></i></td><td style="white-space: nowrap">{{ c.name }}</td><td>{{ c.detail }}<div v-if="c.passed === false && c.advice" class="warn">{{ c.advice }}</div></td></tr></tbody></table></div>
+              <div v-if="current.checks.length" class="stack"><h3>Checks</h3><table class="small"><tbody><tr v-for="c in current.checks" :key="c.name"><td><i role="img" :aria-label="c.passed === null ? 'not checked' : c.passed ? 'passed' : 'failed'" :class="['dot', c.passed === null ? '' : c.passed ? 'good' : 'fault']"></i></td><td style="white-space: nowrap">{{ c.name }}</td><td>{{ c.detail }}<div v-if="c.passed === false && c.advice" class="warn">{{ c.advice }}</div></td></tr></tbody></table></div>
               <div class="stack"><h3>Residual by camera</h3><table class="small"><tbody><tr v-for="[name, f] in cameras" :key="name"><td>{{ name }}</td><td class="num">{{ fixed(f.rms_px, 2) }} px</td><td class="num muted">{{ current.pictures[name] }} pictures</td></tr></tbody></table></div>
             </div></template>
         </div>
@@ -91,7 +92,7 @@ export default {
       if (!file) return;
       this.upload = { name: file.name, state: "0 %", detail: "", errors: [] };
       const mine = this.upload;
-      const { status, document } = await send("/console/calibrations", file, { label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => (mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking"));
+      const { status, document } = await send("/console/calibrations", file, { from: this.source, label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => (mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking"));
       if (status === 202) { this.upload = null; this.chosen = document.id; window.eigenheadSay("done", "The calibration is queued."); }
       else { mine.state = "refused"; mine.detail = document.detail; mine.errors = document.errors || []; }
     },

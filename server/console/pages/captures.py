@@ -64,6 +64,7 @@ class CaptureLine(TypedDict):
     sizes: dict[str, tuple[int, int]]
     verdict: str | None
     faults: list[FaultDocument]
+    warnings: list[dict[str, str]]
     sync: SyncLine | None
 
 
@@ -183,6 +184,7 @@ def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine
         "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
         "verdict": record.verdict,
         "faults": [fault.document() for fault in record.faults],
+        "warnings": [asdict(warning) for warning in record.warnings],
         "sync": None if record.shot is None else sync_line(record.shot),
     }
 

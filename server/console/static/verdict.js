@@ -42,6 +42,7 @@ export const Verdict = {
     <div class="stack verdict" role="region" aria-label="Verdict" :data-verdict="capture.verdict || 'none'" style="gap: .35rem">
       <div class="line wrap"><span class="tag" :class="tag.kind">{{ tag.text }}</span><span>{{ sentence }}</span><span v-if="capture.sync" class="muted small push" :class="{ warn: !capture.sync.good }">{{ capture.sync.text }}</span></div>
       <ul v-if="lines.length" class="faults small"><li v-for="line in lines" :key="line.code" :data-fault="line.code"><strong class="warn">{{ line.cameras.join(', ') }}: {{ line.title }}.</strong> {{ line.details.slice(0, 3).join('; ') }}{{ line.details.length > 3 ? ' ...' : '' }}. <span>To do: {{ line.remedy }}.</span></li></ul>
+      <ul v-if="capture.warnings?.length" class="faults small" aria-label="Warnings"><li v-for="told in capture.warnings" :key="told.message" :data-warning="told.code" class="warn">{{ told.message }}</li></ul>
     </div>`,
 };
 

@@ -9,9 +9,9 @@ from fastapi.responses import FileResponse
 from pydantic import ValidationError
 
 from server.http.auth import ServiceOf, require
-from server.http.schemas import CalibrationList, CalibrationOut, NewCalibration
+from server.http.calibration_schemas import CalibrationList, CalibrationOut, NewCalibration
 from server.services.keys import Caller
-from server.wire.multipart import check_length, described_form, receive_board_pictures
+from server.wire.multipart import check_length, described_form, receive_calibration_pictures
 from server.wire.problems import Problem, Responses, documented
 from server.wire.send_file import send_file
 
@@ -20,19 +20,28 @@ Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
 JSON_BYTES = 1 << 20
 
-BODY = described_form("archive of IMAGES/ and board.toml", ("label",))
+BODY = described_form(
+    "archive of IMAGES/ and board.toml; from a scene of photographs, and scale.json",
+    ("label",),
+    **{"from": "board (without it), or scene: the photographs show no board"},
+)
 BODY["requestBody"]["content"]["application/json"] = {"schema": NewCalibration.model_json_schema()}
 
 
 @router.post("", status_code=202, responses=documented(400, 404, 413, 415, 507), openapi_extra=BODY)
 async def make_calibration(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CalibrationOut:
-    """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took of the board (JSON)."""
+    """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took (JSON): of the board,
+    or, ``"from": "scene"``, of anything."""
     if request.headers.get("content-type", "").partition(";")[0].strip() == "application/json":
         await service.threads.disk(check_length, request, service.store, service.settings)
         wanted = _parsed(await _small_body(request))
-        made = await service.threads.check(service.calibrations.add_shots, wanted.board, wanted.captures, wanted.label)
+        known, shots, label = service.calibrations, wanted.captures, wanted.label
+        if wanted.source == "scene":
+            made = await service.threads.check(known.add_scene, shots, wanted.scale, label)
+        else:
+            made = await service.threads.check(known.add_shots, wanted.board or {}, shots, label)
     else:
-        made = await receive_board_pictures(service, request)
+        made = await receive_calibration_pictures(service, request)
     response.headers["Location"] = f"/v1/calibrations/{made.id}"
     return CalibrationOut.model_validate(made)
 

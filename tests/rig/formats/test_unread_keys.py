@@ -34,9 +34,9 @@ def test_a_key_that_is_not_read_is_named_with_its_place(place: tuple[str, ...], 
 def test_what_all_cameras_have_alike_is_said_once() -> None:
     document = json.loads(json.dumps(document_from_rig(default_layout())))
     for camera in document["cameras"]:
-        camera["serial"] = "x"
+        camera["owner"] = "x"
     (told,) = unread_keys_of(document)
-    assert f"cameras.serial of {len(document['cameras'])} cameras" in told
+    assert f"cameras.owner of {len(document['cameras'])} cameras" in told
 
 
 def test_a_thousand_keys_are_a_few_lines() -> None:

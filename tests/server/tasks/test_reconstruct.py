@@ -1,5 +1,6 @@
 """What a job does, from a capture folder to the files of a result, in this process: a small studio picture set."""
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +35,9 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
 ) -> None:
     write_capture(tmp_path / "capture", shot.capture, shot.rig)
+    told = {"code": "scale-assumed", "message": "as if these cameras had been found from the photographs"}
+    digest = hashlib.sha256((tmp_path / "capture" / "cameras.json").read_bytes()).hexdigest()
+    (tmp_path / "capture" / "calibration.json").write_text(json.dumps({"cameras_sha256": digest, "told": [told]}))
     bench, heard = Bench(), []
     bench.keep("renderer", lambda: renderer)
     reconstruct_capture(
@@ -56,7 +60,8 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     assert order[-1] == "write"  # nothing is called done before its files are there
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert all(camera["used"] for camera in report["cameras"].values())
-    assert {warning["code"] for warning in report["warnings"]} <= {"view"}
+    assert report["warnings"][0] == told
+    assert {warning["code"] for warning in report["warnings"][1:]} <= {"view"}
     face = shot.scene.head.vertices[shot.scene.photographed]
     away, _ = KDTree(read_mesh(tmp_path / "result" / "head.ply").vertices).query(face)
     # A pixel is 2.3 mm at the head here, and outlines are met to half a one.

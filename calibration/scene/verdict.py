@@ -1,0 +1,21 @@
+"""Whether a calibration from the scene is worth using for a rig, and what it lacks: the limits of a board's."""
+
+from calibration.quality.verdict import POSE_GOOD_PX, POSE_POOR_PX, Verdict
+from calibration.scene.result import SceneCalibration
+
+
+def judge_scene(calibration: SceneCalibration) -> Verdict:
+    """By its weakest camera; an assumed scale or a view that did not join leaves it usable at best."""
+    sigma = dict(zip(calibration.rig.names, calibration.uncertainty.pose_sigma_px, strict=True))
+    poor = [name for name, px in sigma.items() if px > POSE_POOR_PX]
+    loose = [name for name, px in sigma.items() if POSE_GOOD_PX < px <= POSE_POOR_PX]
+    mild = [_loose(loose, POSE_GOOD_PX)] if loose else []
+    if calibration.scale.assumed:
+        mild.append(f"the scale is {calibration.scale.told}")
+    mild += calibration.left_out.values()
+    severe = [_loose(poor, POSE_POOR_PX)] if poor else []
+    return Verdict("poor" if severe else "usable" if mild else "good", (*severe, *mild))
+
+
+def _loose(names: list[str], pixels: float) -> str:
+    return f"{', '.join(names)}: pose looser than {pixels:.1f} px at the subject: add views beside it"

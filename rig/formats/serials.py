@@ -1,0 +1,95 @@
+"""Which camera took a picture, by the serial number of the body that cameras write into their files.
+
+Read: EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431) of JPEG, TIFF, PNG, WebP and HEIC, of RAW files that are built
+like TIFF, and of Canon's CR3 (its box CMT2); DNG's CameraSerialNumber (0xC62F). A camera of ``cameras.json`` names its
+body by ``serial``, or has the serial for a name.
+"""
+
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from rig.formats.cameras_json import SERIAL_MOST
+from rig.formats.images import HEIC_SUFFIXES, IMAGE_FORMATS, IMAGE_SUFFIXES, RAW_SUFFIXES, heif_header
+from rig.rig import Rig
+
+BODY_SERIAL, DNG_SERIAL, EXIF_IFD = 0xA431, 0xC62F, 0x8769
+BYTE_ORDERS = {b"II": b"II*\0", b"MM": b"MM\0*"}  # Olympus and Panasonic write another third byte
+CR3_EXIF = re.compile(rb"CMT2(?=II\*\0|MM\0\*)")
+
+
+def camera_serial(path: Path) -> str | None:
+    """The serial number in a picture file; None where there is none, or none that can be read."""
+    with suppress(Exception):  # damaged EXIF fails in more ways than Pillow's documentation has
+        for tags in _tag_sets(path):
+            for tag in (BODY_SERIAL, DNG_SERIAL):
+                text = str(tags.get(tag, "")).strip(" \0\t\r\n")
+                if 0 < len(text) <= SERIAL_MOST and text.isprintable() and text.strip("0"):
+                    return text
+    return None
+
+
+def _tag_sets(path: Path) -> list[Mapping[int, object]]:
+    suffix = path.suffix.lower()
+    if suffix in RAW_SUFFIXES:
+        data = path.read_bytes()
+        if inner := CR3_EXIF.search(data, 0, 1 << 20):
+            return [_exif(data[inner.end() : inner.end() + (1 << 20)])]
+        exif = _exif(BYTE_ORDERS[data[:2]] + data[4:])
+    elif suffix in HEIC_SUFFIXES:
+        exif = _exif(heif_header(path.read_bytes()).info.get("exif") or b"")
+    else:
+        with Image.open(path, formats=IMAGE_FORMATS) as header:
+            exif = header.getexif()
+            return [exif.get_ifd(EXIF_IFD), exif]  # read from the file, which must be open still
+    return [exif.get_ifd(EXIF_IFD), exif]
+
+
+def _exif(data: bytes) -> Image.Exif:
+    found = Image.Exif()
+    found.load(data)
+    return found
+
+
+def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
+    """The rig with the serial of each camera's picture, unless two of them share it: then one body took both."""
+    serials = {name: camera_serial(path) for name, path in pictures.items()}
+    told = [serial for serial in serials.values() if serial is not None]
+    own = {name: serial for name, serial in serials.items() if serial is not None and told.count(serial) == 1}
+    return Rig(tuple(replace(camera, serial=own.get(camera.name, camera.serial)) for camera in rig))
+
+
+def pictures_by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, Path]:
+    """The pictures of ``folder`` that no camera has for a name, each under the camera that took it.
+
+    Nothing is looked at where every camera has a picture of its name; appends a fault for each picture that cannot be
+    told, and for two of one body."""
+    here = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    inside = {path.name for path in folder.iterdir() if path.is_dir()}
+    lacking = [camera for camera in rig if camera.name not in {path.stem for path in here} | inside]
+    strays = [path for path in here if path.stem not in rig]
+    bodies = {camera.serial or camera.name: camera.name for camera in lacking}
+    if not lacking or not strays:
+        return {}
+    serials = {path: camera_serial(path) for path in strays}
+    if not any(serials.values()) and not any(camera.serial for camera in rig):
+        return {}  # an ordinary capture with a picture too many, which others name
+    found: dict[str, Path] = {}
+    for path, serial in serials.items():
+        where = f"{folder.name}/{path.name}"
+        if serial is None:
+            faults.append(f"{where} is no camera's name, and its EXIF has no serial number: name it after its camera")
+        elif serial not in bodies:
+            known = ", ".join(bodies)
+            told = f"{where} was taken by the body {serial}, and cameras without a picture are {known}"
+            faults.append(f"{told}: write its camera's serial into cameras.json, or name it after its camera")
+        elif bodies[serial] in found:
+            other = found[bodies[serial]].name
+            faults.append(f"{where} and {other} were both taken by the body {serial} ({bodies[serial]}): leave one")
+        else:
+            found[bodies[serial]] = path
+    return found

@@ -1,0 +1,67 @@
+"""Large photographs are read smaller: pictures, masks and clean plates, and the cameras that see them so.
+
+A head fills 60 % of a picture's height, so that four megapixels put 0.24 mm of it on a pixel: finer than what depth is
+measured at (0.4 mm, ``DenseSettings.pixel_mm``) and than the vertices of any mesh. Limits in pixels were chosen on
+pictures of 0.8 Mpx: at 12 Mpx outlines still agree, at 24 they are told to contradict their cameras.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from rig.camera import Intrinsics
+from rig.capture import Features
+from rig.rig import Rig
+
+WORK_PIXELS = 4_000_000  # eleven with a plate each take 2.5 GB, at 6 Mpx 3.5 (tests.benchmarks.large_pictures)
+NEAR = 0.15  # a share this near to a half or a quarter becomes it: JPEG is decoded so at a third of the cost
+HALVINGS_MOST = 3  # that decoders know
+
+
+def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
+    """How much smaller a camera's pictures are read, of 1; None: as they are."""
+    pixels = intrinsics.width * intrinsics.height
+    if pixels_most is None or pixels <= pixels_most:
+        return 1.0
+    share = (pixels_most / pixels) ** 0.5
+    return next((h for h in (0.5, 0.25, 0.125) if abs(share / h - 1) < NEAR), share)
+
+
+def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
+    """The cameras of pictures that were read smaller."""
+    shares = {camera.name: work_share(camera.intrinsics, pixels_most) for camera in rig}
+    return Rig(
+        tuple(
+            camera if shares[camera.name] == 1.0 else replace(camera, intrinsics=camera.intrinsics.scaled(share))
+            for camera, share in zip(rig, shares.values(), strict=True)
+        )
+    )
+
+
+def work_features(features: Features, rig: Rig, work: Rig) -> Features:
+    """Points of the files, in the pictures as they were read."""
+
+    def moved(name: str, pixel: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
+        full, own = rig[name].intrinsics, work[name].intrinsics
+        return (pixel + 0.5) * (own.width / full.width, own.height / full.height) - 0.5
+
+    return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
+
+
+def halvings(share: float, size: tuple[int, int]) -> int:
+    """How often a decoder may halve a picture of ``size`` (width, height) that is wanted at ``share`` of it: only where
+    whole blocks of pixels become one, so that none is of half a block."""
+    count = 0
+    while count < HALVINGS_MOST and share <= 0.5 ** (count + 1) and not any(side % 2 ** (count + 1) for side in size):
+        count += 1
+    return count
+
+
+def at_share(pixels: UInt8[np.ndarray, "h w ..."], size: tuple[int, int], share: float) -> UInt8[np.ndarray, "h w ..."]:
+    """The picture of a file of ``size`` (width, height) at ``share`` of it; decoders may have done some of it."""
+    wanted = (round(size[0] * share), round(size[1] * share))
+    if wanted == (pixels.shape[1], pixels.shape[0]):
+        return pixels
+    return cv2.resize(pixels, wanted, interpolation=cv2.INTER_AREA)
