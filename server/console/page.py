@@ -28,7 +28,9 @@ from server.wire.problems import Problem, problem_from
 
 REFRESH_S = 0.5
 STATUS_S = 2.0
+FOLLOW_S = 0.15  # how often a job that was started on a page is looked at: its head opens there as soon as it is done
 FIRST_LOOK_S = 1.0  # so long a page waits to be sent with its state in it, which saves it a turn over the socket
+FOLLOWED_MOST = 50
 KEEP_S = 3600.0  # of a value that is shared by all pages
 KEEP_TIMES = 9.0  # a value is kept so many times as long as it took to make,
 KEEP_MOST_S = 5.0  # but no longer: the one look that waited for a locked database would stand for minutes
@@ -113,9 +115,13 @@ class Page(Element):
         self.props["state"] = {"loading": True}
         self._in_turn = anyio.Lock()
         self._told = ""
+        self._started: tuple[list[str], bool] = ([], False)
+        self._followed: list[str] = []
         self.on("act", self._act)
         self.on("choose", self._choose)
         frame.on("undo", self._undo)
+        frame.on("follow", self._follow)
+        self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
         ui.timer(REFRESH_S, self.refresh, immediate=True)
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
 
@@ -145,6 +151,19 @@ class Page(Element):
         else:
             self.frame.show(status=status)
 
+    def started(self, *jobs: str, opens: bool = False) -> None:
+        """Jobs that an action began: the browser's tab follows them; ``opens``: the head is shown when it is ready."""
+        self._started = ([*jobs], opens)
+
+    def _follow(self, event: GenericEventArguments) -> None:
+        self._followed = [str(job) for job in event.args][:FOLLOWED_MOST]
+        self._following.active = bool(self._followed)
+
+    async def _refresh_followed(self) -> None:
+        ids = tuple(self._followed)
+        found = await anyio.to_thread.run_sync(followed_jobs, self.service, ids, limiter=_threads)
+        self.frame.show(followed=found)
+
     async def _choose(self, event: GenericEventArguments) -> None:
         self.choice |= event.args
         await self.refresh()
@@ -158,7 +177,7 @@ class Page(Element):
             await self._do(arguments.pop("name"), arguments)
 
     async def _do(self, name: str, event: Mapping[str, object]) -> None:
-        done = False
+        done, self._started = False, ([], False)
         try:
             action = UNDO if name == "undo" else self.actions[name]
             said = await anyio.to_thread.run_sync(self._run, action, event, limiter=_threads)
@@ -168,6 +187,8 @@ class Page(Element):
         except Exception as error:
             problem = as_problem(error)
             self.frame.say("fault", problem.detail, problem.errors)
+        if self._started[0]:
+            self.frame.run_method("began", *self._started)
         await self.refresh()
         self.run_method("acted", name, done)  # a form that was refused keeps what was typed
 
@@ -237,6 +258,27 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
     with anyio.move_on_after(FIRST_LOOK_S):
         await drawn.refresh()
     return None
+
+
+class Followed(TypedDict):
+    """How far a job is that was started in this tab of the browser; ``gone`` is the state of one that was removed."""
+
+    id: str
+    state: str
+    progress: float
+
+
+def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
+    def make() -> list[Followed]:
+        known = {job.id: job for job in service.jobs.of(ids)}
+        return [
+            {"id": i, "state": known[i].state, "progress": round(known[i].progress, 2)}
+            if i in known
+            else {"id": i, "state": "gone", "progress": 0.0}
+            for i in ids
+        ]
+
+    return shared.get(("followed", ids), FOLLOW_S / 2, make)
 
 
 class Status(TypedDict):

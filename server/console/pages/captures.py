@@ -229,12 +229,14 @@ def session_line(session: Session) -> SessionLine:
 
 def reconstruct(page: Page, event: WorkForm) -> str:
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
+    page.started(job.id, opens=True)
     return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
 
 
 def reconstruct_session(page: Page, event: WorkForm) -> str:
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
+    page.started(*(job.id for job in jobs))
     return f"Queued {len(jobs)} {'job' if len(jobs) == 1 else 'jobs'}. Watch them on the page Jobs."
 
 
@@ -298,7 +300,9 @@ def bulk(page: Page, event: BulkForm) -> str | None:
     if action == "reconstruct":
         permit(page.caller, "submit")
         work = chosen_work(event)
-        done = each(ids, lambda capture: service.jobs.submit(capture, work, key=page.caller.key))
+        jobs: list[str] = []
+        done = each(ids, lambda capture: jobs.append(service.jobs.submit(capture, work, key=page.caller.key).id))
+        page.started(*jobs)
     elif action == "move":
         done = each(ids, lambda capture: service.captures.edit(capture, {"session": event["id"] or None}))
     elif action == "erase":

@@ -229,6 +229,7 @@ def reconstruct(page: FeaturesPage, event: Sure) -> str | None:
     if picked.points != picked.saved and save(page, event) is None:
         return None
     job = page.service.jobs.submit(picked.capture, Work(), key=page.caller.key)
+    page.started(job.id, opens=True)
     return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
 
 

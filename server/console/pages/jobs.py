@@ -227,6 +227,7 @@ def restart(page: Page, event: RestartForm) -> str:
     wanted = Work(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
+    page.started(job.id, opens=True)
     return f"Queued job {job.id[-6:]}."
 
 
@@ -260,12 +261,13 @@ def bulk(page: Page, event: BulkForm) -> str:
             raise Conflict("job-active", "These jobs are queued or running; cancel them first.")
         remove_all_later(ended, service.jobs.delete, f"{len(ended)} jobs with their heads", "submit")
         return f"{len(ended)} removed."
-    restarted = Work()
+    restarted, begun = Work(), list[str]()
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
-        "restart": lambda job: service.jobs.restart(job, restarted, key=page.caller.key),
+        "restart": lambda job: begun.append(service.jobs.restart(job, restarted, key=page.caller.key).id),
     }
     done = each(event["ids"], actions[action])
+    page.started(*begun)
     shared.forget("jobs")
     said = {"cancel": "cancelled", "restart": "queued again"}[action]
     if done.refused:

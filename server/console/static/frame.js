@@ -1,4 +1,5 @@
 // Navigation, the service's state, messages in the corner, and the keys that work on every page.
+import { started } from "/console/static/started.js";
 import { typing } from "/console/static/words.js";
 
 const MESSAGE_MS = 6000;
@@ -6,8 +7,9 @@ const MESSAGES_MOST = 4;
 const SCROLL_BACK_MS = 3000;
 
 export default {
-  props: { links: Array, current: String, status: Object, removed: Array },
-  emits: ["undo"],
+  mixins: [started],
+  props: { links: Array, current: String, status: Object, removed: Array, followed: Array },
+  emits: ["undo", "follow"],
   data: () => ({ messages: [], next: 1, help: false, look: localStorage.getItem("eigenhead-look") || "dark" }),
   watch: { look: { handler(look) { document.documentElement.dataset.look = look; localStorage.setItem("eigenhead-look", look); }, immediate: true } },
   computed: {
@@ -26,6 +28,7 @@ export default {
           <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
           <div>{{ status.disk || '\\u00a0' }}</div>
           <a v-if="status.local === false" href="/sign-in" style="padding: 0">Other API key</a>
+          <button class="b quiet small" id="sound" style="padding-left: 0; justify-self: start" title="A quiet sound when a head that was begun in this tab is ready" :aria-pressed="sound" @click="turnSound">Sound {{ sound ? 'on' : 'off' }}</button>
           <div class="line"><span><kbd>?</kbd> keys</span><button class="b quiet small push" id="look" :aria-pressed="look === 'light'" @click="turn">{{ look === 'light' ? 'Dark' : 'Light' }}</button></div>
         </div>
       </nav>
@@ -33,7 +36,7 @@ export default {
       <div class="messages" role="log" aria-live="polite" aria-label="Messages">
         <div v-for="r in removed" :key="r.id" class="message line"><span class="grow">Removed: {{ r.title }}</span><button class="b" @click="$emit('undo', r.id)">Undo</button></div>
         <div v-for="m in messages" :key="m.id" :class="['message', m.kind]">
-          <div class="grow"><div>{{ m.text }}</div>
+          <div class="grow"><div>{{ m.text }} <a v-if="m.link" :href="m.link">Open it</a></div>
             <ul v-if="m.faults.length" class="faults small muted"><li v-for="(f, i) in m.faults" :key="i">{{ f }}</li></ul></div>
           <button class="b quiet" aria-label="Close message" @click="drop(m.id)">&times;</button>
         </div>
@@ -52,10 +55,10 @@ export default {
   mounted() { window.addEventListener("keydown", this.key); document.addEventListener("scroll", this.scrolled, true); this.scrollBack(); },
   unmounted() { window.removeEventListener("keydown", this.key); document.removeEventListener("scroll", this.scrolled, true); clearInterval(this.scrolling); },
   methods: {
-    say(kind, text, faults) {
+    say(kind, text, faults, link) {
       const id = this.next++, further = faults.filter((fault) => !text.includes(fault));
-      this.messages = [...this.messages, { id, kind, text, faults: further }].slice(-MESSAGES_MOST);
-      if (kind === "done") setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
+      this.messages = [...this.messages, { id, kind, text, link, faults: further }].slice(-MESSAGES_MOST);
+      if (kind === "done" && !link) setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
     },
     turn() { this.look = this.look === "light" ? "dark" : "light"; },
     place(name) { return `eigenhead scroll ${location.pathname} ${name}`; },
