@@ -15,6 +15,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
+from rig.errors import InputError
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
 from server.console.theme import Frame, page_frame
@@ -239,7 +240,11 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: s
 def as_problem(error: Exception) -> Problem:
     if isinstance(error, WorkFailed) and error.kind != "bug":
         return Problem(500, error.kind, error.message, error.faults)
-    return problem_from(error)
+    problem = problem_from(error)
+    if isinstance(error, InputError):  # who reads a page sends no document again
+        told = error.faults[0] if len(error.faults) == 1 else f"{error.subject}: {len(error.faults)} things to mend."
+        return Problem(problem.status, problem.kind, told, error.faults)
+    return problem
 
 
 async def signed_in() -> Caller | None:

@@ -60,6 +60,7 @@ class CaptureRecord:
     board: bool = False
     verdict: str | None = None
     faults: tuple[Fault, ...] = ()
+    tags: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,13 +20,22 @@ from server.services.captures import TEXT_MOST, About
 from server.services.presets import PRESETS, settings_of
 from server.services.records import Session
 from server.services.service import Service
+from server.services.tags import typed_tags
 from server.services.work import Work
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
+SAID = {
+    "reconstruct": "queued",
+    "move": "moved",
+    "tag": "tagged",
+    "untag": "without these tags",
+    "erase": "erased for good",
+    "remove": "removed",
+}
 SHOWN = 50  # captures of a page
-ASKED = ("find", "session", "verdict", "sort", "after", "capture")
+ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
 SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
 
 
@@ -65,6 +74,7 @@ class CaptureLine(TypedDict):
     verdict: str | None
     faults: list[FaultDocument]
     sync: SyncLine | None
+    tags: list[str]
 
 
 class SessionLine(TypedDict):
@@ -91,6 +101,7 @@ class CapturesState(TypedDict):
     next: str | None
     total: int
     sessions: list[SessionLine]
+    tags: list[str]
     models: list[str]
     presets: list[PresetLine]
 
@@ -103,9 +114,12 @@ class WorkForm(Chosen):
 
 
 class EditForm(Chosen):
+    """``tags``: with commas between."""
+
     label: NotRequired[str]
     expression: NotRequired[str]
     session: NotRequired[str | None]
+    tags: NotRequired[str]
 
 
 class SessionForm(TypedDict):
@@ -118,24 +132,23 @@ class SessionEditForm(Chosen, SessionForm):
 
 
 class BulkForm(WorkForm):
-    """An action on all ``ids``; ``id`` is the session of move, empty for none."""
+    """An action on all ``ids``; ``id`` is the session of move, empty for none; ``tags``: with commas between."""
 
     ids: list[str]
     action: str
+    tags: NotRequired[str]
 
 
 class CapturesPage(Page, component="captures.js"):
     def look(self) -> CapturesState:
-        asked = {
-            name: self.choice.get(name) or None for name in ("find", "session", "verdict", "sort", "after", "capture")
-        }
+        asked = {name: self.choice.get(name) or None for name in ASKED}
         return shared.get(("captures", *asked.values()), 0.3, lambda: captures_state(self.service, asked))
 
 
 def captures_state(service: Service, asked: Mapping[str, str | None]) -> CapturesState:
     """A page of the captures that are sought, with the jobs of each."""
     order = cast(CaptureOrder, asked["sort"] if asked["sort"] in get_args(CaptureOrder) else "-created")
-    query = CaptureQuery(asked["find"] or "", asked["session"], asked["verdict"], order=order)
+    query = CaptureQuery(asked["find"] or "", asked["session"], asked["verdict"], tag=asked["tag"], order=order)
     found = service.captures.page(query, SHOWN, asked["after"])
     records = [record for record in found.items if record.id not in removals]
     chosen = [record for record in service.captures.of([asked["capture"] or ""]) if record.id not in removals]
@@ -147,6 +160,7 @@ def captures_state(service: Service, asked: Mapping[str, str | None]) -> Capture
         "next": found.next,
         "total": found.total - (len(found.items) - len(records)),
         "sessions": sessions_list(service, asked["session"]),
+        "tags": shared.get("tags", 1.0, service.captures.tags),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
         "presets": [{"id": p.id, "title": p.title, "explanation": p.explanation} for p in PRESETS],
     }
@@ -184,6 +198,7 @@ def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine
         "verdict": record.verdict,
         "faults": [fault.document() for fault in record.faults],
         "sync": None if record.shot is None else sync_line(record.shot),
+        "tags": [*record.tags],
     }
 
 
@@ -256,7 +271,8 @@ def sample(page: Page, event: object) -> str:
 def edit(page: Page, event: EditForm) -> None:
     given: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     About.of({name: given[name] for name in given if name != "session"})
-    page.service.captures.edit(event["id"], given)
+    tags = typed_tags(event["tags"]) if "tags" in event else None
+    page.service.captures.edit(event["id"], given, tags=tags)
     forget_captures()
 
 
@@ -305,6 +321,11 @@ def bulk(page: Page, event: BulkForm) -> str | None:
         page.started(*jobs)
     elif action == "move":
         done = each(ids, lambda capture: service.captures.edit(capture, {"session": event["id"] or None}))
+    elif action in ("tag", "untag"):
+        tags, change = typed_tags(event.get("tags", "")), service.captures.tag
+        if action == "untag":
+            change = service.captures.untag
+        done = each(ids, lambda capture: change(capture, tags))
     elif action == "erase":
         done = each(ids, service.captures.erase)
     else:
@@ -316,7 +337,7 @@ def bulk(page: Page, event: BulkForm) -> str | None:
         if done.done:
             remove_all_later(done.done, service.captures.remove, title, "capture")
     forget_captures()
-    said = {"reconstruct": "queued", "move": "moved", "erase": "erased for good", "remove": "removed"}[action]
+    said = SAID[action]
     if done.refused:
         told = [f"{one.id[-6:]}: {one.detail}" for one in done.refused]
         raise Unusable("some-refused", f"{len(done.done)} {said}, {len(told)} refused.", told)
@@ -324,7 +345,7 @@ def bulk(page: Page, event: BulkForm) -> str | None:
 
 
 def forget_captures() -> None:
-    shared.forget("captures", "sessions")
+    shared.forget("captures", "sessions", "tags", "subjects")
 
 
 def session_texts(*texts: str) -> tuple[str, ...]:
@@ -350,7 +371,7 @@ CapturesPage.actions = {
 
 @ui.page("/captures")
 async def captures_page(
-    capture: str = "", find: str = "", session: str = "", verdict: str = "", sort: str = ""
+    capture: str = "", find: str = "", session: str = "", verdict: str = "", tag: str = "", sort: str = ""
 ) -> RedirectResponse | None:
-    asked = {"capture": capture, "find": find, "session": session, "verdict": verdict, "sort": sort}
+    asked = {"capture": capture, "find": find, "session": session, "verdict": verdict, "tag": tag, "sort": sort}
     return await show("captures", CapturesPage, **asked)
