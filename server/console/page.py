@@ -146,9 +146,11 @@ class Page(Element):
             self.update()
 
     async def _refresh_status(self) -> None:
-        status = await anyio.to_thread.run_sync(status_of, self.service, self.caller, limiter=_threads)
+        caller = self.caller
+        status = await anyio.to_thread.run_sync(status_of, self.service, caller, limiter=_threads)
         if status is None:
-            ui.navigate.to("/sign-in")
+            if caller is self.caller:  # else its first key was made on this page meanwhile
+                ui.navigate.to("/sign-in")
         else:
             self.frame.show(status=status)
 

@@ -16,6 +16,7 @@ PAGES = (
     ("jobs", "/jobs", "Jobs"),
     ("result", "/result", "Result"),
     ("calibration", "/calibration", "Calibration"),
+    ("service", "/service", "Service"),
 )
 
 # Before anything is drawn: a page that turns from dark to light while it loads dazzles.

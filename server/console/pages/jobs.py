@@ -19,6 +19,7 @@ from server.services.bulk import each
 from server.services.documents import JobLine
 from server.services.jobs import FINISHED, STATUSES
 from server.services.records import Job
+from server.services.retention import ENDED
 from server.services.service import Service
 from server.services.work import Work
 from server.storage.events import JobEvent
@@ -27,7 +28,6 @@ from server.storage.job_index import JobOrder, JobQuery
 SHOWN = 50  # jobs of a page, and of those that wait before them
 SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
 ACTIVE = (*STATUSES["running"], *STATUSES["queued"])
-ENDED = tuple(status for state in FINISHED for status in STATUSES[state])
 ASKED = ("find", "state", "sort", "after")
 LOG_LINES = 200
 

@@ -47,7 +47,7 @@ export default {
       </div>
     </div>`,
   created() {
-    this.keys = [["1 - 7", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["H", "Rig: open the head that is ready"], ["Esc", "stop a countdown, close"],
+    this.keys = [["1 - 8", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["H", "Rig: open the head that is ready"], ["Esc", "stop a countdown, close"],
       ["1 - 7", "Features: choose a point"], ["Arrows", "Features: move it by 0.25 px (Shift: 2 px)"], ["Tab", "Features: next view"], ["Enter", "Features: take the suggested place"],
       ["Del", "Features: take the point back"], ["S", "Features: save"], ["H B", "Result: head, bust"], ["T G U P", "Result: texture, clay, uncertainty, parts"], ["W M", "Result: wireframe, measure"], ["?", "this list"]];
     window.eigenheadSay = (kind, text, faults) => this.say(kind, text, faults || []);
@@ -76,7 +76,7 @@ export default {
       if (typing(event)) return;
       if (event.key === "?") this.help = !this.help;
       else if (event.key === "Escape") this.help = false;
-      else if (this.current !== "features" && /^[1-7]$/.test(event.key)) window.location.href = this.links[event.key - 1].path;
+      else if (this.current !== "features" && /^[1-8]$/.test(event.key)) window.location.href = this.links[event.key - 1].path;
     },
   },
 };

@@ -13,7 +13,7 @@ from tests.support.services import RunningService, uploaded_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration")
+PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service")
 
 
 def test_no_page_has_a_violation_dark_or_light_and_each_says_what_to_do(
