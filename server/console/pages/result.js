@@ -13,6 +13,7 @@ const COLOURINGS = [["texture", "Texture", "T"], ["clay", "Clay", "G"], ["uncert
 const SURFACES = [["head", "Head", "H"], ["bust", "Bust", "B"]];
 const PARTS = [["unseen", [0.45, 0.47, 0.5]], ["skin", [0.9, 0.65, 0.5]], ["hair", [0.35, 0.25, 0.6]], ["clothes", [0.2, 0.6, 0.55]]];
 const FAR = 4; // medians: what lies beyond is shown as the scale's end, so that shoulders do not stretch it
+const FOV_DEG = 28; // up and down; in a view that is higher than wide about as much across
 const MM = 1000;
 
 function ramp(share) {
@@ -106,7 +107,7 @@ export default {
       catch (error) { this.fault = "This browser shows no 3D (WebGL is off). The downloads work."; return; }
       this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
       this.scene = new THREE.Scene();
-      this.camera = new THREE.PerspectiveCamera(28, 1, 0.01, 10);
+      this.camera = new THREE.PerspectiveCamera(FOV_DEG, 1, 0.01, 10);
       this.controls = new OrbitControls(this.camera, this.$refs.canvas);
       this.controls.addEventListener("change", this.draw);
       this.material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85, metalness: 0, side: THREE.DoubleSide });
@@ -125,7 +126,7 @@ export default {
     fit() {
       const { clientWidth: w, clientHeight: h } = this.$refs.view;
       if (!w || !h || !this.renderer) return;
-      this.renderer.setSize(w, h, false); this.camera.aspect = w / (this.split ? 2 : 1) / h; this.camera.updateProjectionMatrix();
+      this.renderer.setSize(w, h, false); this.camera.aspect = w / (this.split ? 2 : 1) / h; this.camera.fov = Math.min(FOV_DEG / Math.min(1, this.camera.aspect), 3 * FOV_DEG); this.camera.updateProjectionMatrix();
       const view = this.cameras.find((c) => c.name === this.through);
       this.seen = view ? lookThrough(THREE, view, w, h) : this.camera;
       const place = view && fitted(view, w, h);
