@@ -122,9 +122,13 @@ class Page(Element):
         self.on("choose", self._choose)
         frame.on("undo", self._undo)
         frame.on("follow", self._follow)
-        self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
-        ui.timer(REFRESH_S, self.refresh, immediate=True)
+
+    def begin(self) -> None:
+        """Looks again and again from now on. A timer asks for the browser's connection, at which NiceGUI sends the page
+        as it stands: timers come after the first look, so that its state is sent with the page."""
+        ui.timer(REFRESH_S, self.refresh, immediate="loading" in self.props["state"])
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
+        self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
 
     def look(self) -> Mapping[str, object]:
         """The state document. Runs in a thread."""
@@ -262,8 +266,9 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
         return RedirectResponse("/sign-in")
     with page_frame(name) as frame:
         drawn = page(frame, caller, **initial)
-    with anyio.move_on_after(FIRST_LOOK_S):
-        await drawn.refresh()
+        with anyio.move_on_after(FIRST_LOOK_S):
+            await drawn.refresh()
+        drawn.begin()
     return None
 
 

@@ -3,16 +3,18 @@
     python -m tests.benchmarks.console_timings [--keep FOLDER] [--rounds N]
 
 - ``head``, ``bust``: from asking for a result's page to the first picture of its head; from the key B to the bust's;
-- ``done_to_head``: from the end of a job, as the service dates it, to the first picture of its head, which opens there;
+- ``done_to_head``: from the end of a job, as the worker dates it, to the first picture of its head, which opens there;
 - ``click``: on the page of features, from a click to the residual that follows from it, with 26 points in 11 views.
 
 A service is started with a sample capture of the simulated studio, whose head the first round makes with the default
 settings. ``--keep`` makes it once in FOLDER and uses it again. [median, slowest] of ``ROUNDS``; the first visit, which
-fills the browser's cache as an operator's first one of the day does, stands by itself as ``head_first_visit``.
+fills the browser's cache as an operator's first one of the day does, stands by itself as ``head_first_visit``. Figures
+hold for a machine that does nothing else: ``load`` is its mean over the last one and five minutes.
 """
 
 import argparse
 import json
+import os
 import statistics
 import sys
 import tempfile
@@ -85,7 +87,15 @@ def time_viewer(v: Visit, job: str, rounds: int) -> dict[str, list[float]]:
     return {"head_first_visit": head[:1], "head": head[1:], "bust": bust[1:]}
 
 
-def time_opening(v: Visit, client: httpx.Client, capture: str, rounds: int) -> dict[str, list[float]]:
+def ended_at(service: RunningService, job: str) -> float:
+    """When the worker wrote that a job is finished (s since 1970): in SQLite the engine keeps whole seconds."""
+    line = next(line for line in service.log.read_text().splitlines() if "job finished" in line and job in line)
+    return datetime.fromisoformat(line.split()[0]).timestamp()
+
+
+def time_opening(
+    v: Visit, service: RunningService, client: httpx.Client, capture: str, rounds: int
+) -> dict[str, list[float]]:
     """Jobs of a quick method, since only their end counts; they are begun on the page, and removed."""
     took = []
     for _ in range(rounds):
@@ -95,8 +105,7 @@ def time_opening(v: Visit, client: httpx.Client, capture: str, rounds: int) -> d
         page.wait_for_url("**/result/*", timeout=JOB_S * 1000)
         job = page.url.rpartition("/")[2]
         seen = drawn(page, f"{job} head")
-        ended = datetime.fromisoformat(client.get(f"/v1/jobs/{job}").json()["finished"]).timestamp()
-        took.append(seen - ended)
+        took.append(seen - ended_at(service, job))
         client.delete(f"/v1/jobs/{job}")
     return {"done_to_head": took}
 
@@ -143,7 +152,7 @@ def main() -> None:
         v.page.add_init_script(WATCH)
         figures: dict[str, Any] = time_viewer(v, job, chosen.rounds)
         figures |= time_clicks(v, service, client, capture, chosen.rounds)
-        figures |= time_opening(v, client, capture, min(chosen.rounds, 3))
+        figures |= time_opening(v, service, client, capture, min(chosen.rounds, 3))
         bytes_of = {
             n: f["bytes"] for n, f in client.get(f"/v1/jobs/{job}").json()["files"].items() if n.endswith("glb")
         }
@@ -152,7 +161,9 @@ def main() -> None:
         name: [round(statistics.median(took), 3), round(max(took), 3)] if isinstance(took, list) else took
         for name, took in figures.items()
     }
-    sys.stdout.write(json.dumps({"s [median, slowest]": told, "bytes": bytes_of}, indent=1) + "\n")
+    machine = {"cores": len(os.sched_getaffinity(0)), "load": [round(load, 1) for load in os.getloadavg()[:2]]}
+    figures_of_all = {"s [median, slowest]": told, "bytes": bytes_of, "machine": machine}
+    sys.stdout.write(json.dumps(figures_of_all, indent=1) + "\n")
 
 
 if __name__ == "__main__":

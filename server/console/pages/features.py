@@ -111,7 +111,7 @@ class FeaturesPage(Page, component="features.js"):
     picked: Picked | None = None
 
     def look(self) -> FeaturesShown:
-        captures: list[CaptureChoice] = shared.get("choices", 0.3, lambda: captures_to_pick(self.service))
+        captures: list[CaptureChoice] = shared.get("choices", 2.0, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         known = any(capture["id"] == chosen for capture in captures)
         if not known and chosen is not None:  # an older one, by its address
