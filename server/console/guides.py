@@ -71,13 +71,16 @@ class Guides:
         self._curves: dict[tuple[str, tuple[float, ...], str], list[list[float]]] = {}
         self._predicted: tuple[object, dict[str, dict[str, list[float]]]] = (None, {})
 
-    def helps(self, points: Pixels, landmarks: Landmarks, shown: Collection[str]) -> Helps:
-        """``shown``: the points of which curves are wanted."""
+    def helps(
+        self, points: Pixels, landmarks: Landmarks, shown: Collection[str], views: Collection[str] | None = None
+    ) -> Helps:
+        """``shown``: the points of which curves are wanted; ``views``: the cameras in which, None for all."""
+        targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}
         places = {name: found.position for name, found in located.items() if found.position is not None}
         self._curves = {key: curve for key, curve in self._curves.items() if key[:2] in _picks(points, shown)}
         return {
-            "guides": {name: self._guides(points[name]) for name in shown if name in points},
+            "guides": {name: self._guides(points[name], targets) for name in shown if name in points},
             "reprojected": {name: found.reprojected for name, found in located.items() if found.reprojected},
             "off_px": {name: found.off_px for name, found in located.items() if found.off_px},
             "predicted": self._predict(places, landmarks),
@@ -92,10 +95,12 @@ class Guides:
             self._located[name] = (key, found)
         return found
 
-    def _guides(self, views: Mapping[str, Float[np.ndarray, " 2"]]) -> dict[str, list[list[list[float]]]]:
+    def _guides(
+        self, views: Mapping[str, Float[np.ndarray, " 2"]], targets: Collection[str]
+    ) -> dict[str, list[list[list[float]]]]:
         return {
             target: [self._curve(source, pixel, target) for source, pixel in views.items() if source != target]
-            for target in self._rig.names
+            for target in targets
         }
 
     def _curve(self, source: str, pixel: Float[np.ndarray, " 2"], target: str) -> list[list[float]]:

@@ -133,15 +133,18 @@ class FeaturesPage(Page, component="features.js"):
         points = picked.points
         pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in points.items()}
         shown = self.choice.get("point") or SEVEN_POINTS[0]
+        nearest, chosen = nearest_views(rig, record.front, VIEWS), self.choice.get("views")
         return {
             "id": capture_id,
             "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in record.cameras],
-            "views": nearest_views(rig, record.front, VIEWS),
+            "views": nearest,
             "names": [*SEVEN_POINTS, *(name for name in NAMES if name not in SEVEN_POINTS)],
             "points": points,
             "dirty": points != picked.saved,
             "asked": picked.asked == points,
-            **picked.guides.helps(pixels, landmarks.of(self.service), [shown]),
+            **picked.guides.helps(
+                pixels, landmarks.of(self.service), [shown], chosen.split("\n") if chosen else nearest
+            ),
         }
 
     def of_capture(self) -> Picked:
