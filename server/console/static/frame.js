@@ -13,6 +13,7 @@ export default {
   data: () => ({ messages: [], next: 1, help: false, look: localStorage.getItem("eigenhead-look") || "dark" }),
   watch: { look: { handler(look) { document.documentElement.dataset.look = look; localStorage.setItem("eigenhead-look", look); }, immediate: true } },
   computed: {
+    known() { return !!this.status && "jobs" in this.status; },
     starting() { return (this.status?.starting || []).map((name) => (name === "egl" ? "graphics" : name)); },
     faults() { return Object.entries(this.status?.faults || {}); },
   },
@@ -23,7 +24,7 @@ export default {
         <a v-for="(link, i) in links" :key="link.name" :href="link.path" :aria-current="link.name === current ? 'page' : null">
           <span>{{ link.title }}</span><kbd aria-hidden="true">{{ i + 1 }}</kbd></a>
         <div class="foot" role="status">
-          <div class="line"><i :class="['dot', faults.length ? 'warn' : starting.length ? '' : 'good']"></i>{{ faults.length ? 'Needs a look' : starting.length ? 'Starting: ' + starting.join(', ') : 'Ready' }}</div>
+          <div class="line"><i :class="['dot', faults.length ? 'warn' : starting.length || !known ? '' : 'good']"></i>{{ !known ? 'Connecting ...' : faults.length ? 'Needs a look' : starting.length ? 'Starting: ' + starting.join(', ') : 'Ready' }}</div>
           <div v-for="[name, detail] in faults" :key="name" class="warn">{{ name === 'egl' ? 'graphics' : name }}: {{ detail }}</div>
           <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
           <div>{{ status.disk || '\\u00a0' }}</div>

@@ -71,7 +71,8 @@ def test_a_page_comes_back_after_the_service_was_killed(
     uploaded_capture(service, tmp_path, 1)
     v = visit(browser, service.url)
     page = v.go("/captures")
-    expect(page.locator(".row-button")).to_have_count(1)
+    expect(page.locator(".row-button")).to_have_count(1)  # sent with the page
+    expect(page.get_by_text("GB free")).to_be_visible(timeout=20_000)  # over the socket, which is there now
     service.kill()
     expect(page.locator("#popup")).to_be_visible(timeout=20_000)
     service.start()
