@@ -232,7 +232,7 @@ export default {
       const wanted = this.other;
       try {
         const values = await this.numbers(`distance.f32?other=${wanted}`);
-        if (wanted === this.other) this.spread(values, wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT");
+        if (wanted === this.other && !this.mateId) this.spread(values, wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT");
       } catch (error) { this.fault = error.message; }
       this.loading = false; this.draw();
     },
