@@ -5,12 +5,20 @@ order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of th
 """
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
 from rig.geometry import RigidTransform
 from rig.recorded_lens import RecordedLens
+
+
+@lru_cache(maxsize=1024)  # asked at every projection; the roots of a cubic cost more than projecting a point
+def _turning_radius(k1: float, k2: float, k3: float) -> float:
+    cubic = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    squares = cubic.real[(np.abs(cubic.imag) < 1e-12) & (cubic.real > 0)]
+    return float(np.sqrt(squares.min())) if len(squares) else np.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +40,7 @@ class Distortion:
 
     def turning_radius(self) -> float:
         """Radius (of ``X / Z``) where the radial model stops growing: farther points would fold back into the image."""
-        cubic = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
-        squares = cubic.real[(np.abs(cubic.imag) < 1e-12) & (cubic.real > 0)]
-        return float(np.sqrt(squares.min())) if len(squares) else np.inf
+        return _turning_radius(self.k1, self.k2, self.k3)
 
     def apply(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Distorted places of ``X / Z, Y / Z``."""

@@ -71,13 +71,16 @@ class Guides:
         self._curves: dict[tuple[str, tuple[float, ...], str], list[list[float]]] = {}
         self._predicted: tuple[object, dict[str, dict[str, list[float]]]] = (None, {})
 
-    def helps(self, points: Pixels, landmarks: Landmarks, shown: Collection[str]) -> Helps:
-        """``shown``: the points of which curves are wanted."""
+    def helps(
+        self, points: Pixels, landmarks: Landmarks, shown: Collection[str], views: Collection[str] | None = None
+    ) -> Helps:
+        """``shown``: the points of which curves are wanted; ``views``: the cameras in which, None for all."""
+        targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}
         places = {name: found.position for name, found in located.items() if found.position is not None}
         self._curves = {key: curve for key, curve in self._curves.items() if key[:2] in _picks(points, shown)}
         return {
-            "guides": {name: self._guides(points[name]) for name in shown if name in points},
+            "guides": {name: self._guides(points[name], targets) for name in shown if name in points},
             "reprojected": {name: found.reprojected for name, found in located.items() if found.reprojected},
             "off_px": {name: found.off_px for name, found in located.items() if found.off_px},
             "predicted": self._predict(places, landmarks),
@@ -92,10 +95,12 @@ class Guides:
             self._located[name] = (key, found)
         return found
 
-    def _guides(self, views: Mapping[str, Float[np.ndarray, " 2"]]) -> dict[str, list[list[list[float]]]]:
+    def _guides(
+        self, views: Mapping[str, Float[np.ndarray, " 2"]], targets: Collection[str]
+    ) -> dict[str, list[list[list[float]]]]:
         return {
             target: [self._curve(source, pixel, target) for source, pixel in views.items() if source != target]
-            for target in self._rig.names
+            for target in targets
         }
 
     def _curve(self, source: str, pixel: Float[np.ndarray, " 2"], target: str) -> list[list[float]]:
@@ -121,7 +126,8 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
         return Located(None, {}, {}, None)
     remarks = locate_features({name: views}, rig, noise_px=CLICK_NOISE_PX).remarks
     off = {camera: round(float(np.linalg.norm(r)), 2) for camera, r in found.residuals_px.items()}
-    return Located(found.position_world, _seen(rig, found.position_world), off, "; ".join(remarks) or None)
+    seen = _seen(rig, {name: found.position_world})[name]
+    return Located(found.position_world, seen, off, "; ".join(remarks) or None)
 
 
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
@@ -144,7 +150,7 @@ def predicted(
         world_from_head = procrustes(
             np.array([landmarks[name] for name in names]), np.array([located[name] for name in names])
         )
-        return {name: _seen(rig, world_from_head.apply(point[None])[0]) for name, point in landmarks.items()}
+        return _seen(rig, {name: world_from_head.apply(point[None])[0] for name, point in landmarks.items()})
     return {}
 
 
@@ -163,9 +169,16 @@ def mean_landmarks(bench: Bench, report: Report, *, model: str, names: list[str]
     return {name: vertices[loaded.landmarks[name]].tolist() for name in names}
 
 
-def _seen(rig: Rig, point: Float[np.ndarray, " 3"]) -> dict[str, list[float]]:
-    pixels = {camera.name: camera.project(point[None]) for camera in rig}
-    return {n: p[0].round(2).tolist() for n, p in pixels.items() if _near_image(rig[n], p)[0]}
+def _seen(rig: Rig, points: Mapping[str, Float[np.ndarray, " 3"]]) -> dict[str, dict[str, list[float]]]:
+    """Where the cameras see each point; a camera outside whose picture it lies is left out."""
+    places = np.array(list(points.values()))
+    found: dict[str, dict[str, list[float]]] = {name: {} for name in points}
+    for camera in rig:
+        pixels = camera.project(places)
+        for name, near, pixel in zip(points, _near_image(camera, pixels), pixels.round(2).tolist(), strict=True):
+            if near:
+                found[name][camera.name] = pixel
+    return found
 
 
 def _near_image(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> np.ndarray:

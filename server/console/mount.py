@@ -19,7 +19,10 @@ REFUSED = (
     "This page is not open to other web pages. Behind a proxy, set EIGENHEAD_PUBLIC_URL to the address you asked for."
 )
 PAGES = frozenset(
-    {"/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/sign-in", "/favicon.ico"}
+    [
+        *("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service"),
+        *("/sign-in", "/favicon.ico"),
+    ]
 )
 FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
 
@@ -30,7 +33,17 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
     NiceGUI's own app is one a process, so that a process has one service with pages: the last that was made.
     """
     from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
-    from server.console.pages import calibration, captures, features, jobs, result, rig, sign_in, subjects  # noqa: F401
+    from server.console.pages import (  # noqa: F401
+        calibration,
+        captures,
+        features,
+        jobs,
+        result,
+        rig,
+        service,
+        sign_in,
+        subjects,
+    )
 
     Storage.path = settings.data.resolve() / "console"
     pages.state.eigenhead = app

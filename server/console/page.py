@@ -15,6 +15,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
+from rig.errors import InputError
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
 from server.console.theme import Frame, page_frame
@@ -28,7 +29,9 @@ from server.wire.problems import Problem, problem_from
 
 REFRESH_S = 0.5
 STATUS_S = 2.0
+FOLLOW_S = 0.15  # how often a job that was started on a page is looked at: its head opens there as soon as it is done
 FIRST_LOOK_S = 1.0  # so long a page waits to be sent with its state in it, which saves it a turn over the socket
+FOLLOWED_MOST = 50
 KEEP_S = 3600.0  # of a value that is shared by all pages
 KEEP_TIMES = 9.0  # a value is kept so many times as long as it took to make,
 KEEP_MOST_S = 5.0  # but no longer: the one look that waited for a locked database would stand for minutes
@@ -113,11 +116,19 @@ class Page(Element):
         self.props["state"] = {"loading": True}
         self._in_turn = anyio.Lock()
         self._told = ""
+        self._started: tuple[list[str], bool] = ([], False)
+        self._followed: list[str] = []
         self.on("act", self._act)
         self.on("choose", self._choose)
         frame.on("undo", self._undo)
-        ui.timer(REFRESH_S, self.refresh, immediate=True)
+        frame.on("follow", self._follow)
+
+    def begin(self) -> None:
+        """Looks again and again from now on. A timer asks for the browser's connection, at which NiceGUI sends the page
+        as it stands: timers come after the first look, so that its state is sent with the page."""
+        ui.timer(REFRESH_S, self.refresh, immediate="loading" in self.props["state"])
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
+        self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
 
     def look(self) -> Mapping[str, object]:
         """The state document. Runs in a thread."""
@@ -139,11 +150,26 @@ class Page(Element):
             self.update()
 
     async def _refresh_status(self) -> None:
-        status = await anyio.to_thread.run_sync(status_of, self.service, self.caller, limiter=_threads)
+        caller = self.caller
+        status = await anyio.to_thread.run_sync(status_of, self.service, caller, limiter=_threads)
         if status is None:
-            ui.navigate.to("/sign-in")
+            if caller is self.caller:  # else its first key was made on this page meanwhile
+                ui.navigate.to("/sign-in")
         else:
             self.frame.show(status=status)
+
+    def started(self, *jobs: str, opens: bool = False) -> None:
+        """Jobs that an action began: the browser's tab follows them; ``opens``: the head is shown when it is ready."""
+        self._started = ([*jobs], opens)
+
+    def _follow(self, event: GenericEventArguments) -> None:
+        self._followed = [str(job) for job in event.args][:FOLLOWED_MOST]
+        self._following.active = bool(self._followed)
+
+    async def _refresh_followed(self) -> None:
+        ids = tuple(self._followed)
+        found = await anyio.to_thread.run_sync(followed_jobs, self.service, ids, limiter=_threads)
+        self.frame.show(followed=found)
 
     async def _choose(self, event: GenericEventArguments) -> None:
         self.choice |= event.args
@@ -158,7 +184,7 @@ class Page(Element):
             await self._do(arguments.pop("name"), arguments)
 
     async def _do(self, name: str, event: Mapping[str, object]) -> None:
-        done = False
+        done, self._started = False, ([], False)
         try:
             action = UNDO if name == "undo" else self.actions[name]
             said = await anyio.to_thread.run_sync(self._run, action, event, limiter=_threads)
@@ -168,6 +194,8 @@ class Page(Element):
         except Exception as error:
             problem = as_problem(error)
             self.frame.say("fault", problem.detail, problem.errors)
+        if self._started[0]:
+            self.frame.run_method("began", *self._started)
         await self.refresh()
         self.run_method("acted", name, done)  # a form that was refused keeps what was typed
 
@@ -218,7 +246,11 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: s
 def as_problem(error: Exception) -> Problem:
     if isinstance(error, WorkFailed) and error.kind != "bug":
         return Problem(500, error.kind, error.message, error.faults)
-    return problem_from(error)
+    problem = problem_from(error)
+    if isinstance(error, InputError):  # who reads a page sends no document again
+        told = error.faults[0] if len(error.faults) == 1 else f"{error.subject}: {len(error.faults)} things to mend."
+        return Problem(problem.status, problem.kind, told, error.faults)
+    return problem
 
 
 async def signed_in() -> Caller | None:
@@ -234,9 +266,31 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
         return RedirectResponse("/sign-in")
     with page_frame(name) as frame:
         drawn = page(frame, caller, **initial)
-    with anyio.move_on_after(FIRST_LOOK_S):
-        await drawn.refresh()
+        with anyio.move_on_after(FIRST_LOOK_S):
+            await drawn.refresh()
+        drawn.begin()
     return None
+
+
+class Followed(TypedDict):
+    """How far a job is that was started in this tab of the browser; ``gone`` is the state of one that was removed."""
+
+    id: str
+    state: str
+    progress: float
+
+
+def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
+    def make() -> list[Followed]:
+        known = {job.id: job for job in service.jobs.of(ids)}
+        return [
+            {"id": i, "state": known[i].state, "progress": round(known[i].progress, 2)}
+            if i in known
+            else {"id": i, "state": "gone", "progress": 0.0}
+            for i in ids
+        ]
+
+    return shared.get(("followed", ids), FOLLOW_S / 2, make)
 
 
 class Status(TypedDict):

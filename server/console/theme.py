@@ -16,6 +16,7 @@ PAGES = (
     ("jobs", "/jobs", "Jobs"),
     ("result", "/result", "Result"),
     ("calibration", "/calibration", "Calibration"),
+    ("service", "/service", "Service"),
 )
 
 # Before anything is drawn: a page that turns from dark to light while it loads dazzles.
@@ -30,10 +31,11 @@ class Frame(Element, component="static/frame.js"):
     def __init__(self, current: str) -> None:
         super().__init__()
         links = [{"name": name, "path": path, "title": title} for name, path, title in PAGES]
-        self.props.update(links=links, current=current, status={}, removed=[])
+        self.props.update(links=links, current=current, status={}, removed=[], followed=[])
 
     def show(self, **changed: Any) -> None:
-        """``status`` of the service, or what was ``removed`` and can be taken back."""
+        """``status`` of the service, what was ``removed`` and can be taken back, or how far the jobs are that are
+        ``followed``."""
         if any(self.props[name] != value for name, value in changed.items()):
             self.props.update(changed)
             self.update()

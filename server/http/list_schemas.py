@@ -5,10 +5,22 @@ from typing import Annotated, Literal
 from fastapi import Query
 from pydantic import ConfigDict, Field
 
-from server.http.schemas import EXAMPLE_ID, Answer, CaptureOut, Id, JobOut, JobSettings, Moment, Received, SessionOut
+from server.http.schemas import (
+    EXAMPLE_ID,
+    Answer,
+    CaptureOut,
+    Id,
+    JobOut,
+    JobSettings,
+    Moment,
+    Received,
+    SessionOut,
+    Tags,
+)
 
 Limit = Annotated[int, Query(ge=1, le=1000)]
 Cursor = Annotated[str | None, Query(max_length=2000, description="``next`` of the page before, in the same order")]
+WithTag = Annotated[str | None, Query(max_length=200, description="only what bears this tag, in whatever case")]
 Sought = Annotated[str, Query(max_length=200, description="words that must all be found")]
 
 
@@ -40,6 +52,7 @@ class PersonOut(Answer):
     head: str | None = Field(description="newest job with a result")
     capture: str | None = Field(description="newest capture")
     consent: bool = Field(description="whether every session has a note of it")
+    tags: list[str] = Field(description="of their captures")
 
 
 class SubjectList(Listed):
@@ -73,11 +86,13 @@ Ids = Annotated[list[Id], Field(min_length=1, max_length=1000)]
 class CaptureBulk(Received):
     model_config = ConfigDict(json_schema_extra={"examples": [{"action": "remove", "ids": [EXAMPLE_ID]}]})
 
-    action: Literal["remove", "erase", "reconstruct", "move"] = Field(
-        description="remove: pictures go, heads stay; erase: nothing stays; reconstruct: a job each; move: to a session"
+    action: Literal["remove", "erase", "reconstruct", "move", "tag", "untag"] = Field(
+        description="remove: pictures go, heads stay; erase: nothing stays; reconstruct: a job each; move: to a "
+        "session; tag, untag: adds or takes away tags"
     )
     ids: Ids
     session: Id | None = Field(None, description="of move; null: out of any")
+    tags: Tags = Field(default_factory=list, description="of tag and untag")
     model: str | None = Field(None, max_length=200, description="of reconstruct")
     settings: JobSettings | None = Field(None, description="of reconstruct")
 

@@ -6,10 +6,13 @@ from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 from server.http.openapi import SETTINGS
 from server.services.service import Check
+from server.services.tags import TAG_MOST, TAGS_MOST
 from server.storage.records import JsonObject
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
 Text = Annotated[str, Field(max_length=500)]
+Tag = Annotated[str, Field(min_length=1, max_length=TAG_MOST, pattern="^[^\\x00-\\x1f\\x7f,]*$")]
+Tags = Annotated[list[Tag], Field(max_length=TAGS_MOST, description="without commas and control characters")]
 Moment = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
 JobSettings = Annotated[JsonObject, WithJsonSchema(SETTINGS)]
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -73,6 +76,7 @@ class CaptureEdit(Received):
     session: Id | None = None
     label: Text | None = None
     expression: Text | None = None
+    tags: Tags = Field(default_factory=list, description="in place of those before")
 
 
 class NewFeatures(Received):
@@ -188,6 +192,7 @@ class CaptureOut(Answer):
     warnings: list[WarningOut] = Field(
         default_factory=list, description="of cameras that were found from the photographs; report.json repeats them"
     )
+    tags: list[str] = Field(default_factory=list, description="what people find it by")
 
 
 class SessionOut(Answer):

@@ -32,5 +32,6 @@ def each(ids: Iterable[str], action: Callable[[str], object]) -> Bulk:
         except EigenheadError as error:
             problem = unusable_input(error) if isinstance(error, InputError) else error
             kind = problem.kind if isinstance(problem, Refused) else "internal-error"
-            refused.append(RefusedOne(identity, URN + kind, str(problem)))
+            detail = "; ".join(error.faults) if isinstance(error, InputError) else str(problem)
+            refused.append(RefusedOne(identity, URN + kind, detail))
     return Bulk(tuple(done), tuple(refused))

@@ -17,6 +17,7 @@ from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs, refuse_board
 from server.services.records import Found
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
+from server.services.tags import checked_tags
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
@@ -131,8 +132,12 @@ class Captures:
     def newest(self) -> CaptureRecord | None:
         return next(iter(self.page(CaptureQuery(), limit=1).items), None)
 
-    def edit(self, identity: str, given: Mapping[str, str | None]) -> CaptureRecord:
-        """Another label, expression or session; what is not given stays. Raises NotFound."""
+    def edit(
+        self, identity: str, given: Mapping[str, str | None], *, tags: Sequence[str] | None = None
+    ) -> CaptureRecord:
+        """Another label, expression or session, or other ``tags``; what is not given stays. Raises NotFound, and
+        InputError for tags that cannot be."""
+        checked = None if tags is None else checked_tags(tags)
         if given.get("session") is not None:
             self._store.session(str(given["session"]))
 
@@ -142,9 +147,27 @@ class Captures:
                 session=given.get("session", record.session),
                 label=given.get("label", record.label) or "",
                 expression=given.get("expression", record.expression) or "",
+                tags=record.tags if checked is None else checked,
             )
 
         return self._store.change_capture(identity, change)
+
+    def tag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
+        """Adds ``tags`` to those of a capture. Raises NotFound, and InputError where these are too many then."""
+        return self._store.change_capture(identity, lambda r: replace(r, tags=checked_tags([*r.tags, *tags])))
+
+    def untag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
+        """Takes ``tags`` away from a capture, in whatever case. Raises NotFound, InputError."""
+        gone = {tag.casefold() for tag in checked_tags(tags)}
+
+        def change(record: CaptureRecord) -> CaptureRecord:
+            return replace(record, tags=tuple(tag for tag in record.tags if tag.casefold() not in gone))
+
+        return self._store.change_capture(identity, change)
+
+    def tags(self, limit: int = 200) -> list[str]:
+        """The tags that captures bear, the most frequent first."""
+        return self._library.tags(limit)
 
     def image(self, identity: str, kind: str, camera: str) -> StoredFile:
         """A camera's file of a kind (images, background), found in the record, never by putting a request's text into a

@@ -69,7 +69,7 @@ class Session:
 @dataclass(frozen=True, slots=True)
 class Subject:
     """One person: sessions of one name, newest first, with how many captures they have; ``id`` is the newest session's.
-    ``head``: the newest job with a result, ``heads`` how many there are."""
+    ``head``: the newest job with a result, ``heads`` how many there are; ``tags``: of their captures."""
 
     id: str
     label: str
@@ -81,6 +81,7 @@ class Subject:
     head: str | None
     capture: str | None
     consent: bool
+    tags: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@ anything that the service did not make itself."""
 
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,14 +11,28 @@ import structlog
 
 from rig.errors import EigenheadError
 from server.errors import NotFound
-from server.services.jobs import DELIVERY, FINISHED
+from server.services.jobs import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
+from server.storage.job_index import JobQuery
+from server.storage.library import CaptureQuery
 from server.storage.store import folder_bytes, newest
 
 LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
 DAY_S = 86400.0
+ENDED = tuple(status for state in FINISHED for status in STATUSES[state])
 
 log = structlog.get_logger()
+
+
+def clear_caches(service: Service) -> int:
+    """Removes silhouettes, thumbnails and the like of all captures; what is asked for is made anew. Returns how many
+    captures' went."""
+    store, removed = service.store, 0
+    for identity in store.ids("cache/captures"):
+        if not service.jobs.active(capture=identity):
+            store.remove(store.cache_of(identity))
+            removed += 1
+    return removed
 
 
 def sweep(service: Service) -> dict[str, int]:
@@ -32,6 +47,62 @@ def sweep(service: Service) -> dict[str, int]:
     if any(gone.values()):
         log.info("swept", **gone)
     return gone
+
+
+@dataclass(frozen=True, slots=True)
+class Upcoming:
+    """A finished job or a capture that retention takes next. ``goes``: when, None where that hangs on the disk or on
+    what comes; ``why``: the setting."""
+
+    kind: str
+    id: str
+    label: str
+    goes: str | None
+    why: str
+
+
+def upcoming(service: Service, limit: int = 10) -> list[Upcoming]:
+    """What would go next if nothing came and nobody asked for it, jobs first. Captures that a job needs wait for it."""
+    return [*_jobs_next(service, limit), *_captures_next(service, limit)]
+
+
+def _jobs_next(service: Service, limit: int) -> list[Upcoming]:
+    s = service.settings
+    page = service.jobs.page(JobQuery("", ENDED, order="created"), limit)
+    full = s.make_room and service.store.free_bytes() < s.free_bytes
+    found = []
+    for place, job in enumerate(page.items):
+        many = s.keep_jobs is not None and page.total - place > s.keep_jobs
+        if full or many:
+            goes, why = _moment(time.time()), "keep_jobs" if many else "make_room"
+        elif s.keep_results_days is not None:
+            goes, why = _later(job.finished or job.created, s.keep_results_days), "keep_results_days"
+        elif s.make_room or s.keep_jobs is not None:
+            goes, why = None, "make_room" if s.make_room else "keep_jobs"
+        else:
+            break
+        found.append(Upcoming("job", job.id, job.name, goes, why))
+    return found
+
+
+def _captures_next(service: Service, limit: int) -> list[Upcoming]:
+    days = service.settings.keep_captures_days
+    if days is None:
+        return []
+    oldest = service.captures.page(CaptureQuery(order="created"), limit).items
+    return [
+        Upcoming("capture", r.id, r.label, _later(r.created, days), "keep_captures_days")
+        for r in oldest
+        if not service.jobs.active(capture=r.id)
+    ]
+
+
+def _later(moment: str | None, days: float) -> str | None:
+    return None if moment is None else _moment(datetime.fromisoformat(moment).timestamp() + days * DAY_S)
+
+
+def _moment(at: float) -> str:
+    return datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 def _jobs(service: Service) -> int:

@@ -34,18 +34,27 @@ class Sessions:
         return Found(tuple(_with_captures(record, captures[record.id]) for record in records), page.next, page.total)
 
     def subjects(
-        self, sought: str = "", order: SubjectOrder = "-created", limit: int = 100, cursor: str | None = None
+        self,
+        sought: str = "",
+        order: SubjectOrder = "-created",
+        limit: int = 100,
+        cursor: str | None = None,
+        *,
+        tag: str | None = None,
     ) -> Found[Subject]:
-        """People, by the names of their sessions. Raises InputError for a cursor of another list."""
-        page = self._library.subjects(sought, order, limit, cursor)
+        """People, by the names of their sessions; ``tag``: those with a capture that bears it. Raises
+        InputError for a cursor of another list."""
+        page = self._library.subjects(sought, order, limit, cursor, tag)
         captures = self._library.captures_of([session for sessions in page.subjects for session in sessions])
-        jobs = self._jobs.of_captures([capture for some in captures.values() for capture in some])
+        all_captures = [capture for some in captures.values() for capture in some]
+        jobs, tags = self._jobs.of_captures(all_captures), self._library.tags_of(all_captures)
         found = []
         for sessions in page.subjects:
             records = [record for session in sessions if (record := self._record(session)) is not None]
             if records:
                 theirs = {capture: jobs[capture] for session in sessions for capture in captures[session]}
-                found.append(_subject(records, theirs))
+                theirs_tags = {tag.casefold(): tag for capture in theirs for tag in tags.get(capture, ())}
+                found.append(_subject(records, theirs, tuple(theirs_tags.values())))
         return Found(tuple(found), page.next, page.total)
 
     def captures_of_subject(self, session: str | None) -> list[str]:
@@ -90,7 +99,9 @@ def _with_captures(record: SessionRecord, captures: list[str]) -> Session:
     return Session(**asdict(record), captures=tuple(captures))
 
 
-def _subject(records: Sequence[SessionRecord], jobs: Mapping[str, Sequence[tuple[str, str]]]) -> Subject:
+def _subject(
+    records: Sequence[SessionRecord], jobs: Mapping[str, Sequence[tuple[str, str]]], tags: tuple[str, ...]
+) -> Subject:
     """``records``: a person's sessions, newest first; ``jobs``: id and state of those of each capture."""
     all_jobs = sorted(((job, state, capture) for capture, some in jobs.items() for job, state in some), reverse=True)
     heads = [job for job, state, _ in all_jobs if state == "succeeded"]
@@ -105,4 +116,5 @@ def _subject(records: Sequence[SessionRecord], jobs: Mapping[str, Sequence[tuple
         head=heads[0] if heads else None,
         capture=next(iter(jobs), None),
         consent=all(record.consent.strip() for record in records),
+        tags=tags,
     )

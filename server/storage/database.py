@@ -62,6 +62,14 @@ capture_index = sa.Table(  # what captures are found by; the capture itself is i
     sa.Column("changed", sa.BigInteger, nullable=False),  # of its record, in ns: tells whether the row is of it still
 )
 
+capture_tags = sa.Table(  # of the captures' records, too
+    "eigenhead_capture_tags",
+    metadata,
+    sa.Column("capture_id", sa.String(64), primary_key=True),
+    sa.Column("folded", sa.String(200), primary_key=True, index=True),  # without case
+    sa.Column("name", sa.Text, nullable=False),
+)
+
 session_index = sa.Table(
     "eigenhead_session_index",
     metadata,
@@ -146,7 +154,8 @@ def scrub(engine: sa.Engine) -> None:
     this moment, the files keep it until the next time."""
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         if engine.dialect.name != "sqlite":
-            connection.execute(sa.text(f"VACUUM {capture_index.name}, {session_index.name}, {job_index.name}"))
+            tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
+            connection.execute(sa.text(f"VACUUM {tables}"))
             return
         for _ in range(SCRUB_TRIES):
             busy, _, _ = connection.execute(sa.text("PRAGMA wal_checkpoint(TRUNCATE)")).one()

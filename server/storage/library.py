@@ -12,7 +12,7 @@ import sqlalchemy as sa
 import structlog
 from sqlalchemy.dialects import postgresql, sqlite
 
-from server.storage.database import capture_index, scrub, session_index
+from server.storage.database import capture_index, capture_tags, scrub, session_index
 from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store
@@ -28,14 +28,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class CaptureQuery:
-    """Which captures, in what order: all words of ``sought`` stand in label, expression, session, verdict, source or
-    id; ``before``: only those older than this id."""
+    """Which captures, in what order: all words of ``sought`` stand in label, expression, tags, session, verdict, source
+    or id; ``tag``: those that bear it; ``before``: only those older than this id."""
 
     sought: str = ""
     session: str | None = None
     verdict: str | None = None
     board: bool | None = None
     before: str | None = None
+    tag: str | None = None
     order: CaptureOrder = "-created"
 
 
@@ -56,9 +57,11 @@ class Library:
 
     def put_capture(self, record: CaptureRecord, changed: int) -> None:
         self._put(capture_index, [_capture_row(record, changed)])
+        self._put_tags([record])
 
     def drop_capture(self, identity: str) -> None:
         self._drop(capture_index, [identity])
+        self._drop_tags([identity])
 
     def put_session(self, record: SessionRecord, changed: int) -> None:
         self._put(session_index, [_session_row(record, changed)])
@@ -80,6 +83,8 @@ class Library:
             rows = rows.where(table.verdict == query.verdict)
         if query.board is not None:
             rows = rows.where(table.board == query.board)
+        if query.tag is not None:
+            rows = rows.where(table.id.in_(tagged(query.tag)))
         if query.before is not None:
             rows = rows.where(table.id < query.before)
         for word in words_of(query.sought):
@@ -98,6 +103,23 @@ class Library:
             for some in _portions(sessions):
                 for row in connection.execute(query.where(capture_index.c.session.in_(some))):
                     found[row.session].append(row.id)
+        return found
+
+    def tags(self, limit: int) -> list[str]:
+        """The tags that captures bear, those of most captures first."""
+        table = capture_tags.c
+        query = sa.select(sa.func.min(table.name, type_=sa.Text())).group_by(table.folded)
+        with self._engine.connect() as connection:
+            return [*connection.scalars(query.order_by(sa.func.count().desc(), table.folded).limit(limit))]
+
+    def tags_of(self, captures: Collection[str]) -> dict[str, list[str]]:
+        """The tags of some captures, by capture."""
+        found: dict[str, list[str]] = {}
+        query = sa.select(capture_tags.c.capture_id, capture_tags.c.name).order_by(capture_tags.c.folded)
+        with self._engine.connect() as connection:
+            for some in _portions(captures):
+                for row in connection.execute(query.where(capture_tags.c.capture_id.in_(some))):
+                    found.setdefault(row.capture_id, []).append(row.name)
         return found
 
     def heads_of(self, session: str) -> list[str]:
@@ -121,9 +143,11 @@ class Library:
             order = Order(session_index.c.id, session_index.c.id, descending=True)
             return page_of(connection, rows, order, limit, cursor)
 
-    def subjects(self, sought: str, order: SubjectOrder, limit: int, cursor: str | None = None) -> SubjectPage:
+    def subjects(
+        self, sought: str, order: SubjectOrder, limit: int, cursor: str | None = None, tag: str | None = None
+    ) -> SubjectPage:
         """Sessions of one name are one person's; one without a name is somebody by itself. A subject is as new as its
-        newest session. Raises InputError for a cursor of another list."""
+        newest session; ``tag``: those with a capture that bears it. Raises InputError for a cursor of another list."""
         table = session_index.c
         newest, name = (
             sa.func.max(table.id).label("newest"),
@@ -132,6 +156,9 @@ class Library:
         rows = sa.select(table.subject, newest, name).group_by(table.subject)
         for word in words_of(sought):
             rows = rows.where(sessions_with(word))
+        if tag is not None:
+            theirs = sa.select(capture_index.c.session).where(capture_index.c.id.in_(tagged(tag)))
+            rows = rows.where(table.subject.in_(sa.select(table.subject).where(table.id.in_(theirs))))
         one = rows.subquery()
         by = one.c.newest if order.removeprefix("-") == "created" else one.c.name
         wanted = Order(by, one.c.newest, order.startswith("-"))
@@ -155,11 +182,13 @@ class Library:
                 known = {row.id: row.changed for row in connection.execute(sa.select(table.c.id, table.c.changed))}
             there = store.changes(kind)  # asked second: what is added in between is no stray row
             self._drop(table, gone := [identity for identity in known if identity not in there])
-            rows = []
-            for identity in (identity for identity, changed in there.items() if known.get(identity) != changed):
-                if (row := _row_of(store, kind, identity, there[identity])) is not None:
-                    rows.append(row)
+            differing = [identity for identity, changed in there.items() if known.get(identity) != changed]
+            records = [record for identity in differing if (record := store.found(kind, identity)) is not None]
+            rows = [_row_of(record, there[record.id]) for record in records]
             self._put(table, rows)
+            if table is capture_index:
+                self._drop_tags(gone)
+                self._put_tags([record for record in records if isinstance(record, CaptureRecord)])
             mended += len(gone) + len(rows)
         if mended:
             log.info("index mended", rows=mended)
@@ -172,6 +201,19 @@ class Library:
                 statement = insert(table)
                 new = {column.name: statement.excluded[column.name] for column in table.c if not column.primary_key}
                 connection.execute(statement.on_conflict_do_update(index_elements=["id"], set_=new), some)
+
+    def _put_tags(self, records: Collection[CaptureRecord]) -> None:
+        names = {(record.id, folded(tag)): tag for record in records for tag in record.tags}
+        rows = [{"capture_id": capture, "folded": tag, "name": name} for (capture, tag), name in names.items()]
+        self._drop_tags([record.id for record in records])
+        with self._engine.begin() as connection:
+            for some in _portions(rows):
+                connection.execute(sa.insert(capture_tags), some)
+
+    def _drop_tags(self, captures: Collection[str]) -> None:
+        with self._engine.begin() as connection:
+            for some in _portions(captures):
+                connection.execute(sa.delete(capture_tags).where(capture_tags.c.capture_id.in_(some)))
 
     def _drop(self, table: sa.Table, ids: Collection[str]) -> None:
         with self._engine.begin() as connection:
@@ -186,6 +228,11 @@ def captures_with(word: str) -> sa.ColumnElement[bool]:
     return sa.or_(own, capture_index.c.session.in_(sessions))
 
 
+def tagged(tag: str) -> sa.Select:
+    """Ids of the captures that bear a tag, in whatever case."""
+    return sa.select(capture_tags.c.capture_id).where(capture_tags.c.folded == folded(tag).replace("\0", ""))
+
+
 def sessions_with(word: str) -> sa.ColumnElement[bool]:
     """Of sessions that a word of a search stands in."""
     return sa.or_(contains(session_index.c.words, word), is_or_ends(session_index.c.id, word))
@@ -196,10 +243,7 @@ def subject_of(record: SessionRecord) -> str:
     return folded(record.label).strip() or record.id
 
 
-def _row_of(store: Store, kind: str, identity: str, changed: int) -> dict[str, object] | None:
-    record = store.found(kind, identity)
-    if record is None:
-        return None
+def _row_of(record: CaptureRecord | SessionRecord, changed: int) -> dict[str, object]:
     return _capture_row(record, changed) if isinstance(record, CaptureRecord) else _session_row(record, changed)
 
 
@@ -213,7 +257,7 @@ def _capture_row(record: CaptureRecord, changed: int) -> dict[str, object]:
         "source": record.source,
         "board": record.board,
         "bytes": record.bytes,
-        "words": folded(record.label, record.expression, record.verdict, record.source),
+        "words": folded(record.label, record.expression, record.verdict, record.source, *record.tags),
         "changed": changed,
     }
 

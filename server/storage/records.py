@@ -65,6 +65,7 @@ class CaptureRecord:
     verdict: str | None = None
     faults: tuple[Fault, ...] = ()
     warnings: tuple[ReportWarning, ...] = ()
+    tags: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,7 +70,7 @@ class Visit:
 
     def check_clean(self) -> None:
         """No console error, and no address outside the service."""
-        assert self.errors == []
+        assert not self.errors, self.errors
         inside = (self.base, self.base.replace("http", "ws"), "blob:", "data:")
         assert [address for address in self.addresses if not address.startswith(inside)] == []
 

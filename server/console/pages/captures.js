@@ -10,7 +10,7 @@ export default {
   components: { Outline, Pager, Verdict },
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ chosen: asked.get("capture") || "", verdict: asked.get("verdict") || "", sort: asked.get("sort") || "", outlines: false, drawing: 0, large: null, removal: null, sure: false, over: false, uploads: [], busy: "", session: asked.get("session") || openSession(), form: kept("captures form"), erasing: false, draft: {}, writing: false, method: "", model: "" }),
+  data: () => ({ chosen: asked.get("capture") || "", verdict: asked.get("verdict") || "", tag: asked.get("tag") || "", tagging: "", sort: asked.get("sort") || "", outlines: false, drawing: 0, large: null, removal: null, sure: false, over: false, uploads: [], busy: "", session: asked.get("session") || openSession(), form: kept("captures form"), erasing: false, draft: {}, writing: false, method: "", model: "" }),
   computed: {
     sessions() { return this.state.sessions || []; },
     open() { return this.sessions.find((s) => s.id === this.session) || null; },
@@ -19,7 +19,7 @@ export default {
     models() { return this.state.models || []; },
     current() { return this.state.chosen || null; },
     preset() { return (this.state.presets || []).find((p) => p.id === this.method); },
-    narrowed() { return !!(this.sought || this.verdict); },
+    narrowed() { return !!(this.sought || this.verdict || this.tag); },
   },
   watch: {
     sessions: { handler(all) {
@@ -29,12 +29,12 @@ export default {
     }, immediate: true },
     session(id) { keepSession(id); this.erasing = false; this.large = null; this.chosen = ""; this.first(); },
     "current.id": { handler(id) { this.readChecks(id); if (id) this.keepAddress(); }, immediate: true },
-    verdict() { this.first(); }, sort() { this.first(); },
+    verdict() { this.first(); }, tag() { this.first(); }, sort() { this.first(); },
     form: { handler(form) { keepDraft("captures form", form); }, deep: true },
     current: { handler(c) {
       if (this.writing) return;
       const mine = kept("capture draft"); // typed before a reload, and not sent
-      this.draft = !c ? {} : mine?.id === c.id ? mine : { label: c.label, expression: c.expression, session: c.session || "" };
+      this.draft = !c ? {} : mine?.id === c.id ? mine : { label: c.label, expression: c.expression, tags: c.tags.join(", "), session: c.session || "" };
     }, immediate: true },
   },
   template: `
@@ -75,14 +75,16 @@ export default {
             <div v-if="!u.done" class="bar" role="progressbar" :aria-valuenow="Math.round(100 * u.share)" aria-valuemin="0" aria-valuemax="100" :aria-label="'Upload of ' + u.name"><i :style="{ width: 100 * u.share + '%' }"></i></div>
             <template v-if="u.detail"><p class="fault">{{ u.detail }}</p><ul class="faults scroll" style="max-height: 14rem"><li v-for="(f, i) in u.errors" :key="i">{{ f }}</li></ul></template>
           </div>
-          <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, verdict, id" aria-label="Find captures"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
+          <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, tag, id" aria-label="Find captures"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
           <div class="line"><select v-model="verdict" id="verdict" class="grow" aria-label="Verdict"><option value="">every verdict</option><option value="good">good</option><option value="usable">usable</option><option value="poor">poor</option><option value="none">not judged</option></select>
             <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="label">by label</option><option value="verdict">by verdict</option><option value="-bytes">largest first</option></select></div>
+          <select v-if="tag || (state.tags || []).length" v-model="tag" id="tag" aria-label="Tag"><option value="">every tag</option><option v-if="tag && !state.tags?.includes(tag)" :value="tag">{{ tag }}</option><option v-for="t in state.tags" :key="t" :value="t">{{ t }}</option></select>
           <div v-if="picking" class="panel pad stack small" role="region" aria-label="Selected captures">
             <div class="line wrap"><strong>{{ picked.length }} selected</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button></div>
             <div class="line wrap"><button class="b" id="bulk-reconstruct" :disabled="!picked.length || !!busy" @click="bulk('reconstruct', '', { method, model })">Reconstruct</button>
               <select aria-label="Move to a session" id="bulk-move" :disabled="!picked.length || !!busy" @change="bulk('move', $event.target.value === 'none' ? '' : $event.target.value); $event.target.value = ''"><option value="">Move to ...</option><option value="none">no session</option><option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option></select>
               <button class="b" id="bulk-remove" :disabled="!picked.length || !!busy" @click="bulk('remove')">Remove the pictures</button><button class="b danger" id="bulk-erase" :disabled="!picked.length || !!busy" @click="sure = true">Erase ...</button></div>
+            <form class="line" aria-label="Tags of the selected captures" @submit.prevent="bulk('tag', '', { tags: tagging })"><input v-model="tagging" id="tagging" class="grow" maxlength="500" list="known-tags" placeholder="tag, tag" aria-label="Tags, with commas between"><button class="b" id="bulk-tag" :disabled="!picked.length || !tagging.trim() || !!busy">Tag</button><button type="button" class="b quiet" id="bulk-untag" :disabled="!picked.length || !tagging.trim() || !!busy" @click="bulk('untag', '', { tags: tagging })">Untag</button></form>
             <div v-if="sure && picked.length" class="stack" style="gap: .4rem" role="alertdialog" aria-label="Erase the selected captures"><p class="warn">Erase {{ picked.length }} {{ picked.length === 1 ? 'capture' : 'captures' }} with pictures, heads, jobs and every record of them? It cannot be taken back.</p>
               <div class="line"><button class="b danger" id="bulk-erase-for-good" :disabled="!!busy" @click="bulk('erase')">Erase for good</button><button class="b quiet" @click="sure = false">Keep</button></div></div></div>
           <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of captures" data-scroll="captures" @keydown="walk">
@@ -91,7 +93,7 @@ export default {
               <span class="line"><strong class="cut grow">{{ c.label || clock(c.created) }}</strong><span v-if="c.verdict && c.verdict !== 'good'" class="tag" :class="verdictTag(c).kind">{{ verdictTag(c).text }}</span><span v-if="tags(c).length === 1" class="tag" :class="tags(c)[0].kind">{{ tags(c)[0].text }}</span></span>
               <span v-if="tags(c).length > 1" class="line wrap" style="gap: .3rem"><span v-for="t in tags(c)" :key="t.text" class="tag" :class="t.kind">{{ t.text }}</span></span>
               <span class="small muted">{{ clock(c.created) }} &middot; {{ c.source === 'rig' ? 'rig' : 'upload' }} &middot; {{ c.cameras.length }} cameras &middot; {{ size(c.bytes) }}</span>
-              <span v-if="c.session || c.expression || c.features" class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression, c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
+              <span v-if="c.session || c.expression || c.features || c.tags.length" class="small muted cut">{{ [name(sessions.find(s => s.id === c.session)), c.expression, c.tags.map(t => '#' + t).join(' '), c.features && 'features picked'].filter(Boolean).join(' · ') }}</span>
             </button></div>
             <pager :behind="behind.length" :next="state.next" :size="captures.length" :total="state.total" @back="back" @forward="forward"></pager>
           </div>
@@ -107,6 +109,7 @@ export default {
           <form v-if="current && large === null" class="line wrap" style="align-items: end; margin-bottom: .7rem" aria-label="About the capture" @submit.prevent @focusin="writing = true" @focusout="writing = false" @input="keepDraft('capture draft', { ...draft, id: current.id })" @change="keepDraft('capture draft', null)">
             <label class="field grow">Label<input v-model="draft.label" maxlength="500" :placeholder="clock(current.created)" @change="act('edit', current.id, { label: draft.label })"></label>
             <label class="field grow">Expression<input v-model="draft.expression" maxlength="500" placeholder="neutral, smile ..." @change="act('edit', current.id, { expression: draft.expression })"></label>
+            <label class="field grow">Tags<input v-model="draft.tags" id="tags" maxlength="1000" list="known-tags" placeholder="tag, tag" @change="act('edit', current.id, { tags: draft.tags })"></label><datalist id="known-tags"><option v-for="t in state.tags" :key="t" :value="t"></option></datalist>
             <label class="field">Session<select v-model="draft.session" style="max-width: 11rem" @change="act('edit', current.id, { session: draft.session || null })"><option value="">none</option><option v-for="s in sessions" :key="s.id" :value="s.id">{{ name(s) }}</option></select></label>
             <label class="field" :title="preset?.explanation">Settings<select v-model="method" id="method" aria-describedby="preset"><option v-for="p in state.presets" :key="p.id" :value="p.id">{{ p.title }}</option></select></label>
             <label v-if="models.length > 1" class="field">Model<select v-model="model" id="model"><option value="">default</option><option v-for="m in models.filter(m => m !== 'default')" :key="m">{{ m }}</option></select></label>
@@ -141,9 +144,9 @@ export default {
     acted(name, done) {
       this.busy = "";
       if (name === "new_session" && done) this.form = null;
-      if (name === "bulk") { this.sure = false; this.picked = this.picked.filter((id) => this.captures.some((c) => c.id === id)); }
+      if (name === "bulk") { this.sure = false; if (done) this.tagging = ""; this.picked = this.picked.filter((id) => this.captures.some((c) => c.id === id)); }
     },
-    fields() { return { capture: this.current?.id, find: this.sought, verdict: this.verdict, sort: this.sort }; },
+    fields() { return { capture: this.current?.id, find: this.sought, verdict: this.verdict, tag: this.tag, sort: this.sort }; },
     question() { return { ...this.fields(), capture: this.chosen, session: this.session, after: this.behind.at(-1) || "" }; },
     bulk(action, id, more) { this.busy = "bulk"; this.$emit("act", { name: "bulk", action, id: id || "", ids: [...this.picked], ...more }); },
     name(session) { return sessionName(session, this.sessions); },
@@ -175,7 +178,7 @@ export default {
         });
         mine.done = true;
         if (status === 201) { this.choose(document.id); this.uploads = this.uploads.filter((u) => u.id !== mine.id); window.eigenheadSay("done", `${file.name} is here.`); }
-        else { mine.state = "refused"; mine.detail = document.detail; mine.errors = document.errors || []; }
+        else { mine.state = "refused"; mine.detail = document.detail; mine.errors = (document.errors || []).filter((fault) => fault !== document.detail); }
       }
     },
   },

@@ -20,13 +20,22 @@ from server.services.captures import TEXT_MOST, About
 from server.services.presets import PRESETS, settings_of
 from server.services.records import Session
 from server.services.service import Service
+from server.services.tags import typed_tags
 from server.services.work import Work
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
+SAID = {
+    "reconstruct": "queued",
+    "move": "moved",
+    "tag": "tagged",
+    "untag": "without these tags",
+    "erase": "erased for good",
+    "remove": "removed",
+}
 SHOWN = 50  # captures of a page
-ASKED = ("find", "session", "verdict", "sort", "after", "capture")
+ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
 SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
 
 
@@ -66,6 +75,7 @@ class CaptureLine(TypedDict):
     faults: list[FaultDocument]
     warnings: list[dict[str, str]]
     sync: SyncLine | None
+    tags: list[str]
 
 
 class SessionLine(TypedDict):
@@ -92,6 +102,7 @@ class CapturesState(TypedDict):
     next: str | None
     total: int
     sessions: list[SessionLine]
+    tags: list[str]
     models: list[str]
     presets: list[PresetLine]
 
@@ -104,9 +115,12 @@ class WorkForm(Chosen):
 
 
 class EditForm(Chosen):
+    """``tags``: with commas between."""
+
     label: NotRequired[str]
     expression: NotRequired[str]
     session: NotRequired[str | None]
+    tags: NotRequired[str]
 
 
 class SessionForm(TypedDict):
@@ -119,24 +133,23 @@ class SessionEditForm(Chosen, SessionForm):
 
 
 class BulkForm(WorkForm):
-    """An action on all ``ids``; ``id`` is the session of move, empty for none."""
+    """An action on all ``ids``; ``id`` is the session of move, empty for none; ``tags``: with commas between."""
 
     ids: list[str]
     action: str
+    tags: NotRequired[str]
 
 
 class CapturesPage(Page, component="captures.js"):
     def look(self) -> CapturesState:
-        asked = {
-            name: self.choice.get(name) or None for name in ("find", "session", "verdict", "sort", "after", "capture")
-        }
+        asked = {name: self.choice.get(name) or None for name in ASKED}
         return shared.get(("captures", *asked.values()), 0.3, lambda: captures_state(self.service, asked))
 
 
 def captures_state(service: Service, asked: Mapping[str, str | None]) -> CapturesState:
     """A page of the captures that are sought, with the jobs of each."""
     order = cast(CaptureOrder, asked["sort"] if asked["sort"] in get_args(CaptureOrder) else "-created")
-    query = CaptureQuery(asked["find"] or "", asked["session"], asked["verdict"], order=order)
+    query = CaptureQuery(asked["find"] or "", asked["session"], asked["verdict"], tag=asked["tag"], order=order)
     found = service.captures.page(query, SHOWN, asked["after"])
     records = [record for record in found.items if record.id not in removals]
     chosen = [record for record in service.captures.of([asked["capture"] or ""]) if record.id not in removals]
@@ -148,6 +161,7 @@ def captures_state(service: Service, asked: Mapping[str, str | None]) -> Capture
         "next": found.next,
         "total": found.total - (len(found.items) - len(records)),
         "sessions": sessions_list(service, asked["session"]),
+        "tags": shared.get("tags", 1.0, service.captures.tags),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
         "presets": [{"id": p.id, "title": p.title, "explanation": p.explanation} for p in PRESETS],
     }
@@ -186,6 +200,7 @@ def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine
         "faults": [fault.document() for fault in record.faults],
         "warnings": [asdict(warning) for warning in record.warnings],
         "sync": None if record.shot is None else sync_line(record.shot),
+        "tags": [*record.tags],
     }
 
 
@@ -231,12 +246,14 @@ def session_line(session: Session) -> SessionLine:
 
 def reconstruct(page: Page, event: WorkForm) -> str:
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
+    page.started(job.id, opens=True)
     return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
 
 
 def reconstruct_session(page: Page, event: WorkForm) -> str:
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
+    page.started(*(job.id for job in jobs))
     return f"Queued {len(jobs)} {'job' if len(jobs) == 1 else 'jobs'}. Watch them on the page Jobs."
 
 
@@ -256,7 +273,8 @@ def sample(page: Page, event: object) -> str:
 def edit(page: Page, event: EditForm) -> None:
     given: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     About.of({name: given[name] for name in given if name != "session"})
-    page.service.captures.edit(event["id"], given)
+    tags = typed_tags(event["tags"]) if "tags" in event else None
+    page.service.captures.edit(event["id"], given, tags=tags)
     forget_captures()
 
 
@@ -300,9 +318,16 @@ def bulk(page: Page, event: BulkForm) -> str | None:
     if action == "reconstruct":
         permit(page.caller, "submit")
         work = chosen_work(event)
-        done = each(ids, lambda capture: service.jobs.submit(capture, work, key=page.caller.key))
+        jobs: list[str] = []
+        done = each(ids, lambda capture: jobs.append(service.jobs.submit(capture, work, key=page.caller.key).id))
+        page.started(*jobs)
     elif action == "move":
         done = each(ids, lambda capture: service.captures.edit(capture, {"session": event["id"] or None}))
+    elif action in ("tag", "untag"):
+        tags, change = typed_tags(event.get("tags", "")), service.captures.tag
+        if action == "untag":
+            change = service.captures.untag
+        done = each(ids, lambda capture: change(capture, tags))
     elif action == "erase":
         done = each(ids, service.captures.erase)
     else:
@@ -314,7 +339,7 @@ def bulk(page: Page, event: BulkForm) -> str | None:
         if done.done:
             remove_all_later(done.done, service.captures.remove, title, "capture")
     forget_captures()
-    said = {"reconstruct": "queued", "move": "moved", "erase": "erased for good", "remove": "removed"}[action]
+    said = SAID[action]
     if done.refused:
         told = [f"{one.id[-6:]}: {one.detail}" for one in done.refused]
         raise Unusable("some-refused", f"{len(done.done)} {said}, {len(told)} refused.", told)
@@ -322,7 +347,7 @@ def bulk(page: Page, event: BulkForm) -> str | None:
 
 
 def forget_captures() -> None:
-    shared.forget("captures", "sessions")
+    shared.forget("captures", "sessions", "tags", "subjects")
 
 
 def session_texts(*texts: str) -> tuple[str, ...]:
@@ -348,7 +373,7 @@ CapturesPage.actions = {
 
 @ui.page("/captures")
 async def captures_page(
-    capture: str = "", find: str = "", session: str = "", verdict: str = "", sort: str = ""
+    capture: str = "", find: str = "", session: str = "", verdict: str = "", tag: str = "", sort: str = ""
 ) -> RedirectResponse | None:
-    asked = {"capture": capture, "find": find, "session": session, "verdict": verdict, "sort": sort}
+    asked = {"capture": capture, "find": find, "session": session, "verdict": verdict, "tag": tag, "sort": sort}
     return await show("captures", CapturesPage, **asked)

@@ -13,6 +13,7 @@ export default {
   props: { state: Object },
   emits: ["act", "choose"],
   watch: {
+    views(names, before) { if (names.join() !== before.join()) this.$emit("choose", { views: names.join("\n") }); },
     point: { handler(name) { if (name) { this.$emit("choose", { point: name }); keepAddress({ point: this.at }); } }, immediate: true },
   },
   data: () => ({ at: Number(new URLSearchParams(location.search).get("point")) || 0, all: false, chosen: {}, lens: null, drag: null, count: 4, busy: "", pending: {}, sent: 0 }),

@@ -111,7 +111,7 @@ class FeaturesPage(Page, component="features.js"):
     picked: Picked | None = None
 
     def look(self) -> FeaturesShown:
-        captures: list[CaptureChoice] = shared.get("choices", 0.3, lambda: captures_to_pick(self.service))
+        captures: list[CaptureChoice] = shared.get("choices", 2.0, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         known = any(capture["id"] == chosen for capture in captures)
         if not known and chosen is not None:  # an older one, by its address
@@ -133,15 +133,18 @@ class FeaturesPage(Page, component="features.js"):
         points = picked.points
         pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in points.items()}
         shown = self.choice.get("point") or SEVEN_POINTS[0]
+        nearest, chosen = nearest_views(rig, record.front, VIEWS), self.choice.get("views")
         return {
             "id": capture_id,
             "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in record.cameras],
-            "views": nearest_views(rig, record.front, VIEWS),
+            "views": nearest,
             "names": [*SEVEN_POINTS, *(name for name in NAMES if name not in SEVEN_POINTS)],
             "points": points,
             "dirty": points != picked.saved,
             "asked": picked.asked == points,
-            **picked.guides.helps(pixels, landmarks.of(self.service), [shown]),
+            **picked.guides.helps(
+                pixels, landmarks.of(self.service), [shown], chosen.split("\n") if chosen else nearest
+            ),
         }
 
     def of_capture(self) -> Picked:
@@ -229,6 +232,7 @@ def reconstruct(page: FeaturesPage, event: Sure) -> str | None:
     if picked.points != picked.saved and save(page, event) is None:
         return None
     job = page.service.jobs.submit(picked.capture, Work(), key=page.caller.key)
+    page.started(job.id, opens=True)
     return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
 
 

@@ -19,6 +19,7 @@ from server.services.bulk import each
 from server.services.documents import JobLine
 from server.services.jobs import FINISHED, STATUSES
 from server.services.records import Job
+from server.services.retention import ENDED
 from server.services.service import Service
 from server.services.work import Work
 from server.storage.events import JobEvent
@@ -27,7 +28,6 @@ from server.storage.job_index import JobOrder, JobQuery
 SHOWN = 50  # jobs of a page, and of those that wait before them
 SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
 ACTIVE = (*STATUSES["running"], *STATUSES["queued"])
-ENDED = tuple(status for state in FINISHED for status in STATUSES[state])
 ASKED = ("find", "state", "sort", "after")
 LOG_LINES = 200
 
@@ -227,6 +227,7 @@ def restart(page: Page, event: RestartForm) -> str:
     wanted = Work(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
+    page.started(job.id, opens=True)
     return f"Queued job {job.id[-6:]}."
 
 
@@ -260,12 +261,13 @@ def bulk(page: Page, event: BulkForm) -> str:
             raise Conflict("job-active", "These jobs are queued or running; cancel them first.")
         remove_all_later(ended, service.jobs.delete, f"{len(ended)} jobs with their heads", "submit")
         return f"{len(ended)} removed."
-    restarted = Work()
+    restarted, begun = Work(), list[str]()
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
-        "restart": lambda job: service.jobs.restart(job, restarted, key=page.caller.key),
+        "restart": lambda job: begun.append(service.jobs.restart(job, restarted, key=page.caller.key).id),
     }
     done = each(event["ids"], actions[action])
+    page.started(*begun)
     shared.forget("jobs")
     said = {"cancel": "cancelled", "restart": "queued again"}[action]
     if done.refused:

@@ -1,5 +1,7 @@
 // The head in three.js: a mesh in metres, x to the subject's left, y up, the face towards +z.
 import { GLTFLoader, OrbitControls, THREE } from "nicegui-scene";
+import { besideIt } from "/console/static/beside.js";
+import { exports3d } from "/console/static/exports.js";
 import { fitted, lookThrough } from "/console/static/look_through.js";
 import { clock, fixed, size, span, typing } from "/console/static/words.js";
 
@@ -11,6 +13,7 @@ const COLOURINGS = [["texture", "Texture", "T"], ["clay", "Clay", "G"], ["uncert
 const SURFACES = [["head", "Head", "H"], ["bust", "Bust", "B"]];
 const PARTS = [["unseen", [0.45, 0.47, 0.5]], ["skin", [0.9, 0.65, 0.5]], ["hair", [0.35, 0.25, 0.6]], ["clothes", [0.2, 0.6, 0.55]]];
 const FAR = 4; // medians: what lies beyond is shown as the scale's end, so that shoulders do not stretch it
+const FOV_DEG = 28; // up and down; in a view that is higher than wide about as much across
 const MM = 1000;
 
 function ramp(share) {
@@ -29,6 +32,7 @@ function nice(value) {
 }
 
 export default {
+  mixins: [besideIt, exports3d],
   props: { state: Object },
   emits: ["act", "choose"],
   data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", digits: 1 }),
@@ -40,7 +44,6 @@ export default {
     elsewhere() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)).length; },
     ofSubject() { return (this.state.results || []).filter((r) => r.id === this.job?.id || this.same(r)); },
     ofOthers() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)); },
-    rows() { return Object.entries(this.job?.measurements || {}); },
     distance() { return this.points.length === 2 ? MM * this.points[0].distanceTo(this.points[1]) : null; },
   },
   watch: {
@@ -48,8 +51,8 @@ export default {
     sought(text) { clearTimeout(this.typed); this.typed = setTimeout(() => this.$emit("choose", { find: text }), 250); },
     surface() { if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture"; this.load(this.job.id); },
     through() { this.fit(); },
-    colouring() { this.paint(); this.shine(); }, other() { this.compare(); },
-    wire() { this.showWire(); this.draw(); },
+    async colouring() { await this.paint(); this.paintMate(); this.shine(); }, other() { this.compare(); },
+    wire() { this.showWire(); this.paintMate(); this.draw(); },
     lights() { this.shine(); }, measuring(on) { if (!on) this.clearPoints(); },
   },
   template: `
@@ -57,7 +60,7 @@ export default {
       <header class="wraps"><h1>Result</h1>
         <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><optgroup label="Of this subject"><option v-for="r in ofSubject" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup><optgroup v-if="ofOthers.length" label="Of others"><option v-for="r in ofOthers" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup></select><input v-if="state.total > 8" v-model="sought" id="find" type="search" maxlength="200" placeholder="Find a head" aria-label="Find heads" style="width: 9rem"></label>
         <template v-if="job"><span v-if="surfaces.length > 1" class="group" role="group" aria-label="Surface"><button v-for="[name, title, k] in surfaces" :key="name" class="b" :aria-pressed="surface === name" @click="surface = name">{{ title }} <kbd>{{ k }}</kbd></button></span>
-        <span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="!other && colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
+        <span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="(!other || !!mateId) && colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
         <button class="b" :aria-pressed="wire" @click="wire = !wire">Wireframe <kbd>W</kbd></button>
         <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button></template></header>
       <div class="columns beside">
@@ -67,8 +70,9 @@ export default {
           <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ state.asked ? 'This job has no head' : 'No heads yet' }}</h2><p>{{ state.asked ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.' }}</p><a class="b main-action" :href="state.asked ? '/jobs' : '/captures'">{{ state.asked ? 'Go to jobs' : 'Go to captures' }}</a></div>
           <div v-if="scale" class="scale" role="img" :aria-label="scale.title + ', 0 to ' + fixed(scale.most, digits) + ' mm'"><i :style="{ background: gradient }"></i><div><span>{{ scale.beyond ? '≥ ' : '' }}{{ fixed(scale.most, digits) }} mm</span><span>{{ fixed(scale.most / 2, digits) }}</span><span>0</span></div></div>
           <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">median {{ fixed(scale.median, 2) }} mm, 95 % below {{ fixed(scale.p95, 2) }} mm</span></p>
+          <template v-if="split"><p class="small cut" id="left-head" style="position: absolute; left: .9rem; bottom: .8rem; max-width: 45%">{{ headName(job) }}</p><p class="small cut" id="right-head" style="position: absolute; left: 50%; bottom: .8rem; max-width: 45%">{{ headName(others.find(r => r.id === mateId) || job) }}</p></template>
           <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts"><li v-for="[name, colour] in parts" :key="name"><i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ name }}</li></ul>
-          <p v-if="measuring" class="small" style="position: absolute; left: .9rem; bottom: .8rem" role="status">{{ points.length === 0 ? 'Click the first point' : points.length === 1 ? 'Click the second point' : '' }}<strong v-if="distance" class="mono">{{ distance.toFixed(1) }} mm, straight</strong></p>
+          <p v-if="measuring" class="small" style="position: absolute; left: .9rem; bottom: 2.2rem" role="status">{{ points.length === 0 ? 'Click the first point' : points.length === 1 ? 'Click the second point' : '' }}<strong v-if="distance" class="mono">{{ distance.toFixed(1) }} mm, straight</strong></p>
           <p v-if="loading || fault" :class="['small', { fault }]" style="position: absolute; right: .9rem; bottom: .8rem" role="status">{{ fault || 'Loading ...' }}</p>
           <span v-for="(pin, i) in pins" :key="i" class="pin small mono" :style="{ left: pin.x + 'px', top: pin.y + 'px', visibility: pin.shown ? 'visible' : 'hidden' }">{{ i ? 'B' : 'A' }}</span>
         </div>
@@ -76,14 +80,16 @@ export default {
           <template v-if="job">
             <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ w.message }}</li></ul>
             <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? '' : 'ANOTHER PERSON? ' }}{{ headName(r) }}</option></select></label>
+              <label v-if="other && other !== 'truth'" class="check small"><input type="checkbox" v-model="beside" id="beside">side by side, turned together</label>
               <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">offer {{ elsewhere }} {{ elsewhere === 1 ? 'head' : 'heads' }} of other subjects, too</label>
               <label v-if="cameras.length" class="field">Look through<select v-model="through" id="through"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
               <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
             <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="'head-' + job.id.slice(-6) + '.zip'">All files (.zip)</a></div>
+            <div class="line wrap"><button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours" @click="savePicture">Picture (PNG)</button><template v-if="video"><button class="b" id="turntable" :disabled="!!through || loading" :title="through ? 'Not through a camera' : 'One turn, as the view shows the head'" @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? 'Turntable (video)' : 'Stop, ' + Math.round(100 * turning) + ' %' }}</button><select v-model.number="turnS" aria-label="Seconds of the turn"><option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option></select></template></div>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
             <h2 class="third">Measurements, mm</h2>
-            <table class="small"><tbody><tr v-for="[name, m] in rows" :key="name"><td>{{ name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td></tr></tbody></table>
+            <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">&plusmn;</th><th class="num">other</th><th class="num">difference</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ m.name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>
             <h2 class="third">Fit</h2>
             <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">contour residual, {{ job.clear_views }} clear {{ job.clear_views === 1 ? 'view' : 'views' }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ job.method }}</td></tr><tr><td>level of detail</td><td class="num">{{ job.level }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
@@ -91,7 +97,7 @@ export default {
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, fixed, size, span, parts: PARTS, gradient: `linear-gradient(to top, ${RAMP.map((c) => `rgb(${c.map((v) => Math.round(255 * v))})`).join(", ")})` }); },
+  created() { Object.assign(this, { three: { THREE, GLTFLoader }, clock, fixed, size, span, parts: PARTS, gradient: `linear-gradient(to top, ${this.gradientStops().join(", ")})` }); },
   mounted() { this.build(); window.addEventListener("keydown", this.key); if (this.job) { this.load(this.job.id); this.readCameras(this.job.id); } },
   unmounted() { window.removeEventListener("keydown", this.key); this.observer?.disconnect(); this.renderer?.dispose(); },
   methods: {
@@ -101,7 +107,7 @@ export default {
       catch (error) { this.fault = "This browser shows no 3D (WebGL is off). The downloads work."; return; }
       this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
       this.scene = new THREE.Scene();
-      this.camera = new THREE.PerspectiveCamera(28, 1, 0.01, 10);
+      this.camera = new THREE.PerspectiveCamera(FOV_DEG, 1, 0.01, 10);
       this.controls = new OrbitControls(this.camera, this.$refs.canvas);
       this.controls.addEventListener("change", this.draw);
       this.material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85, metalness: 0, side: THREE.DoubleSide });
@@ -120,7 +126,7 @@ export default {
     fit() {
       const { clientWidth: w, clientHeight: h } = this.$refs.view;
       if (!w || !h || !this.renderer) return;
-      this.renderer.setSize(w, h, false); this.camera.aspect = w / h; this.camera.updateProjectionMatrix();
+      this.renderer.setSize(w, h, false); this.camera.aspect = w / (this.split ? 2 : 1) / h; this.camera.fov = Math.min(FOV_DEG / Math.min(1, this.camera.aspect), 3 * FOV_DEG); this.camera.updateProjectionMatrix();
       const view = this.cameras.find((c) => c.name === this.through);
       this.seen = view ? lookThrough(THREE, view, w, h) : this.camera;
       const place = view && fitted(view, w, h);
@@ -140,14 +146,18 @@ export default {
     },
     draw() {
       if (!this.renderer || this.waiting) return;
-      this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.renderer.render(this.scene, this.seen || this.camera); this.place(); });
+      this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.renderOnce(); this.place(); });
     },
+    renderOnce() {
+      if (this.split && this.mate) { const { clientWidth: w, clientHeight: h } = this.$refs.view; this.renderPair(w, h); } else this.renderer.render(this.scene, this.seen || this.camera);
+    },
+    gradientStops() { return RAMP.map((c) => `rgb(${c.map((v) => Math.round(255 * v))})`); },
     place() {
       const { clientWidth: w, clientHeight: h } = this.$refs.view || {};
-      this.pins = this.points.map((p) => { const q = p.clone().project(this.seen || this.camera); return { x: (q.x + 1) / 2 * w, y: (1 - q.y) / 2 * h, shown: q.z < 1 }; });
+      this.pins = this.points.map((p) => { const q = p.clone().project(this.seen || this.camera); return { x: this.split ? (q.x + 1) / 4 * w + (this.right ? w / 2 : 0) : (q.x + 1) / 2 * w, y: (1 - q.y) / 2 * h, shown: q.z < 1 }; });
     },
-    async numbers(name) {
-      const answer = await fetch(`/console/jobs/${this.job.id}/${name}`);
+    async numbers(name, id = this.job.id) {
+      const answer = await fetch(`/console/jobs/${id}/${name}`);
       if (!answer.ok) throw new Error((await answer.json()).detail);
       return new Float32Array(await answer.arrayBuffer());
     },
@@ -183,9 +193,9 @@ export default {
       } catch (error) { this.fault = `The head cannot be shown: ${error.message}`; }
       this.loading = false;
     },
-    paintAs(name) { this.other = ""; this.colouring = name; this.paint(); },
+    paintAs(name) { if (!this.mateId) this.other = ""; this.colouring = name; this.paint(); },
     async paint() {
-      if (!this.mesh || this.other) return;
+      if (!this.mesh || (this.other && !this.mateId)) return;
       const geometry = this.mesh.geometry;
       this.scale = null;
       if (this.colouring === "uncertainty" || this.colouring === "parts") {
@@ -203,9 +213,9 @@ export default {
       this.draw();
     },
     showWire() { for (const material of [this.material, this.flat, this.skin]) if (material) material.wireframe = this.wire; },
-    withRepeated(values) {
-      const all = new Float32Array(values.length + this.repeated.length);
-      all.set(values); this.repeated.forEach((from, i) => { all[values.length + i] = values[from]; });
+    withRepeated(values, repeated = this.repeated) {
+      const all = new Float32Array(values.length + repeated.length);
+      all.set(values); repeated.forEach((from, i) => { all[values.length + i] = values[from]; });
       return all;
     },
     paintParts(values) {
@@ -217,20 +227,24 @@ export default {
     async compare() {
       if (!this.mesh) return;
       if (this.other && this.surface !== "head") { const wanted = this.other; this.surface = "head"; await this.$nextTick(); while (this.loading) await new Promise((done) => setTimeout(done, 50)); this.other = wanted; return; }
-      if (!this.other) return this.paint();
+      if (!this.other || this.mateId) { await this.paint(); return this.paintMate(); }
       this.loading = true; this.fault = "";
       const wanted = this.other;
       try {
         const values = await this.numbers(`distance.f32?other=${wanted}`);
-        if (wanted === this.other) this.spread(values, wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT");
+        if (wanted === this.other && !this.mateId) this.spread(values, wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT");
       } catch (error) { this.fault = error.message; }
       this.loading = false; this.draw();
     },
-    spread(values, title) {
-      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95), all = this.withRepeated(values), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
+    heat(values, repeated, most) {
+      const all = this.withRepeated(values, repeated), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
       all.forEach((value, i) => colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      return new THREE.BufferAttribute(colours, 3);
+    },
+    spread(values, title) {
+      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95);
       this.mesh.material = this.flat;
-      this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
+      this.mesh.geometry.setAttribute("color", this.heat(values, this.repeated, most));
       this.digits = most < 1 ? 2 : 1;
       this.scale = { title, most, p95, beyond: p95 > most, median: stop(values, 0.5) };
     },
@@ -238,14 +252,16 @@ export default {
     pick(event) {
       if (!this.measuring || !this.mesh || Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) > 4) return; // that was a turn
       const box = this.$refs.canvas.getBoundingClientRect();
-      const at = new THREE.Vector2((event.clientX - box.left) / box.width * 2 - 1, 1 - (event.clientY - box.top) / box.height * 2);
+      const across = (event.clientX - box.left) / box.width, right = this.split && across > 0.5;
+      const at = new THREE.Vector2((this.split ? 2 * across - (right ? 1 : 0) : across) * 2 - 1, 1 - (event.clientY - box.top) / box.height * 2);
       const ray = new THREE.Raycaster(); if (this.through) {
         ray.ray.origin.setFromMatrixPosition(this.seen.matrixWorld);
         ray.ray.direction.set(at.x, at.y, 0.5).unproject(this.seen).sub(ray.ray.origin).normalize();
       } else ray.setFromCamera(at, this.camera);
-      const hit = ray.intersectObject(this.mesh)[0];
+      const hit = ray.intersectObject(right ? this.mate : this.mesh)[0];
       if (!hit) return;
-      if (this.points.length === 2) this.clearPoints();
+      if (this.points.length === 2 || right !== this.right) this.clearPoints(); // a distance is on one head
+      this.right = right;
       this.points = [...this.points, hit.point.clone()];
       const dot = new THREE.Mesh(new THREE.SphereGeometry(0.0015, 16, 12), new THREE.MeshBasicMaterial({ color: "#6cb2ff", depthTest: false }));
       dot.position.copy(hit.point); dot.renderOrder = 2; this.marks.add(dot);

@@ -58,7 +58,7 @@ export default {
     columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
   },
   template: `
-    <section class="page" aria-label="Rig">
+    <section class="page" aria-label="Rig" :data-holds="busy || count ? '' : null">
       <header>
         <h1>Rig</h1><span class="lead">{{ lead }}</span>
         <button class="b" :disabled="!!busy" @click="plates">{{ busy === 'plates' ? 'Taking plates ...' : 'Clean plates' }} <kbd>B</kbd></button>
@@ -130,7 +130,7 @@ export default {
   },
   methods: {
     keepTyped() { keepDraft("shot", this.label || this.expression ? { label: this.label, expression: this.expression } : null); },
-    keepPlace() { keepAddress({ shot: this.shot?.id, job: this.job?.id }); document.title = this.job?.state === "succeeded" ? "Head ready - eigenhead" : "Rig - eigenhead"; },
+    keepPlace() { keepAddress({ shot: this.shot?.id, job: this.job?.id }); },
     percent(share) { return share === undefined ? "-" : `${(100 * share).toFixed(share < 0.1 ? 1 : 0)}%`; },
     light(name) {
       const mean = this.live[name]?.mean;

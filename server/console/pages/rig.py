@@ -239,6 +239,7 @@ def retake(page: Page, event: Chosen) -> None:
 def reconstruct_shot(page: Page, event: WorkForm) -> str:
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.choice |= {"shot": None, "job": job.id}
+    page.started(job.id, opens=True)
     return f"Queued job {job.id[-6:]}."
 
 

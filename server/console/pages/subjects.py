@@ -13,13 +13,14 @@ from server.services.service import Service
 from server.storage.library import SubjectOrder
 
 SHOWN = 48
-ASKED = ("find", "sort", "after")
+ASKED = ("find", "tag", "sort", "after")
 
 
 class SubjectsState(TypedDict):
-    """One page of people; ``loose``: captures that belong to no session."""
+    """One page of people; ``tags``: all that captures bear, to choose from."""
 
     subjects: list[Mapping[str, object]]
+    tags: list[str]
     next: str | None
     total: int
 
@@ -32,8 +33,13 @@ class SubjectsPage(Page, component="subjects.js"):
 
 def subjects_state(service: Service, asked: Mapping[str, str | None]) -> SubjectsState:
     order = cast(SubjectOrder, asked["sort"] if asked["sort"] in get_args(SubjectOrder) else "-created")
-    found = service.sessions.subjects(asked["find"] or "", order, SHOWN, asked["after"])
-    return {"subjects": [asdict(subject) for subject in found.items], "next": found.next, "total": found.total}
+    found = service.sessions.subjects(asked["find"] or "", order, SHOWN, asked["after"], tag=asked["tag"])
+    return {
+        "subjects": [asdict(subject) for subject in found.items],
+        "tags": shared.get("tags", 1.0, service.captures.tags),
+        "next": found.next,
+        "total": found.total,
+    }
 
 
 def begin(page: Page, event: SessionForm) -> str:
@@ -46,5 +52,5 @@ SubjectsPage.actions = {"new_session": Action("capture", begin)}
 
 
 @ui.page("/subjects")
-async def subjects_page(find: str = "", sort: str = "") -> RedirectResponse | None:
-    return await show("subjects", SubjectsPage, find=find, sort=sort)
+async def subjects_page(find: str = "", tag: str = "", sort: str = "") -> RedirectResponse | None:
+    return await show("subjects", SubjectsPage, find=find, tag=tag, sort=sort)

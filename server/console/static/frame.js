@@ -1,4 +1,5 @@
 // Navigation, the service's state, messages in the corner, and the keys that work on every page.
+import { started } from "/console/static/started.js";
 import { typing } from "/console/static/words.js";
 
 const MESSAGE_MS = 6000;
@@ -6,11 +7,13 @@ const MESSAGES_MOST = 4;
 const SCROLL_BACK_MS = 3000;
 
 export default {
-  props: { links: Array, current: String, status: Object, removed: Array },
-  emits: ["undo"],
+  mixins: [started],
+  props: { links: Array, current: String, status: Object, removed: Array, followed: Array },
+  emits: ["undo", "follow"],
   data: () => ({ messages: [], next: 1, help: false, look: localStorage.getItem("eigenhead-look") || "dark" }),
   watch: { look: { handler(look) { document.documentElement.dataset.look = look; localStorage.setItem("eigenhead-look", look); }, immediate: true } },
   computed: {
+    known() { return !!this.status && "jobs" in this.status; },
     starting() { return (this.status?.starting || []).map((name) => (name === "egl" ? "graphics" : name)); },
     faults() { return Object.entries(this.status?.faults || {}); },
   },
@@ -21,11 +24,12 @@ export default {
         <a v-for="(link, i) in links" :key="link.name" :href="link.path" :aria-current="link.name === current ? 'page' : null">
           <span>{{ link.title }}</span><kbd aria-hidden="true">{{ i + 1 }}</kbd></a>
         <div class="foot" role="status">
-          <div class="line"><i :class="['dot', faults.length ? 'warn' : starting.length ? '' : 'good']"></i>{{ faults.length ? 'Needs a look' : starting.length ? 'Starting: ' + starting.join(', ') : 'Ready' }}</div>
+          <div class="line"><i :class="['dot', faults.length ? 'warn' : starting.length || !known ? '' : 'good']"></i>{{ !known ? 'Connecting ...' : faults.length ? 'Needs a look' : starting.length ? 'Starting: ' + starting.join(', ') : 'Ready' }}</div>
           <div v-for="[name, detail] in faults" :key="name" class="warn">{{ name === 'egl' ? 'graphics' : name }}: {{ detail }}</div>
           <div>{{ status.jobs || 0 }} {{ status.jobs === 1 ? 'job' : 'jobs' }} under way</div>
           <div>{{ status.disk || '\\u00a0' }}</div>
           <a v-if="status.local === false" href="/sign-in" style="padding: 0">Other API key</a>
+          <button class="b quiet small" id="sound" style="padding-left: 0; justify-self: start" title="A quiet sound when a head that was begun in this tab is ready" :aria-pressed="sound" @click="turnSound">Sound {{ sound ? 'on' : 'off' }}</button>
           <div class="line"><span><kbd>?</kbd> keys</span><button class="b quiet small push" id="look" :aria-pressed="look === 'light'" @click="turn">{{ look === 'light' ? 'Dark' : 'Light' }}</button></div>
         </div>
       </nav>
@@ -33,7 +37,7 @@ export default {
       <div class="messages" role="log" aria-live="polite" aria-label="Messages">
         <div v-for="r in removed" :key="r.id" class="message line"><span class="grow">Removed: {{ r.title }}</span><button class="b" @click="$emit('undo', r.id)">Undo</button></div>
         <div v-for="m in messages" :key="m.id" :class="['message', m.kind]">
-          <div class="grow"><div>{{ m.text }}</div>
+          <div class="grow"><div>{{ m.text }} <a v-if="m.link" :href="m.link">Open it</a></div>
             <ul v-if="m.faults.length" class="faults small muted"><li v-for="(f, i) in m.faults" :key="i">{{ f }}</li></ul></div>
           <button class="b quiet" aria-label="Close message" @click="drop(m.id)">&times;</button>
         </div>
@@ -44,7 +48,7 @@ export default {
       </div>
     </div>`,
   created() {
-    this.keys = [["1 - 7", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["H", "Rig: open the head that is ready"], ["Esc", "stop a countdown, close"],
+    this.keys = [["1 - 8", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["H", "Rig: open the head that is ready"], ["Esc", "stop a countdown, close"],
       ["1 - 7", "Features: choose a point"], ["Arrows", "Features: move it by 0.25 px (Shift: 2 px)"], ["Tab", "Features: next view"], ["Enter", "Features: take the suggested place"],
       ["Del", "Features: take the point back"], ["S", "Features: save"], ["H B", "Result: head, bust"], ["T G U P", "Result: texture, clay, uncertainty, parts"], ["W M", "Result: wireframe, measure"], ["?", "this list"]];
     window.eigenheadSay = (kind, text, faults) => this.say(kind, text, faults || []);
@@ -52,10 +56,10 @@ export default {
   mounted() { window.addEventListener("keydown", this.key); document.addEventListener("scroll", this.scrolled, true); this.scrollBack(); },
   unmounted() { window.removeEventListener("keydown", this.key); document.removeEventListener("scroll", this.scrolled, true); clearInterval(this.scrolling); },
   methods: {
-    say(kind, text, faults) {
+    say(kind, text, faults, link) {
       const id = this.next++, further = faults.filter((fault) => !text.includes(fault));
-      this.messages = [...this.messages, { id, kind, text, faults: further }].slice(-MESSAGES_MOST);
-      if (kind === "done") setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
+      this.messages = [...this.messages, { id, kind, text, link, faults: further }].slice(-MESSAGES_MOST);
+      if (kind === "done" && !link) setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
     },
     turn() { this.look = this.look === "light" ? "dark" : "light"; },
     place(name) { return `eigenhead scroll ${location.pathname} ${name}`; },
@@ -73,7 +77,7 @@ export default {
       if (typing(event)) return;
       if (event.key === "?") this.help = !this.help;
       else if (event.key === "Escape") this.help = false;
-      else if (this.current !== "features" && /^[1-7]$/.test(event.key)) window.location.href = this.links[event.key - 1].path;
+      else if (this.current !== "features" && /^[1-8]$/.test(event.key)) window.location.href = this.links[event.key - 1].path;
     },
   },
 };

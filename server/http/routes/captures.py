@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse
 from rig.errors import InputError
 from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Limit, Sought
+from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Limit, Sought, WithTag
 from server.http.rig_schemas import CaptureChecks, HoldingsOut
 from server.http.schemas import CaptureEdit, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
 from server.services.bulk import each
@@ -74,14 +74,15 @@ def list_captures(
     q: Sought = "",
     session: Annotated[str | None, Query(max_length=64)] = None,
     verdict: Annotated[Literal["good", "usable", "poor", "none"] | None, Query(description="none: not judged")] = None,
+    tag: WithTag = None,
     sort: CaptureOrder = "-created",
     limit: Limit = 100,
     cursor: Cursor = None,
     before: Annotated[str | None, Query(max_length=64, description="only captures older than this id")] = None,
 ) -> CaptureList:
-    """A page at a time, newest first unless asked otherwise; ``q`` looks into label, expression, session, verdict,
-    source and id."""
-    query = CaptureQuery(q, session, verdict, before=before, order=sort)
+    """A page at a time, newest first unless asked otherwise; ``q`` looks into label, expression, tags, session,
+    verdict, source and id."""
+    query = CaptureQuery(q, session, verdict, before=before, tag=tag, order=sort)
     found = service.captures.page(query, limit, cursor)
     captures = [CaptureOut.model_validate(record) for record in found.items]
     return CaptureList(captures=captures, next=found.next, total=found.total)
@@ -100,6 +101,8 @@ def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> B
         "erase": service.captures.erase,
         "reconstruct": lambda capture: service.jobs.submit(capture, work, key=caller.key),
         "move": lambda capture: service.captures.edit(capture, {"session": wanted.session}),
+        "tag": lambda capture: service.captures.tag(capture, wanted.tags),
+        "untag": lambda capture: service.captures.untag(capture, wanted.tags),
     }
     return BulkOut.model_validate(each(wanted.ids, actions[wanted.action]))
 
@@ -118,8 +121,9 @@ def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureCh
 
 @router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: CaptureEdit) -> CaptureOut:
-    """Another label, expression or session."""
-    changed = service.captures.edit(capture_id, wanted.model_dump(exclude_unset=True))
+    """Another label, expression or session, or other tags."""
+    given = wanted.model_dump(exclude_unset=True)
+    changed = service.captures.edit(capture_id, given, tags=given.pop("tags", None))
     return CaptureOut.model_validate(changed)
 
 

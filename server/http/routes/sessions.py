@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import Cursor, Limit, PersonOut, SessionList, Sought, SubjectList
+from server.http.list_schemas import Cursor, Limit, PersonOut, SessionList, Sought, SubjectList, WithTag
 from server.http.schemas import NewSession, SessionEdit, SessionOut
 from server.services.keys import Caller
 from server.storage.library import SubjectOrder
@@ -39,12 +39,13 @@ def list_subjects(
     service: ServiceOf,
     caller: Reader,
     q: Sought = "",
+    tag: WithTag = None,
     sort: SubjectOrder = "-created",
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> SubjectList:
     """People: sessions of one name are one person's. Each with its newest head."""
-    found = service.sessions.subjects(q, sort, limit, cursor)
+    found = service.sessions.subjects(q, sort, limit, cursor, tag=tag)
     subjects = [PersonOut.model_validate(subject) for subject in found.items]
     return SubjectList(subjects=subjects, next=found.next, total=found.total)
 

@@ -71,12 +71,14 @@ def test_two_pages_agree_and_a_removal_is_taken_back_or_for_good(
         assert time.monotonic() < deadline
         time.sleep(0.2)
     here.locator("#reconstruct").click()
+    here.wait_for_url("**/result/*", timeout=30_000)  # its head opens by itself
     jobs = two.go("/jobs")
     expect(jobs.locator("[data-state=succeeded]")).to_have_count(1, timeout=30_000)
     jobs.get_by_role("button", name="Remove").click()
     expect(jobs.locator("[data-job]")).to_have_count(0, timeout=5000)
     here.get_by_role("button", name="Undo").click()  # on another page
     expect(jobs.locator("[data-state=succeeded]")).to_have_count(1, timeout=5000)
+    here = one.go("/captures")
     here.locator("#remove").click()
     expect(here.locator("#removal")).to_contain_text("1 head (")
     expect(here.locator("#removal")).to_contain_text("photographs of the face in the overlays would stay")

@@ -13,7 +13,7 @@ from tests.support.services import RunningService, uploaded_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration")
+PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service")
 
 
 def test_no_page_has_a_violation_dark_or_light_and_each_says_what_to_do(
@@ -71,7 +71,8 @@ def test_a_page_comes_back_after_the_service_was_killed(
     uploaded_capture(service, tmp_path, 1)
     v = visit(browser, service.url)
     page = v.go("/captures")
-    expect(page.locator(".row-button")).to_have_count(1)
+    expect(page.locator(".row-button")).to_have_count(1)  # sent with the page
+    expect(page.get_by_text("GB free")).to_be_visible(timeout=20_000)  # over the socket, which is there now
     service.kill()
     expect(page.locator("#popup")).to_be_visible(timeout=20_000)
     service.start()

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import httpx
 import numpy as np
 import pytest
@@ -53,7 +54,9 @@ def off_the_ramp(colours: np.ndarray) -> np.ndarray:
     return np.min(np.linalg.norm(colours.reshape(-1, 1, 3) - steps, axis=2), axis=1)
 
 
-def test_what_is_shown_is_what_the_files_hold(browser: Browser, heads: RunningService, screenshots: Path) -> None:
+def test_what_is_shown_is_what_the_files_hold(
+    browser: Browser, heads: RunningService, screenshots: Path, tmp_path: Path
+) -> None:
     v = visit(browser, heads.url)
     page = v.go("/result")
     page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
@@ -73,6 +76,8 @@ def test_what_is_shown_is_what_the_files_hold(browser: Browser, heads: RunningSe
     assert np.mean(nearest < 3) > 7 / 8
     keep_screenshots(page, screenshots, "viewer-parts")
     check_comparison(page)
+    check_exports(page, tmp_path)
+    check_side_by_side(page, screenshots)
     check_look_through(page)
     check_subjects(v, screenshots)
     v.check_clean()
@@ -105,6 +110,84 @@ def check_comparison(page: Page) -> None:
     page.get_by_label("Compare with").select_option(index=2)
     expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=30_000)
     page.get_by_label("Compare with").select_option("")
+
+
+def check_exports(page: Page, tmp_path: Path) -> None:
+    """The picture holds the head, on nothing, and the legend of its colours; the video one turn about the head, under
+    a lamp that stands still, so that its bright side changes over."""
+    page.locator("canvas").focus()
+    page.keyboard.press("u")
+    expect(page.locator(".view3d").get_by_text("Standard deviation")).to_be_visible()
+    with page.expect_download() as download:
+        page.locator("#picture").click()
+    picture = np.asarray(Image.open(download.value.path()), float)
+    height, width = picture.shape[:2]
+    assert picture.shape[2] == 4
+    assert picture[-1, 0, 3] == 0
+    middle = picture[height // 2 - 40 : height // 2 + 40, width // 2 - 40 : width // 2 + 40]
+    assert off_the_ramp(middle[:, :, :3]).max() < 6
+    rem, right = height / 40, width - height / 40
+    legend = picture[[round(1.1 * rem), round(10.9 * rem)], round(right - rem / 2), :3]
+    # A hundredth of the scale from its ends, where its last eighth changes by 131 levels: 10.5, and 2.6 a half pixel.
+    assert np.abs(legend - RAMP[[-1, 0]]).max() < 14
+    page.locator("canvas").focus()
+    page.keyboard.press("g")
+    page.get_by_label("Light").select_option("side")
+    with page.expect_download(timeout=60_000) as download:
+        page.locator("#turntable").click()
+    download.value.save_as(tmp_path / "turn.webm")
+    sides = bright_sides(tmp_path / "turn.webm")
+    # The lamp stands 80 degrees to the right: straight ahead after 80 degrees of the turn, to the left after 110.
+    turned_left = [brighter for second, brighter in sides if 110 < 360 * second / 8 < 170]
+    assert sides[0][1] > 5
+    assert turned_left
+    assert max(turned_left) < -5
+    assert 6 < sides[-1][0] < 10, "one turn takes 8 s, however many pictures the machine draws"
+    page.get_by_label("Light").select_option("studio")
+
+
+def bright_sides(video: Path) -> list[tuple[float, float]]:
+    """When each picture comes (s), and how much brighter the head's right half is (levels)."""
+    capture, found = cv2.VideoCapture(str(video)), []
+    while (read := capture.read())[0]:
+        height, width = read[1].shape[:2]
+        reach = height // 6
+        rows = slice(height // 2 - reach, height // 2 + reach)
+        left, right = (read[1][rows, width // 2 + a : width // 2 + b] for a, b in ((-reach, 0), (0, reach)))
+        found.append((capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, float(right.mean()) - float(left.mean())))
+    return found
+
+
+def check_side_by_side(page: Page, screenshots: Path) -> None:
+    """Anna's two heads are equal balls: both halves of the view show the same, however it is turned."""
+    page.get_by_label("Compare with").select_option(index=1)
+    page.locator("#beside").check()
+    expect(page.locator("#right-head")).to_contain_text("Anna")
+    page.locator("canvas").focus()
+    before = np.zeros(1)
+    for keys in (["g"], ["u"], ["ArrowUp"] * 6):
+        for key in keys:
+            page.keyboard.press(key)
+        before = await_halves(page, before)
+    keep_widths(page, screenshots, "side-by-side")
+    page.locator("#beside").uncheck()
+    expect(page.get_by_text("Distance to the other head")).to_be_visible(timeout=30_000)
+    page.get_by_label("Compare with").select_option("")
+
+
+def await_halves(page: Page, before: np.ndarray, tries: int = 40) -> np.ndarray:
+    """The left half of the 3D view, without what is written at its rims, as soon as it is another one than before and
+    the right half is the same."""
+    for _ in range(tries):
+        page.wait_for_timeout(250)
+        shown = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), float)
+        height, half = shown.shape[0], shown.shape[1] // 2
+        rows, columns = slice(height // 3, 2 * height // 3), slice(half // 5, half - half // 5)
+        left, right = shown[rows, :half][:, columns], shown[rows, half : 2 * half][:, columns]
+        changed = before.shape != left.shape or np.abs(left - before).max() > 10
+        if changed and left.mean() > 40 and np.abs(left - right).max() <= 2:  # levels: ground is 20, rounding 1
+            return left
+    raise AssertionError("the halves of the view show different balls")
 
 
 def check_look_through(page: Page) -> None:

@@ -36,7 +36,7 @@ def test_the_whole_way(
     tmp_path: Path,
     record_property: Callable[[str, object], None],
 ) -> None:
-    """From the seat to the files with four keys and clicks; then features picked, and a comparison."""
+    """From the seat to the files with three keys and clicks; then features picked, and a comparison."""
     v = visit(browser, studio.url)
     page = v.go("/")
     expect(page.locator("article.tile")).to_have_count(11)
@@ -46,7 +46,7 @@ def test_the_whole_way(
     expect(page.locator(".countdown")).to_be_visible()
     page.keyboard.press("Escape")
     expect(page.locator(".countdown")).to_have_count(0)
-    page.keyboard.press("Space")  # the first of four keys and clicks from the seat to the files
+    page.keyboard.press("Space")  # the first of three keys and clicks from the seat to the files
     expect(page.get_by_text("Captured 11 pictures")).to_be_visible(timeout=LONG_MS)
     expect(page.locator("[data-shot]")).to_be_visible()
     keep_widths(page, screenshots, "way-verdict")
@@ -56,8 +56,7 @@ def test_the_whole_way(
     running = httpx.get(studio.url + "/v1/jobs").json()["jobs"][0]["state"]
     rate = look_around(browser, studio, screenshots)  # other pages, while the job runs
     record_property("pictures a second of the slowest tile while a job runs", round(rate, 2))
-    expect(page.locator("#open-head")).to_be_visible(timeout=LONG_MS)
-    page.keyboard.press("h")
+    page.wait_for_url("**/result/*", timeout=LONG_MS)  # the head opens by itself
     page.wait_for_selector("canvas[data-loaded]:not([data-loaded=''])", timeout=LONG_MS)
     keep_widths(page, screenshots, "way-head")
     with page.expect_download() as download:

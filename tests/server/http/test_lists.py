@@ -69,6 +69,50 @@ def test_many_captures_take_one_action_and_those_that_cannot_are_named(http: htt
     assert http.get("/v1/sessions", params={"q": "wanda"}).json()["sessions"][0]["captures"] == []
 
 
+def test_captures_and_people_are_found_by_their_tags(http: httpx.Client, captures: list[str]) -> None:
+    session = http.post("/v1/sessions", json={"label": "Tagged Tess"}).json()["id"]
+    edited = http.patch(
+        f"/v1/captures/{captures[2]}", json={"session": session, "tags": ["Beard ", "beard", "study 4"]}
+    )
+    assert edited.json()["tags"] == ["Beard", "study 4"]
+    done = http.post("/v1/captures/bulk", json={"action": "tag", "ids": captures[2:4], "tags": ["blind"]}).json()
+    assert done == {"done": captures[2:4], "refused": []}
+
+    def found(tag: str) -> list[str]:
+        page = http.get("/v1/captures", params={"tag": tag, "sort": "label"}).json()
+        return [capture["id"] for capture in page["captures"]]
+
+    assert (found("BEARD"), found("blind"), found("bear")) == (captures[2:3], captures[2:4], [])
+    people = http.get("/v1/subjects", params={"tag": "study 4"}).json()["subjects"]
+    assert [(person["label"], person["tags"]) for person in people] == [("Tagged Tess", ["Beard", "blind", "study 4"])]
+    assert http.get("/v1/captures", params={"q": "walnut blind"}).json()["total"] == 2
+    http.post("/v1/captures/bulk", json={"action": "untag", "ids": captures[2:4], "tags": ["Blind"]})
+    assert found("blind") == []
+    http.patch(f"/v1/captures/{captures[2]}", json={"label": "walnut 2"})
+    assert found("beard") == captures[2:3], "what is not given stays"
+    http.patch(f"/v1/captures/{captures[2]}", json={"tags": [], "session": None})
+    assert found("beard") == []
+
+
+@pytest.mark.parametrize(
+    "tags", [["a\nb"], ["x" * 51], ["a,b"], [" "], ["\u202eevil"], [""], [f"t{n}" for n in range(21)]]
+)
+def test_tags_that_cannot_be_are_refused(http: httpx.Client, captures: list[str], tags: list[str]) -> None:
+    answer = http.patch(f"/v1/captures/{captures[4]}", json={"tags": tags})
+    assert answer.status_code == 422
+    assert http.get(f"/v1/captures/{captures[4]}").json()["tags"] == []
+
+
+def test_a_capture_takes_no_more_tags_than_it_can_have(http: httpx.Client, captures: list[str]) -> None:
+    """One by one, and many at once: the one that is full is named, the other is tagged."""
+    full = [f"t{number}" for number in range(20)]
+    assert http.patch(f"/v1/captures/{captures[4]}", json={"tags": full}).status_code == 200
+    answer = http.post("/v1/captures/bulk", json={"action": "tag", "ids": captures[3:5], "tags": ["one more"]}).json()
+    assert (answer["done"], [one["id"] for one in answer["refused"]]) == (captures[3:4], captures[4:5])
+    assert "at most 20" in answer["refused"][0]["detail"]
+    http.patch(f"/v1/captures/{captures[4]}", json={"tags": []})
+
+
 def test_every_queued_job_has_a_place_of_its_own(http: httpx.Client, captures: list[str]) -> None:
     """In a queue that nobody serves; another test may have left a job in it."""
     left = http.get("/v1/jobs", params={"state": "queued"}).json()["jobs"]

@@ -129,16 +129,20 @@ def test_sessions_of_one_name_are_one_person(store: Store, library: Library) -> 
 def test_each_start_mends_what_differs_from_the_records(tmp_path: Path, library: Library) -> None:
     bare = Store(tmp_path)  # of a version without an index
     for number in (1, 2, 3):
-        stored(bare, capture(number, label=f"old {number}"))
+        stored(bare, capture(number, label=f"old {number}", tags=(f"tag {number}", "all")))
     bare.save_session(session(4, "Anna"))
     assert library.captures(CaptureQuery(), 10).ids == ()
     assert library.reconcile(bare) == 4
     assert library.reconcile(bare) == 0
+    assert library.tags(2) == ["all", "tag 1"]
+    assert library.captures(CaptureQuery(tag="Tag 2"), 10).ids == (identity(2),)
     shutil.rmtree(bare.folder("captures", identity(1)))  # by somebody else
     path = bare.folder("captures", identity(2)) / "record.json"  # from a backup
     path.write_text(json.dumps(CAPTURE.document(capture(2, label="restored"))))
     (bare.folder("captures", identity(3)) / "record.json").write_text("{")
     assert library.reconcile(bare) == 2
+    assert library.tags(9) == ["all", "tag 3"], "the damaged one goes when it was found damaged"
     assert library.captures(CaptureQuery("restored"), 10).ids == (identity(2),)
     library.reconcile(bare)
     assert library.captures(CaptureQuery(), 10).ids == (identity(2),)  # the damaged one was set aside
+    assert library.tags(9) == []

@@ -1,0 +1,199 @@
+"""The service itself: API keys, what is kept how long and goes next, and what lies on the disk."""
+
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import TypedDict
+
+from nicegui import app as pages
+from nicegui import ui
+from nicegui.events import GenericEventArguments
+from starlette.responses import RedirectResponse
+
+from rig.errors import InputError
+from server.console.identity import KEY_ID
+from server.console.page import Action, Chosen, Page, remove_all_later, shared, show
+from server.errors import Conflict
+from server.services.keys import LOCAL, SCOPES, Caller
+from server.services.retention import clear_caches, sweep, upcoming
+from server.services.service import Service
+from server.services.storage_use import FAILED, StorageCount
+from server.settings import PREFIX, ServiceSettings
+from server.storage.job_index import JobQuery
+
+NAME_MOST = 200
+REMOVED_AT_ONCE = 1000
+GB = 1e9
+
+
+class KeyLine(TypedDict):
+    id: str
+    name: str
+    scopes: list[str]
+    created: str
+    own: bool
+
+
+class SettingLine(TypedDict):
+    """A setting of retention: its variable, what it is set to in words, and what it means."""
+
+    name: str
+    variable: str
+    value: str
+    means: str
+
+
+class ServiceShown(TypedDict):
+    """``keys`` are None for a caller who may not see them; ``open``: whether there are none, so that whoever sits at
+    this machine may do everything."""
+
+    keys: list[KeyLine] | None
+    open: bool
+    scopes: list[str]
+    admin: bool
+    retention: list[SettingLine]
+    upcoming: list[dict[str, object]]
+    storage: dict[str, object]
+
+
+class KeyForm(TypedDict):
+    label: str
+    scopes: list[str]
+
+
+class ServicePage(Page, component="service.js"):
+    secret: str | None = None  # of a key that was made a moment ago, until the page has it
+
+    def look(self) -> ServiceShown:
+        admin, service = self.caller.may("admin"), self.service
+        return {
+            "keys": [*key_lines(service, self.caller)] if admin else None,
+            "open": self.caller.key == LOCAL,
+            "scopes": [*SCOPES],
+            "admin": admin,
+            "retention": setting_lines(service.settings),
+            "upcoming": shared.get("upcoming", 5.0, lambda: [asdict(one) for one in upcoming(service)]),
+            "storage": shared.get("storage", 2.0, lambda: asdict(counted.of(service))),
+        }
+
+    async def _act(self, event: GenericEventArguments) -> None:
+        await super()._act(event)
+        if self.secret is not None:  # over the page's socket alone, and never in the state that a look makes
+            pages.storage.user[KEY_ID] = self.caller.key
+            self.run_method("show_key", self.secret)
+            self.secret = None
+
+
+counted = StorageCount()
+
+
+def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
+    return [
+        {
+            "id": key.id,
+            "name": key.name,
+            "scopes": [*key.scopes],
+            "created": datetime.fromtimestamp(key.created, UTC).isoformat(timespec="seconds"),
+            "own": key.id == caller.key,
+        }
+        for key in service.keys.all()
+    ]
+
+
+def setting_lines(s: ServiceSettings) -> list[SettingLine]:
+    told = {
+        "keep_captures_days": _days(s.keep_captures_days),
+        "keep_results_days": _days(s.keep_results_days),
+        "keep_jobs": "all of them" if s.keep_jobs is None else f"the newest {s.keep_jobs}",
+        "make_room": "yes" if s.make_room else "no",
+        "free_bytes": f"{s.free_bytes / GB:.1f} GB",
+        "cache_bytes": f"{s.cache_bytes / GB:.1f} GB",
+        "upload_hours": f"{s.upload_hours:g} hours",
+    }
+    described = ServiceSettings.model_fields
+    return [
+        {
+            "name": name,
+            "variable": PREFIX + name.upper(),
+            "value": value,
+            "means": (described[name].description or "").partition(";")[0],
+        }
+        for name, value in told.items()
+    ]
+
+
+def _days(days: float | None) -> str:
+    return "for ever" if days is None else f"{days:g} days"
+
+
+def add_key(page: ServicePage, event: KeyForm) -> str:
+    """The first key closes an open service, and so must be able to make others; this page goes on with it."""
+    name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
+    faults = []
+    if not name or len(name) > NAME_MOST:
+        faults.append(f"a key has a name of 1 to {NAME_MOST} characters")
+    if not name.isprintable():
+        faults.append("the name has control characters")
+    if not scopes:
+        faults.append("choose what the key may do")
+    if page.caller.key == LOCAL and "admin" not in scopes:
+        faults.append("from the first key on, all others need one: give it the scope admin")
+    if faults:
+        raise InputError("key", faults)
+    page.secret = page.service.keys.add(name, tuple(scopes))
+    if page.caller.key == LOCAL:
+        page.caller = Caller(page.secret.split("_")[1], frozenset(scopes))
+        return f"Key {name!r} is made. Everybody needs a key from now on; this browser is signed in with it."
+    return f"Key {name!r} is made."
+
+
+def revoke(page: ServicePage, event: Chosen) -> str:
+    if event["id"] == page.caller.key:
+        raise Conflict("own-key", "A key cannot remove itself; use another, or `eigenhead keys remove`.")
+    page.service.keys.remove(event["id"])
+    return "Revoked: its pages end within two seconds, its requests now."
+
+
+def clear(page: ServicePage, event: object) -> str:
+    gone = clear_caches(page.service)
+    forget_storage()
+    return f"Cleared what was kept of {gone} {'capture' if gone == 1 else 'captures'}; what is asked for is made anew."
+
+
+def remove_failed(page: ServicePage, event: object) -> str:
+    jobs = page.service.jobs
+    ids = [job.id for job in jobs.page(JobQuery("", FAILED), REMOVED_AT_ONCE).items]
+    if not ids:
+        raise Conflict("none-failed", "No job failed or was cancelled.")
+    remove_all_later(ids, jobs.delete, f"{len(ids)} jobs that failed or were cancelled", "admin")
+    forget_storage()
+    return f"{len(ids)} removed."
+
+
+def sweep_now(page: ServicePage, event: object) -> str:
+    gone = {kind: count for kind, count in sweep(page.service).items() if count}
+    forget_storage()
+    return "Swept: " + (", ".join(f"{count} {kind}" for kind, count in gone.items()) or "nothing was due") + "."
+
+
+def count_again(page: ServicePage, event: object) -> None:
+    forget_storage()
+
+
+def forget_storage() -> None:
+    counted.forget()
+    shared.forget("storage", "upcoming")
+
+
+ServicePage.actions = {
+    "add_key": Action("admin", add_key),
+    "revoke": Action("admin", revoke),
+    "clear": Action("admin", clear),
+    "remove_failed": Action("admin", remove_failed),
+    "sweep": Action("admin", sweep_now),
+    "count": Action("read", count_again),
+}
+
+
+@ui.page("/service")
+async def service_page() -> RedirectResponse | None:
+    return await show("service", ServicePage)

@@ -1,0 +1,123 @@
+"""What lies in the data folder, by kind, and what of it could go."""
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from server.services.jobs import STATUSES
+from server.services.service import Service
+from server.storage.job_index import JobQuery
+
+COUNT_AGAIN_S = 300.0  # between two looks through the data folder, which of a large one take long
+FAILED = (*STATUSES["failed"], *STATUSES["cancelled"])
+
+KINDS = {  # folders of the data folder, by what they hold
+    "captures": ("captures",),
+    "results": ("jobs",),
+    "caches": ("cache",),
+    "calibrations": ("calibrations",),
+    "unfinished": ("incoming", "uploads", "trash"),
+    "set aside": ("set-aside",),
+    "rig": ("rig",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class KindOfUse:
+    """``things``: captures, jobs, ...: what lies directly in the kind's folders."""
+
+    kind: str
+    bytes: int
+    things: int
+
+
+@dataclass(frozen=True, slots=True)
+class StorageUse:
+    """``kinds`` are None while the data folder is looked through for the first time; ``at`` (s since 1970) says when it
+    was. ``spare``: what uploads and jobs leave free; ``failed``: jobs that ended without a result."""
+
+    data: str
+    free: int
+    total: int
+    spare: int
+    kinds: tuple[KindOfUse, ...] | None
+    at: float | None
+    failed: int
+
+
+class StorageCount:
+    """Looks through the data folder in a thread of its own, when asked and the last look is old."""
+
+    def __init__(self) -> None:
+        self._looking = threading.Lock()
+        self._found: tuple[KindOfUse, ...] | None = None
+        self._at: float | None = None
+
+    def of(self, service: Service) -> StorageUse:
+        """Does not wait for a look that is under way."""
+        old = self._at is None or time.time() - self._at > COUNT_AGAIN_S
+        if old and self._looking.acquire(blocking=False):
+            threading.Thread(target=self._look, args=(service.store.data,), daemon=True).start()
+        disk = shutil.disk_usage(service.store.data)
+        return StorageUse(
+            str(service.store.data.resolve()),
+            disk.free,
+            disk.total,
+            service.settings.free_bytes,
+            self._found,
+            self._at,
+            service.jobs.page(JobQuery("", FAILED), limit=1).total,
+        )
+
+    def forget(self) -> None:
+        """The next question makes a new look; until it is through, the old one is told."""
+        self._at = None if self._found is None else 0.0
+
+    def _look(self, data: Path) -> None:
+        try:
+            self._found, self._at = count(data), time.time()
+        finally:
+            self._looking.release()
+
+
+def count(data: Path) -> tuple[KindOfUse, ...]:
+    """Bytes of all files, by kind; "other" is what else lies in the folder, the database and models among it."""
+    known = {folder for folders in KINDS.values() for folder in folders}
+    found = []
+    for kind, folders in KINDS.items():
+        places = [data / folder for folder in folders]
+        found.append(KindOfUse(kind, sum(map(_bytes, places)), sum(len(_names(place)) for place in places)))
+    rest = [data / name for name in _names(data) if name not in known]
+    return (*found, KindOfUse("other", sum(map(_bytes, rest)), len(rest)))
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)  # noqa: PTH208 - names alone, of a hundred thousand
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _bytes(path: Path) -> int:
+    return path.lstat().st_size if path.is_file() else sum(_sizes(path))
+
+
+def _sizes(folder: Path) -> Iterator[int]:
+    """Of all files below a folder, of what is removed meanwhile none; links are not followed."""
+    try:
+        entries = os.scandir(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    with entries:
+        for entry in entries:
+            try:
+                if entry.is_dir(follow_symlinks=False):
+                    yield from _sizes(Path(entry.path))
+                else:
+                    yield entry.stat(follow_symlinks=False).st_size
+            except FileNotFoundError:
+                continue
