@@ -59,7 +59,9 @@ def halvings(share: float, size: tuple[int, int]) -> int:
     return count
 
 
-def at_share(pixels: UInt8[np.ndarray, "h w ..."], size: tuple[int, int], share: float) -> UInt8[np.ndarray, "h w ..."]:
+def at_share(
+    pixels: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int], share: float
+) -> UInt8[np.ndarray, "r c *channels"]:
     """The picture of a file of ``size`` (width, height) at ``share`` of it; decoders may have done some of it."""
     wanted = (round(size[0] * share), round(size[1] * share))
     if wanted == (pixels.shape[1], pixels.shape[0]):
