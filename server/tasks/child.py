@@ -30,6 +30,9 @@ from server.processes import SERVER, python_command, python_environment
 PATIENCE_S = 0.5  # between asking a piece of work to stop and killing it: a cancellation takes effect within a second
 REPORT_EVERY_S = 0.05
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+# By default glibc gives every thread a heap of its own, none of which gives back what the others could use: a default job
+# then held 1.5 GB where it holds 1.35 now, in as many seconds.
+ONE_ARENA = {"MALLOC_ARENA_MAX": "1"}
 
 Report = Callable[[str, float], None]
 P = ParamSpec("P")
@@ -118,7 +121,11 @@ class Child:
         command = python_command("tasks.child", str(theirs.fileno()), str(self._niceness))
         with theirs:
             self._process = subprocess.Popen(
-                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=2, env=python_environment()
+                command,
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=2,
+                env=ONE_ARENA | python_environment(),
             )
         self._connection = Connection(ours.detach())
         return self._connection
