@@ -30,8 +30,8 @@ from server.processes import SERVER, python_command, python_environment
 PATIENCE_S = 0.5  # between asking a piece of work to stop and killing it: a cancellation takes effect within a second
 REPORT_EVERY_S = 0.05
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-# By default glibc gives every thread a heap of its own, none of which gives back what the others could use: a default job
-# then held 1.5 GB where it holds 1.35 now, in as many seconds.
+# By default glibc gives every thread a heap of its own, none of which gives back what the others could use: a default
+# job then holds 150 MB more, and takes as many seconds.
 ONE_ARENA = {"MALLOC_ARENA_MAX": "1"}
 
 Report = Callable[[str, float], None]
