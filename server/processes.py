@@ -6,8 +6,10 @@ directory or on PYTHONPATH.
 
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
+M_ARENA_MAX = -8  # of malloc.h
 SERVER = __package__ or "server"  # "eigenhead.server" in the wheel
 
 
@@ -26,3 +28,15 @@ def python_environment() -> dict[str, str]:
     checkout = str(Path(__file__).resolve().parents[1])
     others = [folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder not in ("", checkout)]
     return os.environ | {"PYTHONPATH": os.pathsep.join([checkout, *others])}
+
+
+def share_one_heap() -> None:
+    """Has all threads of this process use one heap, where the C library is glibc; to be called before there are any.
+
+    By default each has its own, and none gives what it has free to the others: a default job then holds 150 MB more,
+    and takes as many seconds.
+    """
+    import ctypes
+
+    with suppress(AttributeError):
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from rig.errors import InputError
 from rig.formats.archive import extract_archive
 from server.cli.answers import CannotWrite
+from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
 from server.tasks.prepare import prepare_kernels
 from server.tasks.progress import JobProgress
@@ -50,6 +51,7 @@ def reconstruct_locally(
     capture and ``out`` is found before anything heavy is loaded."""
     from pipeline.settings import settings_from_document
 
+    share_one_heap()
     chosen = settings_from_document(settings)
     with _result_folder(out) as fresh, folder_of(capture) as folder:
         _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)

@@ -30,9 +30,6 @@ from server.processes import SERVER, python_command, python_environment
 PATIENCE_S = 0.5  # between asking a piece of work to stop and killing it: a cancellation takes effect within a second
 REPORT_EVERY_S = 0.05
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-# By default glibc gives every thread a heap of its own, none of which gives back what the others could use: a default
-# job then holds 150 MB more, and takes as many seconds.
-ONE_ARENA = {"MALLOC_ARENA_MAX": "1"}
 
 Report = Callable[[str, float], None]
 P = ParamSpec("P")
@@ -125,7 +122,7 @@ class Child:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=2,
-                env=ONE_ARENA | python_environment(),
+                env=python_environment(),
             )
         self._connection = Connection(ours.detach())
         return self._connection

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
+from server.processes import share_one_heap
 from server.tasks.child import Bench, Report
 
 DONE = "done"  # the pipeline's last word, when nothing is written yet
@@ -45,6 +46,7 @@ def reconstruct_capture(
     disk, Cancelled out of ``report``.
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
+    share_one_heap()
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
