@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
+from pipeline.clock import Clock
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.subdivision import vertex_areas
@@ -31,13 +32,13 @@ from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import Records, Row
 from pipeline.experiments.span import weighted_quantile
 from pipeline.experiments.visible_surface import read_visible
+from pipeline.first_fit import align, basis, fit_head, front_camera
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.fitting.rim import find_rim, make_topology, pack_views
 from pipeline.imaging.cpu_raster import camera_depths, depth_maps
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.multiview.visual_hull import visual_hull
-from pipeline.reconstruct import Clock, align, basis, fit_head, front_camera
 from pipeline.settings import Settings, document_from_settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import without_moved_cameras

@@ -9,8 +9,8 @@ from calibration.silhouette_refinement.refine import TooFewCaptures, refine
 from calibration.silhouette_refinement.report import RefinementRun
 from calibration.silhouette_refinement.rims import Heads
 from pipeline.eigenheads.model import load_model, with_modes
+from pipeline.first_fit import align
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.reconstruct import align
 from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import without_moved_cameras

@@ -149,7 +149,7 @@ def test_a_file_that_nobody_used_for_a_month_goes_and_one_in_use_stays(folder: P
 KEPT = """
 from pipeline.eigenheads.model import load_model
 from pipeline.fitting.photo.refine import finer
-from pipeline.reconstruct import basis
+from pipeline.first_fit import basis
 from pipeline.settings import Settings
 model = basis(load_model(), Settings())
 fine, patches, at_centres = finer(model, Settings().photo)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.first_fit import basis
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import RELIEF_OF_OUTLINES, vertex_deviation_mm, with_estimated_prior
-from pipeline.reconstruct import basis
 from pipeline.settings import Settings
 from rig.geometry import Similarity
 

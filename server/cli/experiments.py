@@ -1,0 +1,77 @@
+"""The command that repeats the paper's experiments, and runs ours."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from server.cli.answers import Json, answer, progress_bar
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+@app.command(epilog="Example: eigenhead experiments limit --subjects 3 --json")
+def experiments(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, planted, "
+            "surfaces, texture, light, templates or real."
+        ),
+    ],
+    folders: Annotated[
+        list[Path] | None, typer.Argument(help="real: captures, or photographs alone, of more views than are used.")
+    ] = None,
+    model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
+    subjects: Annotated[int | None, typer.Option(help="How many, instead of the experiment's own.", min=1)] = None,
+    simplex: Annotated[
+        int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
+    ] = None,
+    captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
+    openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
+    front: Annotated[str | None, typer.Option(help="real: the view that the subject faces.")] = None,
+    outlines: Annotated[
+        Path | None, typer.Option(help="real: outlines drawn by hand, outlines.json.", exists=True, dir_okay=False)
+    ] = None,
+    shared: Annotated[Path, typer.Option(help="Where captures/ and ict-facekit/ are.")] = Path("../shared/data"),
+    out: Annotated[
+        Path | None, typer.Option(help="Keeps rows there, so that a stopped run goes on; and the table and pictures.")
+    ] = None,
+    json_out: Json = False,
+) -> None:
+    """Repeat the paper's experiments, and ours."""
+    if name == "real":
+        _experiment_real(folders or [], model, front, outlines, out, json_out)
+        return
+    if folders:
+        raise typer.BadParameter("only real takes folders", param_hint="FOLDERS")
+    from pipeline.experiments.runner import run_experiment
+
+    with progress_bar() as report:
+        found = run_experiment(
+            name,
+            model=model,
+            subjects=subjects,
+            simplex=simplex,
+            captures=captures,
+            openmvs=openmvs,
+            shared=shared,
+            folder=out,
+            report=report,
+        )
+    answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
+
+
+def _experiment_real(
+    folders: list[Path], model: str, front: str | None, outlines: Path | None, out: Path | None, json_out: bool
+) -> None:
+    from server.cli.real import judge_folders
+
+    missing = [str(folder) for folder in folders if not folder.is_dir()]
+    if missing or not folders:
+        told = f"{', '.join(missing)}: no such folder" if missing else "name the folders of the photographs"
+        raise typer.BadParameter(told, param_hint="FOLDERS")
+    with progress_bar() as report:
+        found = judge_folders(folders, model=model, front=front, outlines=outlines, kept=out, report=report)
+    answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
