@@ -118,11 +118,7 @@ class Child:
         command = python_command("tasks.child", str(theirs.fileno()), str(self._niceness))
         with theirs:
             self._process = subprocess.Popen(
-                command,
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=2,
-                env=python_environment(),
+                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=2, env=python_environment()
             )
         self._connection = Connection(ours.detach())
         return self._connection
