@@ -48,8 +48,8 @@ def studio(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudioDevices]:
     threads, opened = threading.active_count(), descriptors()
     with StudioDevices(folder, NAMES, FlatStudio(False), FlatStudio(True)) as devices:
         yield devices
-    assert threading.active_count() == threads
-    assert descriptors() == opened
+    assert threading.active_count() <= threads  # fewer where something of an earlier test ended meanwhile
+    assert descriptors() <= opened
     assert {path.name for path in folder.iterdir()} <= {"rig.toml", "plates"}
 
 
