@@ -52,7 +52,7 @@ def test_keys_are_made_and_revoked_and_what_goes_is_told(browser: Browser, scree
         page.get_by_role("button", name="Revoke reader").click()
         page.get_by_role("button", name="Revoke for good").click()
         expect(page.locator("[data-key]")).to_have_count(1)
-        shown.wait_for_url("**/sign-in", timeout=10_000)
+        shown.wait_for_url("**/sign-in", timeout=30_000)
         assert service_answers(service, reader) == 401
         v.check_clean()
         other.check_clean()
