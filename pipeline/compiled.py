@@ -70,7 +70,7 @@ def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Calla
         cache: whether to keep it.
         allocates: whether the function, or one that it calls, makes arrays. One that makes none does without counts of
             references: otherwise every further name of an array, a row or a field too, costs an atomic instruction,
-            which was three quarters of the dense stage's sweep, and which cores wait for each other at.
+            which was most of the dense stage's sweep, and which cores wait for each other at.
         options: of ``numba.njit``.
     """
 
