@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
+from pipeline.estimation.positive_definite import inverse
 from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.head_problem import started_problem
@@ -169,7 +170,7 @@ def finish(solved: Solved) -> Fit:
         # At a bound a posterior is no Gaussian: it falls exponentially with the slope there, its deviation 1 / slope.
         held = posed[(state.coefficients[posed] <= 0.0) & (equations.gradient[posed] > 0.0)]
         equations.matrix[held, held] += equations.gradient[held] ** 2
-    covariance = np.linalg.inv(equations.matrix)[:kept, :kept]
+    covariance = inverse(equations.matrix)[:kept, :kept]
     rim = observed_rim(problem, solved.evidence, state, stage)
     names = problem.views.names
     return Fit(

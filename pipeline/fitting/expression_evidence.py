@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.estimation.bounded import least_within
+from pipeline.estimation.positive_definite import inverse_diagonal
 from pipeline.fitting.contour import Solved, normal_equations
 from pipeline.fitting.head_problem import apply_step, weight_room
 from pipeline.fitting.prior_term import weight_slope
@@ -30,7 +31,7 @@ def with_expression_evidence(solved: Solved, eigenheads: int) -> Solved:
         eigenheads: how many of the modes are a population's.
     """
     posed, state = solved.problem.model.posed, solved.state
-    if not len(posed) or state.coefficients[posed.start : posed.stop].sum() < NEUTRAL:
+    if not makes_face(state.coefficients, posed):
         return solved
     equations = normal_equations(solved)
     count, unknowns = len(state.coefficients), len(equations.gradient)
@@ -50,10 +51,15 @@ def with_expression_evidence(solved: Solved, eigenheads: int) -> Solved:
         slope[weights] += weight_slope(np.maximum(now[weights], 0.0), median)
         step = least_within(whole, slope, *room)
         now = state.coefficients + step[:count]
-        covariance = np.diag(np.linalg.inv(whole))
+        covariance = inverse_diagonal(whole)
         for group in groups:
             variance[group] = _variance(now, covariance, variance, group)
     return replace(solved, state=apply_step(state, step, solved.stage))
+
+
+def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
+    """Whether the weights among coefficients are those of a face that is not neutral."""
+    return len(posed) > 0 and bool(coefficients[posed.start : posed.stop].sum() >= NEUTRAL)
 
 
 def _variance(

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import NormalEquations
@@ -80,22 +80,23 @@ class RimAt:
         stage, rim = self.term.stage, active_samples(self.rim)
         rows = rim_rows(self.term.problem, self.state, rim, stage)
         weight = _loss(rim.residual, self.term.scale_px).weight(rim.residual**2)
-        weight *= rim.length / self.term.evidence.noise.unit
+        root = np.sqrt(weight * rim.length / self.term.evidence.noise.unit).astype(np.float32)
+        rows *= root[:, None]
         shared, views = stage.modes + POSE, len(self.term.problem.views.names)
         ends = np.searchsorted(rim.view, np.arange(views + 1))
         matrix, gradient = equations.matrix, equations.gradient
+        common, residual = rows[:, :shared], root * rim.residual.astype(np.float32)
+        matrix[:shared, :shared] += common.T @ common  # A^T A: half the work of A^T B
+        gradient[:shared] += residual @ common
+        if not stage.cameras:
+            return
         for k, (first, last) in enumerate(pairwise(ends)):
-            part = rows[first:last]
-            weighted = part * weight[first:last, None]
-            square, slope = weighted.T @ part, weighted.T @ rim.residual[first:last]
-            matrix[:shared, :shared] += square[:shared, :shared]
-            gradient[:shared] += slope[:shared]
-            if stage.cameras:
-                own = slice(shared + PER_CAMERA * k, shared + PER_CAMERA * (k + 1))
-                matrix[:shared, own] += square[:shared, shared:]
-                matrix[own, :shared] += square[shared:, :shared]
-                matrix[own, own] += square[shared:, shared:]
-                gradient[own] += slope[shared:]
+            part, own = rows[first:last, shared:], slice(shared + PER_CAMERA * k, shared + PER_CAMERA * (k + 1))
+            across = common[first:last].T @ part
+            matrix[:shared, own] += across
+            matrix[own, :shared] += across.T
+            matrix[own, own] += part.T @ part
+            gradient[own] += residual[first:last] @ part
 
 
 def _loss(residual_px: Float[np.ndarray, " s"], scale_px: float) -> GemanMcClure:
@@ -109,12 +110,12 @@ def active_samples(rim: Rim) -> Rim:
     return rim if kept.all() else Rim(*(getattr(rim, name)[kept] for name in Rim.__dataclass_fields__))
 
 
-def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> Float[np.ndarray, "s q"]:
+def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> Float32[np.ndarray, "s q"]:
     """d(residual) / d(coefficients, pose, the correction of the sample's own camera)."""
     pose, views = state.world_from_head, moved_views(problem, state)
     basis = problem.bases[stage.level]
     operator = basis.operator
-    rows = np.empty((len(rim.view), stage.modes + POSE + PER_CAMERA))
+    rows = np.empty((len(rim.view), stage.modes + POSE + PER_CAMERA), np.float32)
     # One type for every level, or the loop is compiled once for each.
     level = Level(operator.indptr.astype(np.int64), operator.indices.astype(np.int64), operator.data, basis.modes)
     samples = RimSamples(

@@ -81,7 +81,7 @@ class SurfaceAt:
         root = np.sqrt(seen.information * LOSS.weight(self.squares))
         rows *= root.astype(np.float32)[:, None]
         equations.matrix[...] += rows.T @ rows  # A^T A: half the work of A^T B
-        equations.gradient[...] += (root * self.residual) @ rows
+        equations.gradient[...] += (root * self.residual).astype(np.float32) @ rows
         if stage.cameras:
             tail = slice(len(equations.gradient) - seen.by_camera.shape[1], None)
             self.cameras.add_to(NormalEquations(equations.matrix[tail, tail], equations.gradient[tail]))

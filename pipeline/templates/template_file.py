@@ -2,76 +2,36 @@
 
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.templates.carrying import Attachment, Carrier
+from pipeline.templates.header import DAMAGE, FORMAT, WORDS, BadTemplate, TemplateHeader, header_words, read_meta
 from rig.atomic_write import write_atomically
-from rig.errors import EigenheadError
 from rig.formats.polygon_obj import PolygonMesh
 
-FORMAT = "eigenhead-template/1"
 MESH = {"sizes": "i", "corners": "i", "uv": "f", "corner_uv": "i"}
 ATTACHMENT = {"triangles": "i", "weights": "f", "offsets": "f"}
 CARRIER = {"rest": "f", "skin": "i", "anchors": "i", "wholes": "i", "whole_anchors": "i"}
 
 
-class BadTemplate(EigenheadError):
-    """A file that is no template of this project, or a damaged one."""
-
-    def __init__(self, path: Path, why: str) -> None:
-        super().__init__(
-            f"{path} cannot be used as a template: {why}. Register it again: eigenhead template add FILE.obj "
-            f"--name {path.stem} --overwrite"
-        )
-
-
-class OtherModel(EigenheadError):
-    """A template that another model carries than the one in use."""
-
-    def __init__(self, template: "Template", model_name: str) -> None:
-        same = " of another version" if template.model_name == model_name else ""
-        super().__init__(
-            f"the template {template.name!r} was registered to the model {template.model_name!r}{same}, and the job's "
-            f"is {model_name!r}: use that model (--model), or register the mesh to this one: eigenhead template add "
-            f"{template.source} --name {template.name[:20]}-2 --model {model_name}"
-        )
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Template:
+class Template(TemplateHeader):
     """A mesh registered to a head model. ``mesh.vertices`` is ``carrier.rest``."""
 
-    name: str
-    source: str  # the OBJ file's name
-    source_sha256: str
-    model_name: str
-    model_sha256: str
     mesh: PolygonMesh
     carrier: Carrier
-    figures: Mapping[str, float] = field(default_factory=dict)  # of the registration
-
-    def check_model(self, model_name: str, model_sha256: str) -> None:
-        """Raises OtherModel."""
-        if model_sha256 != self.model_sha256:
-            raise OtherModel(self, model_name)
 
 
 def save_template(path: Path, template: Template) -> None:
     """Writes a template file, atomically. Raises OSError."""
     meta = {
         "format": FORMAT,
-        "name": template.name,
-        "source": template.source,
-        "source_sha256": template.source_sha256,
-        "model_name": template.model_name,
-        "model_sha256": template.model_sha256,
+        **{word: getattr(template, word) for word in WORDS},
         "statements": [list(entry) for entry in template.mesh.statements],
         "figures": dict(template.figures),
     }
@@ -92,17 +52,13 @@ def read_template(path: Path) -> Template:
     """A template from its file. Raises BadTemplate."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            if "meta" not in file:
-                raise BadTemplate(path, "it does not carry this project's template format")
-            meta = json.loads(file["meta"].tobytes())
-            if meta.get("format") != FORMAT:
-                raise BadTemplate(path, f"format {meta.get('format')!r:.40}, wanted {FORMAT!r}")
+            meta = read_meta(path, file)
             kinds = MESH | ATTACHMENT | CARRIER
             arrays = {name: np.asarray(file[name], int if kinds[name] == "i" else float) for name in kinds}
         template = _template(meta, arrays)
     except OSError as error:
         raise BadTemplate(path, error.strerror or "cannot be read") from None
-    except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
+    except DAMAGE as fault:
         raise BadTemplate(path, f"damaged or incomplete ({fault})") from None
     _check(path, template)
     return template
@@ -121,8 +77,7 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray]) -> Template:
         wholes=arrays["wholes"],
         whole_anchors=arrays["whole_anchors"],
     )
-    words = ("name", "source", "source_sha256", "model_name", "model_sha256")
-    return Template(**{word: str(meta[word]) for word in words}, mesh=mesh, carrier=carrier, figures=meta["figures"])
+    return Template(**header_words(meta), mesh=mesh, carrier=carrier, figures=meta["figures"])
 
 
 def _check(path: Path, template: Template) -> None:

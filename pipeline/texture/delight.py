@@ -16,6 +16,7 @@ from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.parallel_for import in_threads
 from pipeline.texture.inpaint import fill_unknown
+from pipeline.texture.layout_image import spread_texels
 from pipeline.texture.light import Light, fit_light, transfer
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.uv_unwrap import Atlas, Layout
@@ -110,9 +111,4 @@ def _factor_image(layout: Layout, factors: Float[np.ndarray, "v 3"]) -> Float32[
     texels, ones = FACTORS_PX * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, FACTORS_PX, FACTORS_PX)
     image = interpolate(shown, texels, ones, layout.faces, factors[layout.source].astype(np.float32))
-    empty = (shown < 0).view(np.uint8)
-    _, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL)
-    nearest = np.asarray(labels).astype(np.int32)
-    known = np.ones((int(nearest.max()) + 1, 3), np.float32)
-    known[nearest[shown >= 0]] = image[shown >= 0]
-    return known[nearest]
+    return spread_texels(image, shown >= 0)

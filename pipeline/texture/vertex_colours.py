@@ -24,6 +24,7 @@ from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.parallel_for import thread_count
 from pipeline.settings import TextureSettings
+from pipeline.texture.blind_patches import see_blind_patches
 from pipeline.texture.decision import Decision, pack_pictures
 from pipeline.texture.inpaint import fill_unknown
 from pipeline.texture.neighbourhood import Neighbourhood
@@ -106,6 +107,7 @@ def texture(
         masks = {name: silhouettes[name].mask for name in views.names}
         pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world, settings.footprint_px)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around, settings)
+        decision = see_blind_patches(decision, mesh_world, silhouettes, depths, settings)
     shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))

@@ -47,10 +47,24 @@ def see_points(
     settings: TextureSettings,
 ) -> Sight:
     """What ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
+    weights = see_weights(camera, silhouette, depth, points, normals, settings)
+    pixels = project_points(camera, points)
+    return Sight(weights, sample_colours(image, pixels, weights, LINEAR, settings.footprint_px))
+
+
+def see_weights(
+    camera: Camera,
+    silhouette: Silhouette,
+    depth: Float32[np.ndarray, "h w"],
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    settings: TextureSettings,
+) -> Float32[np.ndarray, " v"]:
+    """How well ``camera`` sees each point of a surface; 0 where it does not."""
     pixels, depths = project_points(camera, points), camera_depths(camera, points)
     towards = camera.centre_world - points
     facing = np.einsum("vi,vi->v", normals, towards) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
-    weights = visibility_weights(
+    return visibility_weights(
         pixels,
         depths,
         facing,
@@ -59,7 +73,6 @@ def see_points(
         1.0 / camera.intrinsics.fx,
         (settings.contour_margin_px, settings.hidden_mm, settings.least_facing, settings.sharpness),
     )
-    return Sight(weights, sample_colours(image, pixels, weights, LINEAR, settings.footprint_px))
 
 
 def sharpened(

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from pipeline.fitting.fine.association_kernels import Head, closest_triangles
-from pipeline.parallel_for import in_threads
+from pipeline.parallel_for import in_threads, thread_count
 
 CANDIDATES = 4  # vertices whose triangles are tried
 
@@ -35,6 +35,54 @@ def faces_at_vertices(
     return start.astype(np.int64), (corner // 3).astype(np.int64)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """A head that points are asked for a place on, with what finds it."""
+
+    head: Head
+    tree: KDTree
+    corner_mm: float  # from no place of a triangle is its nearest corner farther
+
+    @classmethod
+    def of(
+        cls, vertices: Float[np.ndarray, "v 3"], vertex_normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+    ) -> "Target":
+        """Of a mesh (mm) with its unit vertex normals."""
+        sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
+        head = Head(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
+        return cls(head, KDTree(vertices), float(np.max(sides, initial=0.0)))
+
+    def closest(
+        self,
+        points: Float[np.ndarray, "p 3"],
+        normals: Float[np.ndarray, "p 3"],
+        *,
+        reach_mm: float,
+        least_agreement: float,
+    ) -> Associated:
+        """The closest place on the head of every point that has one within reach.
+
+        Args:
+            points: of the dense surface, mm, in the head's frame.
+            normals: unit, outwards.
+            reach_mm: farther points have no place on it, and cost next to nothing.
+            least_agreement: cosine between a point's normal and the head's.
+
+        Returns:
+            The points that have a place, in their order.
+        """
+        count = min(CANDIDATES, len(self.head.vertices))
+        within = reach_mm + self.corner_mm
+        _, near = self.tree.query(points, k=count, distance_upper_bound=within, workers=thread_count())
+        near = near.reshape(len(points), count)
+        triangle = np.empty(len(points), np.int64)
+        blend, square = np.zeros((len(points), 3)), np.empty(len(points))
+        given = points, normals, near, self.head, least_agreement, triangle, blend, square
+        in_threads(len(points), lambda a, b: closest_triangles(a, b, *given))
+        row = np.flatnonzero((triangle >= 0) & (square <= reach_mm**2))
+        return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
+
+
 def associate(
     points: Float[np.ndarray, "p 3"],
     normals: Float[np.ndarray, "p 3"],
@@ -42,35 +90,12 @@ def associate(
     vertex_normals: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
     *,
-    reach_mm: float | Float[np.ndarray, " p"],
+    reach_mm: float,
     least_agreement: float,
 ) -> Associated:
-    """The closest place on the head of every point that has one within reach.
-
-    Args:
-        points: of the dense surface, mm.
-        normals: unit, outwards.
-        vertices: of the head, mm, same frame.
-        vertex_normals: unit.
-        faces: of the head.
-        reach_mm: farther points have no place on it; one value, or one for each point.
-        least_agreement: cosine between a point's normal and the head's.
-
-    Returns:
-        The points that have a place, in their order.
-    """
-    reach = np.broadcast_to(np.asarray(reach_mm, float), len(points))
-    head = Head(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
-    _, near = KDTree(vertices).query(points, k=min(CANDIDATES, len(vertices)), workers=-1)
-    near = near.reshape(len(points), min(CANDIDATES, len(vertices)))
-    triangle = np.empty(len(points), np.int64)
-    blend, square = np.zeros((len(points), 3)), np.empty(len(points))
-    in_threads(
-        len(points),
-        lambda a, b: closest_triangles(a, b, points, normals, near, head, least_agreement, triangle, blend, square),
-    )
-    row = np.flatnonzero((triangle >= 0) & (square <= reach**2))
-    return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
+    """``Target.closest`` of a head that is asked once; all in one frame, mm."""
+    target = Target.of(vertices, vertex_normals, faces)
+    return target.closest(points, normals, reach_mm=reach_mm, least_agreement=least_agreement)
 
 
 def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

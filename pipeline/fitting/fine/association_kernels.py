@@ -31,6 +31,8 @@ def closest_triangles(first, last, points, normals, near, head, least_agreement,
         x, y, z = points[p]
         for c in range(near.shape[1]):
             v = near[p, c]
+            if v == len(vertices):  # no more within reach
+                break
             agreement = (
                 normals[p, 0] * vertex_normals[v, 0]
                 + normals[p, 1] * vertex_normals[v, 1]

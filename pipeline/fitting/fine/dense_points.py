@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from pipeline.dense.depth_map import DepthMap, points_world
 from pipeline.dense.part_votes import HAIR, SKIN, PartVotes, part_shares
 from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
+from pipeline.parallel_for import thread_count
 from pipeline.settings import FineSettings
 from rig.mesh import Mesh, vertex_normals
 
@@ -49,7 +50,7 @@ def dense_points(
 def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:
     vertices = head_world.vertices[::EVERY]
     normals = vertex_normals(head_world.vertices, head_world.faces)[::EVERY]
-    _, near = KDTree(vertices, balanced_tree=False, compact_nodes=False).query(points, workers=-1)
+    _, near = KDTree(vertices, balanced_tree=False, compact_nodes=False).query(points, workers=thread_count())
     return ((points - vertices[near]) * normals[near]).sum(axis=1) < -INSIDE_MM
 
 

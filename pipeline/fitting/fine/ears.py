@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from pipeline.dense.part_votes import SKIN
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
-from pipeline.fitting.fine.association import associate
+from pipeline.fitting.fine.association import Target, interpolated
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from rig.geometry import rotation_from_vector
 from rig.mesh import vertex_normals
@@ -85,13 +85,15 @@ def _registered(
     place = np.full(len(vertices), -1)
     place[local] = np.arange(len(local))
     part = place[faces[(place[faces] >= 0).all(axis=1)]]
+    own = vertices[local] - centre
+    target = Target.of(own, vertex_normals(own, part), part)
     up, ahead = _axes(vertices, model)
     found = []
     for rise in STARTS_MM:
         for forth in STARTS_MM:
             shift = rise * up + forth * ahead
             if abs(rise) + abs(forth) <= max(STARTS_MM):  # up, down, to or fro
-                found.append(_descend(vertices[local], part, ear[local], points, centre, shift))
+                found.append(_descend(target, ear[local], points, centre, shift))
     best = min(found, key=lambda each: each.cost)
     if best.shown < LEAST_SHOWN:
         return vertices
@@ -111,33 +113,32 @@ def _axes(
 
 
 def _descend(
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
+    target: Target,
     ear: Bool[np.ndarray, " v"],
     points: SurfacePoints,
     centre: Float[np.ndarray, " 3"],
     shift: Float[np.ndarray, " 3"],
 ) -> Motion:
-    """The best motion about ``centre`` from one start."""
-    normals = vertex_normals(vertices, faces)
+    """The best motion about ``centre`` from one start; ``target`` is the ear and its surroundings from there.
+
+    The points are brought to the ear as it was, so that what finds places on it is made once.
+    """
     scale, turn, cost, shown = 1.0, np.eye(3), np.inf, 0
     prior = np.diag([TURN_SD**-2] * 3 + [SHIFT_SD_MM**-2] * 3 + [SCALE_SD**-2])
     for reach in REACHES_MM:
-        now = scale * (vertices - centre) @ turn.T + centre + shift
-        found = associate(
-            points.points, points.normals, now, normals @ turn.T, faces, reach_mm=reach, least_agreement=AGREEMENT
-        )
-        corner = faces[found.triangle]
-        at = np.einsum("nk,nkc->nc", found.blend, now[corner])
+        back = (points.points - centre - shift) @ turn / scale
+        found = target.closest(back, points.normals @ turn, reach_mm=reach / scale, least_agreement=AGREEMENT)
+        distance_mm = scale * found.distance_mm
+        corner = target.head.faces[found.triangle]
+        arm = scale * interpolated(target.head.vertices[corner], found.blend) @ turn.T
         ahead = points.normals[found.row]
-        off = ((points.points[found.row] - at) * ahead).sum(axis=1)
+        off = ((points.points[found.row] - centre - shift - arm) * ahead).sum(axis=1)
         robust = ROBUST_SHARE * reach
-        weight = 1.0 / (1.0 + (found.distance_mm / robust) ** 2) ** 2
+        weight = 1.0 / (1.0 + (distance_mm / robust) ** 2) ** 2
         shown = int(np.count_nonzero(ear[corner].all(axis=1)))
         missing = len(points.points) - len(found.row)
-        square = found.distance_mm**2 / (found.distance_mm**2 + robust**2)
+        square = distance_mm**2 / (distance_mm**2 + robust**2)
         cost = float((square.sum() + missing) / len(points.points))
-        arm = at - centre - shift
         rows = np.concatenate([np.cross(arm, ahead), ahead, (arm * ahead).sum(axis=1, keepdims=True)], axis=1)
         weighted = rows * weight[:, None] / POINT_SD_MM**2
         state = np.concatenate([np.zeros(3), shift, [np.log(scale)]])

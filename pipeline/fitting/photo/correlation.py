@@ -108,39 +108,54 @@ def _sweep(first, last, samples, pictures, steps, out):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _correlate(first, last, members, view, value, seen, grey, noise, score):
+    """|sum of v f / |f||^2 holds every pair twice, and each view with itself."""
     start, member, weight = members
+    steps = grey.shape[2]
+    mean, energy, factor = np.empty(steps, np.float32), np.empty(steps, np.float32), np.empty(steps, np.float32)
+    alone = np.empty(steps, np.float32)
     for p in range(first, last):
         begin, count, views = start[p], start[p + 1] - start[p], 0
         while views < view.shape[1] and view[p, views] >= 0:
             views += 1
         if views < 2:
             continue
-        shades, norms = np.empty((views, count), np.float32), np.empty(views)
-        for d in range(grey.shape[2]):
-            for q in range(views):
-                k = view[p, q]
-                mean = total = energy = 0.0
-                for i in range(count):
-                    s, w = member[begin + i], weight[begin + i]
-                    shades[q, i] = grey[s, k, d]
-                    if seen[k, s]:
-                        mean += w * grey[s, k, d]
-                        total += w
-                mean /= total
-                for i in range(count):
-                    shade = np.float32(0.0)
-                    if seen[k, member[begin + i]]:
-                        shade = shades[q, i] - np.float32(mean)
-                    shades[q, i] = shade
-                    energy += weight[begin + i] * shade * shade
-                norms[q] = np.sqrt(energy + total * noise[k] * noise[k])
-            together = shared = 0.0
-            for q in range(views):
-                for r in range(q):
-                    product = np.float32(0.0)
-                    for i in range(count):
-                        product += np.float32(weight[begin + i]) * shades[q, i] * shades[r, i]
-                    pair = value[p, q] * value[p, r]
-                    together += pair * product / (norms[q] * norms[r])
-                    shared += pair
-            score[p, d] = together / shared
+        mixed = np.zeros((count, steps), np.float32)
+        alone[:] = 0.0
+        values = squares = 0.0
+        for q in range(views):
+            k, total = view[p, q], np.float32(0.0)
+            mean[:] = 0.0
+            energy[:] = 0.0
+            for i in range(count):
+                s, w = member[begin + i], np.float32(weight[begin + i])
+                if seen[k, s]:
+                    total += w
+                    for d in range(steps):
+                        mean[d] += w * grey[s, k, d]
+            for d in range(steps):
+                mean[d] /= total
+            for i in range(count):
+                s, w = member[begin + i], np.float32(weight[begin + i])
+                if seen[k, s]:
+                    for d in range(steps):
+                        shade = grey[s, k, d] - mean[d]
+                        energy[d] += w * shade * shade
+            v, least = np.float32(value[p, q]), np.float32(total * noise[k] * noise[k])
+            for d in range(steps):
+                square = energy[d] + least
+                factor[d] = v / np.sqrt(square)
+                alone[d] += v * v * energy[d] / square
+            for i in range(count):
+                s = member[begin + i]
+                if seen[k, s]:
+                    for d in range(steps):
+                        mixed[i, d] += factor[d] * (grey[s, k, d] - mean[d])
+            values += value[p, q]
+            squares += value[p, q] * value[p, q]
+        energy[:] = 0.0
+        for i in range(count):
+            w = np.float32(weight[begin + i])
+            for d in range(steps):
+                energy[d] += w * mixed[i, d] * mixed[i, d]
+        for d in range(steps):
+            score[p, d] = (energy[d] - alone[d]) / (values * values - squares)

@@ -138,11 +138,12 @@ def facing_of(
     towards = camera.centre_world - points
     cosine = np.einsum("sc,sc->s", towards, normals) / np.linalg.norm(towards, axis=1)
     height, width = depth.shape
-    pixel = camera.project(points)
+    front = np.flatnonzero(cosine >= LEAST_FACING)
+    pixel = project_points(camera, points[front])
     with np.errstate(invalid="ignore"):  # NaN is outside
         inside = ((pixel >= EDGE_PX) & (pixel < (width - EDGE_PX - 1, height - EDGE_PX - 1))).all(axis=1)
-    rows = np.flatnonzero((cosine >= LEAST_FACING) & inside)
-    column, row = np.rint(pixel[rows]).astype(int).T
+    rows = front[inside]
+    column, row = np.rint(pixel[inside]).astype(int).T
     nearest = cv2.erode(depth, np.ones((2 * WINDOW_PX + 1,) * 2, np.uint8))[row, column]
     z, facing = camera_depths(camera, points[rows]), cosine[rows]
     slope = np.minimum(np.sqrt(np.maximum(1.0 - facing**2, 0.0)) / facing, 4.0)

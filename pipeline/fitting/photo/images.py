@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.fitting.rim import Views
 from pipeline.imaging.grey import LUMINANCE, noise_level
-from pipeline.parallel_for import thread_count
+from pipeline.parallel_for import map_in_threads, thread_count
 
 LEAST_BLUR_PX = 0.7  # below that a bilinear sample is mostly interpolation error
 INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
@@ -28,14 +28,16 @@ class Photographs:
 
 def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Views) -> Photographs:
     """Those of the views; a view without a photograph, or with nothing to see in it, does not speak."""
-    grey, noise, speaks = [], [], []
-    for k, name in enumerate(views.names):
+
+    def load(k: int) -> tuple[Float32[np.ndarray, "h w"], float, bool]:
         width, height = views.size[k]
-        image = images.get(name, np.zeros((height, width, 3), np.uint8))
-        grey.append(image.astype(np.float32) @ LUMINANCE)
-        noise.append(noise_level(grey[-1]))
-        speaks.append(shows_texture(grey[-1], distance_of(views, k) < -INSIDE_PX, noise[-1]))
-    return Photographs(tuple(grey), np.array(noise), np.array(speaks))
+        image = images.get(views.names[k], np.zeros((height, width, 3), np.uint8))
+        grey = image.astype(np.float32) @ LUMINANCE
+        noise = noise_level(grey)
+        return grey, noise, shows_texture(grey, distance_of(views, k) < -INSIDE_PX, noise)
+
+    grey, noise, speaks = zip(*map_in_threads(load, len(views.names)), strict=True)
+    return Photographs(grey, np.array(noise), np.array(speaks))
 
 
 def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:

@@ -70,9 +70,9 @@ def refine_with_photographs(
     problem = widened(problem, model, (LEVEL,))
     stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
     state, evaluations, reason, share = solved.state, solved.evaluations, solved.stopped_because, 0.0
-    evidence, misfit = solved.evidence, solved.misfit_mm
+    evidence = solved.evidence
     centres = model.vertices(np.zeros(0))[patches.centre]
-    lost = np.zeros(0, int)
+    lost, surface = np.zeros(0, int), None
     for each in ROUNDS:
         visibility = sample_visibility(problem, state, patches, photographs.speaks, settings)
         seen = visibility.facing > 0
@@ -85,8 +85,9 @@ def refine_with_photographs(
         outline = {LEVEL: near_hair(model, patches.centre[hidden])}
         evidence = StageEvidence(solved.evidence.noise, PhotoEvidence(surface, outline))
         state, used, reason = run_stage(problem, evidence, state, stage, lambda fraction: None)
-        misfit = unfollowed(model, surface, state, lost)
         evaluations += used
+    assert surface is not None
+    misfit = unfollowed(model, surface, state, lost)
     why = f"{share:.0%} of the face look alike in two or more of {speaking} photographs"
     return Solved(problem, evidence, state, stage, evaluations, reason, misfit), Detail("photo", why)
 

@@ -162,6 +162,34 @@ def test_correlation_of_planted_signals() -> None:
     assert muted.max() < 1e-3
 
 
+def test_correlation_is_the_mean_of_all_pairs_of_views() -> None:
+    """By the pairs' correlations themselves, each worth the product of its views' values; a sample that a view does
+    not see is even there."""
+    rng = np.random.default_rng(4)
+    samples, views, steps = 60, 4, 3
+    patch = Patches(
+        np.zeros((samples, 3), np.int32), np.zeros((samples, 3)), np.zeros(1, int), np.array([0, samples]),
+        np.arange(samples), np.zeros(samples), np.ones(samples),
+    )  # fmt: skip
+    weights, seen = rng.uniform(0.1, 1.0, samples), rng.random((views, samples)) < 0.9
+    common = rng.standard_normal((samples, 1, steps))
+    grey = (100.0 + 20.0 * (common + rng.standard_normal((samples, views, steps)))).astype(np.float32)
+    view, value, noise = np.array([[2, 0, 3, 1]]), np.array([[0.9, 0.8, 0.5, 0.3]]), np.array([1.0, 2.0, 3.0, 4.0])
+    alike, shared = np.zeros(steps), 0.0
+    units = {}
+    for k in range(views):
+        weight = weights * seen[k]
+        shade = (grey[:, k] - weight @ grey[:, k] / weight.sum()) * seen[k][:, None]
+        units[k] = shade / np.sqrt(weights @ shade**2 + weight.sum() * noise[k] ** 2)
+    for q in range(views):
+        for r in range(q):
+            pair = value[0, q] * value[0, r]
+            alike += pair * (weights[:, None] * units[view[0, q]] * units[view[0, r]]).sum(axis=0)
+            shared += pair
+    found = correlate(patch, weights, view, value, seen, grey, noise)
+    np.testing.assert_allclose(found[0], alike / shared, atol=1e-5)
+
+
 def test_surface_equations_are_the_derivative_of_the_cost(model: HeadModel) -> None:
     """The gradient against differences, where the robust cost is still quadratic; the matrix against the gradient's."""
     rng = np.random.default_rng(2)
