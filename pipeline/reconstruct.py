@@ -17,9 +17,11 @@ from pipeline.dense.window_bias import WindowBias
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.model import HeadModel
 from pipeline.first_fit import align, basis, fit_head, fitted_mesh, front_camera
-from pipeline.fitting.fine.blink import with_lids
+from pipeline.fitting.expression_evidence import makes_face
+from pipeline.fitting.fine.blink import blinks_of, with_lids
 from pipeline.fitting.fine.dense_points import dense_points
 from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
+from pipeline.fitting.fine.expression_reading import with_read_expression
 from pipeline.fitting.fine.eyelids import look_at_eyes
 from pipeline.fitting.fine.patch_points import PatchSearch, patch_search
 from pipeline.fitting.fine.refine import Displaced, refine_to_surface
@@ -30,7 +32,7 @@ from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.bust import Bust, make_bust
 from pipeline.results.camera_metrics import camera_figures, start_masks
-from pipeline.results.expression import found_expressions, posable_head, shut_eyes
+from pipeline.results.expression import LEAST_SIGMA, READ_SIGMA, found_expressions, posable_head, shut_eyes
 from pipeline.results.measurements import landmarks, measurements
 from pipeline.results.plausibility import plausibility_warnings, refuse
 from pipeline.results.reconstruction import Reconstruction
@@ -39,6 +41,7 @@ from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import usable_views
 from pipeline.texture.delight import DIM_SHARE, delight
 from pipeline.texture.head_texture import find_layout, paint_head
+from pipeline.texture.reduced_layout import reduced_layout
 from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
 from rig.formats.usdz import check_usd
@@ -77,7 +80,7 @@ def reconstruct(
     found = usable_views(capture, rig, segmented, exchanged=settings.exchanged_pictures)
     digests, capture, silhouettes = capture.digests, found.capture, found.silhouettes
     clock("alignment")
-    model = basis(model, settings)
+    population, model = model, basis(model, settings)
     front = front_camera(rig, settings)
     start, warnings = align(model, capture, silhouettes, rig, settings, front, report)
     clock("fit")
@@ -112,6 +115,7 @@ def reconstruct(
     coloured = texture(*given, around=around, dim_share=dim_share)
     atlas = paint_head(layout, mesh, coloured, full.face_region, settings)
     lit = (mesh, normals, coloured, atlas, full.face_region, around)
+    light = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo, albedo_warnings = delight(*lit) if settings.outputs.delit else (None, [])
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
@@ -123,9 +127,11 @@ def reconstruct(
     figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, before)
     widths = {camera.name: camera.intrinsics.width for camera in rig}
     implausible = plausibility_warnings(fit, figures, widths, model.posed)
-    made = fit if finer is None else with_lids(fit, model, finer.lids)
+    made, least_sigma = fit, LEAST_SIGMA
+    if finer is not None:
+        made, least_sigma = face_made(fit, model, population, finer, settings)
     closed = shut_eyes(model, made) | (frozenset() if finer is None else finer.closed_eyes)
-    expression = found_expressions(model, made)
+    expression = found_expressions(model, made, least_sigma)
     asked = settings.outputs.neutral or settings.outputs.morphs
     posable = posable_head(model, fit.world_from_head, mesh, expression) if asked else None
     told = (
@@ -165,6 +171,7 @@ def reconstruct(
         gains=coloured.gains,
         detail=detail,
         atlas=atlas,
+        reduced=light,
         expression=expression,
         posed=model.posed,
         posable=posable,
@@ -227,6 +234,22 @@ def fine_head(
         why = f"the dense surface shows only {share:.0%} of the face, {settings.fine.least_share:.0%} are needed"
         return None, Detail("photo", why)
     return head, Detail("fine", f"the dense surface shows {share:.0%} of the face")
+
+
+def face_made(
+    fit: Fit, model: HeadModel, population: HeadModel, finer: Displaced, settings: Settings
+) -> tuple[Fit, float]:
+    """The fit with the expression that the finished head makes: what its surface tells where the fit found a face that
+    is made at all, and how far its lids are closed where the points about the eye tell. And of how many deviations a
+    weight must be."""
+    places = blinks_of(model)
+    lids = {side: share for side, share in finer.lids.items() if share != float(fit.coefficients[places[side]])}
+    if not makes_face(fit.coefficients, model.posed):
+        return with_lids(fit, model, lids), LEAST_SIGMA
+    eigenheads, median = min(settings.fitting.modes, len(population.modes)), settings.fitting.expression_median
+    given = (fit, model, population, finer.vertices, finer.observed)
+    read = with_read_expression(*given, eigenheads=eigenheads, median=median)
+    return with_lids(read, model, lids), LEAST_SIGMA if read is fit else READ_SIGMA
 
 
 def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
+from pipeline.parallel_for import map_in_threads
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
 from rig.mesh import Mesh
@@ -124,13 +125,19 @@ def make_cells(
     """The cells of every view that has a photograph, colours of all cameras made alike."""
     cameras = [camera for camera in rig if camera.name in images]
     sizes = [_cell_px(camera, head.middle, cell_mm) for camera in cameras]
-    light = [_linear(images[c.name], size) for c, size in zip(cameras, sizes, strict=True)]
-    seen = [_seen(c, size, head, picture.shape[:2]) for c, size, picture in zip(cameras, sizes, light, strict=True)]
-    gains = _gains(cameras, sizes, light, [depth for depth, _ in seen], head)
-    return [
-        _cells(camera, size, images[camera.name], masks[camera.name], picture * gain, drawn, head)
-        for camera, size, picture, gain, drawn in zip(cameras, sizes, light, gains, seen, strict=True)
-    ]
+    shots = [images[camera.name] for camera in cameras]
+
+    def look(k: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        return _linear(shots[k], sizes[k]), _seen(cameras[k], sizes[k], head, _grid(shots[k], sizes[k]))
+
+    light, seen = zip(*map_in_threads(look, len(cameras)), strict=True) if cameras else ((), ())
+    gains = _gains(cameras, sizes, list(light), [depth for depth, _ in seen], head)
+
+    def cells(k: int) -> Cells:
+        mask = masks[cameras[k].name]
+        return _cells(cameras[k], sizes[k], shots[k], mask, light[k] * gains[k], seen[k], head)
+
+    return map_in_threads(cells, len(cameras))
 
 
 def _cell_px(camera: Camera, at_world: Float[np.ndarray, " 3"], cell_mm: float) -> int:
@@ -144,8 +151,13 @@ def _linear(image: UInt8[np.ndarray, "h w 3"], size: int) -> Float32[np.ndarray,
     return _means(cv2.LUT(image, table), size)
 
 
+def _grid(values: np.ndarray, size: int) -> tuple[int, int]:
+    """Rows and columns of whole cells."""
+    return values.shape[0] // size, values.shape[1] // size
+
+
 def _means(values: np.ndarray, size: int) -> np.ndarray:
-    rows, columns = values.shape[0] // size, values.shape[1] // size
+    rows, columns = _grid(values, size)
     whole = values[: rows * size, : columns * size]
     return cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
 

@@ -55,10 +55,11 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
     group = _keys(cell, size)
     count = np.bincount(group)  # a body has a few million such cells: counted sooner than sorted
     keys = np.flatnonzero(count)
+    group = (np.cumsum(count > 0) - 1)[group]  # of the cells in which anything lies
     count = count[keys, None]
 
     def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
-        return np.stack([np.bincount(group, values[:, k])[keys] for k in range(3)], axis=1) / count
+        return np.stack([np.bincount(group, values[:, k]) for k in range(3)], axis=1) / count
 
     return PartVotes(corner, size, keys, mean(points), mean(shown))
 

@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipeline.dense.part_cells import Cells, grey_of, head_guide, make_cells
+from pipeline.dense.part_cells import Cells, head_guide, make_cells
+from pipeline.dense.part_kernels import spread_parts
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.parallel_for import thread_count
 from pipeline.settings import PartSettings
@@ -246,12 +247,9 @@ def finished(
     grid[inside] = share
     radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
     slope, offset = guided(view.grey, grid, inside.astype(np.float32), radius, settings.edge)
-    whole = (inside.shape[1] * view.size_px, inside.shape[0] * view.size_px)
-    slope, offset = (cv2.resize(each, whole, interpolation=cv2.INTER_LINEAR) for each in (slope, offset))
-    over = (0, mask.shape[0] - whole[1], 0, mask.shape[1] - whole[0])
-    slope, offset = (cv2.copyMakeBorder(each, *over, cv2.BORDER_REPLICATE) for each in (slope, offset))
-    smooth = np.clip(slope * grey_of(image)[:, :, None] + offset, 0.0, 1.0) * mask[:, :, None]
-    return smooth / np.maximum(smooth.sum(axis=2, keepdims=True), 1.0)
+    grey, smooth = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), np.zeros((*mask.shape, 3), np.float32)
+    spread_parts(slope, offset, view.size_px, grey, mask, smooth)
+    return smooth
 
 
 def guided(

@@ -2,6 +2,7 @@
 1997)."""
 
 import heapq
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,8 +15,16 @@ class _Collapser:
     """State of one decimation: triangles by vertex, quadrics, and a lazy heap of half-edge collapses."""
 
     # Lists of floats, not arrays: on vectors of three numpy's overhead is ten times the arithmetic.
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, importance: np.ndarray, fixed: np.ndarray) -> None:
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        importance: np.ndarray,
+        fixed: np.ndarray,
+        chart: np.ndarray | None,
+    ) -> None:
         self.places: list[list[float]] = vertices.tolist()
+        self.chart: list[list[float]] | None = None if chart is None else chart.tolist()
         self.fixed: list[bool] = fixed.tolist()
         self.faces: dict[int, tuple[int, int, int]] = {k: (int(a), int(b), int(c)) for k, (a, b, c) in enumerate(faces)}
         self.at: list[set[int]] = [set() for _ in vertices]
@@ -57,9 +66,11 @@ class _Collapser:
         return all(self._survives(k, v, u) for k in self.at[v] - shared)
 
     def _survives(self, k: int, v: int, u: int) -> bool:
-        """The triangle neither folds over nor becomes a sliver when its corner v moves to u."""
-        before = [self.places[w] for w in self.faces[k]]
-        after = [self.places[u if w == v else w] for w in self.faces[k]]
+        """The triangle neither folds over, in the chart too, nor becomes a sliver when its corner v moves to u."""
+        corners, moved = self.faces[k], [u if w == v else w for w in self.faces[k]]
+        if self.chart is not None and _turn(self.chart, corners) * _turn(self.chart, moved) <= 0:
+            return False
+        before, after = [self.places[w] for w in corners], [self.places[w] for w in moved]
         n0, n1 = _cross(before), _cross(after)
         longest = max(_squared(after[0], after[1]), _squared(after[1], after[2]), _squared(after[2], after[0]))
         length = (_inner(n0, n0) * _inner(n1, n1)) ** 0.5
@@ -95,6 +106,12 @@ def _squared(a: list[float], b: list[float]) -> float:
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
+def _turn(chart: list[list[float]], corners: Sequence[int]) -> float:
+    """Twice the triangle's area in the chart, with its sign."""
+    (ax, ay), (bx, by), (cx, cy) = (chart[w] for w in corners)
+    return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+
+
 def _quadrics(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 10"]:
     """Sum of squared plane distances per vertex, weighted by area: xx xy xz yy yz zz xd yd zd dd."""
     normals = face_normals(vertices, faces)
@@ -115,13 +132,15 @@ def decimate(
     *,
     importance: Float[np.ndarray, " V"],
     fixed: Bool[np.ndarray, " V"],
+    chart: Float[np.ndarray, "V 2"] | None = None,
 ) -> list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ 3"]]]:
     """One level per target face count (falling): kept vertex indices, ascending, and faces among them.
 
-    ``importance`` multiplies the error of a vertex (denser where it is high), ``fixed`` vertices are all kept. A level
+    ``importance`` multiplies the error of a vertex (denser where it is high), ``fixed`` vertices are all kept, no
+    triangle turns over in the ``chart`` (texture coordinates) where there is one. A level
     may end with more faces than asked where no collapse is left that keeps a manifold without folds or slivers.
     """
-    state = _Collapser(vertices, faces, importance, fixed)
+    state = _Collapser(vertices, faces, importance, fixed, chart)
     out = []
     for target in targets:
         while len(state.faces) > target and state.heap:

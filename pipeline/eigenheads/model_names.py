@@ -1,5 +1,7 @@
 """Which head models are at hand, and the files behind their names. Loads nothing: the command line asks it."""
 
+import hashlib
+from functools import lru_cache
 from pathlib import Path
 
 from pipeline.eigenheads.data_folder import models_folder
@@ -49,6 +51,18 @@ def model_path(name_or_path: str | Path) -> Path:
     if path.is_file():
         return path
     raise UnknownModel(name)
+
+
+def model_sha256(path: Path) -> str:
+    """Of a model's file, as results name it. Raises OSError."""
+    state = path.stat()
+    return _sha256(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=64)
+def _sha256(path: Path, changed_ns: int, size: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remove_model(name: str) -> Path:

@@ -8,6 +8,8 @@ it truly is, sliding along the surface included. Weights are compared over the t
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from pipeline.experiments.detail import Known, surface_error
 from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.fitting import expression_evidence
+from pipeline.fitting.fine import expression_reading
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
 from rig.mesh import Mesh
@@ -38,18 +41,21 @@ def expressions(
     models: Mapping[str, HeadModel], *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """``<model>_posed_median_mm``, ``<model>_neutral_before_median_mm``, ``<model>_weights_correlation`` and so on."""
+    """``<model>_posed_median_mm``, ``<model>_neutral_before_median_mm`` and so on. Of weights:
+    ``<model>_weights_correlation`` over the ten largest of each posed head, ``..._true`` over those that it truly has,
+    ``..._all`` over all that any of them has or is told to have; ``<model>_weights_off`` is how far the true ones are
+    told off in the mean, ``<model>_off_<expression>`` the same of one, and ``<model>_weights_told_of_none`` the sum of
+    what a posed head is told beside its own."""
+    code = (*CONTOUR, expression_evidence, expression_reading)
+    kept = {
+        label: Records(folder, f"expressions-{label}", key_of(model.sha256, Settings(), *code))
+        for label, model in models.items()
+    }
     rows: list[Row] = []
-    for label, model in models.items():
-        records = Records(
-            folder, f"expressions-{label}", key_of(model.sha256, Settings(), *CONTOUR, expression_evidence)
-        )
-        for i in range(subjects):
-            for kind in ("posed", "neutral"):
-                report(f"{label} {i} {kind}", (len(rows) + 1) / (2 * subjects * len(models)))
-                name = f"{label}-{i:02} {kind}"
-                row = records.row(name, lambda m=model, i=i, k=kind: _subject(m, i, k == "posed", renderer))
-                rows.append({"model": label, "kind": kind, "subject": i} | row)
+    for i, kind, (label, model) in product(range(subjects), ("posed", "neutral"), models.items()):
+        report(f"{label} {i} {kind}", (len(rows) + 1) / (2 * subjects * len(models)))
+        row = kept[label].row(f"{label}-{i:02} {kind}", partial(_subject, model, i, kind == "posed", renderer))
+        rows.append({"model": label, "kind": kind, "subject": i} | row)
     return {"figures": _figures(rows, tuple(models)), "rows": rows, "markdown": _table(rows, tuple(models))}
 
 
@@ -110,6 +116,7 @@ def _figures(rows: list[Row], labels: tuple[str, ...]) -> dict[str, float]:
                     found[f"{label}_{kind}_{infix}{quantity}"] = float(np.mean([row[when][quantity] for row in of]))
             found[f"{label}_{kind}_weights"] = float(np.mean([sum(row["after"]["weights"].values()) for row in of]))
         found[f"{label}_weights_correlation"] = _correlation(rows, label)
+        found |= {f"{label}_{name}": value for name, value in _weights(rows, label).items()}
     return {name: round(value, 4) for name, value in found.items()}
 
 
@@ -124,6 +131,26 @@ def _correlation(rows: list[Row], label: str) -> float:
             true += [row["truth"].get(name, 0.0) for name in [*names, *others]]
             ours += [told.get(name, 0.0) for name in [*names, *others]]
     return float(np.corrcoef(true, ours)[0, 1]) if len(true) > 1 else float("nan")
+
+
+def _weights(rows: list[Row], label: str) -> dict[str, float]:
+    """Correlation over the true weights and over all that were drawn or told in any head; how far off the true ones
+    are told, all and each. A weight that is not told is 0."""
+    posed = [row for row in rows if (row["model"], row["kind"]) == (label, "posed")]
+    names = sorted({name for row in posed for name in (*row["truth"], *row["after"]["weights"])})
+    true = np.array([[row["truth"].get(name, 0.0) for name in names] for row in posed])
+    told = np.array([[row["after"]["weights"].get(name, 0.0) for name in names] for row in posed])
+    there = true > 0.0
+    if np.count_nonzero(there) < 2:
+        return {}
+    each = {name: np.abs(told - true)[:, k][there[:, k]].mean() for k, name in enumerate(names) if there[:, k].any()}
+    return {
+        "weights_correlation_true": float(np.corrcoef(true[there], told[there])[0, 1]),
+        "weights_correlation_all": float(np.corrcoef(true.ravel(), told.ravel())[0, 1]),
+        "weights_off": float(np.abs(told - true)[there].mean()),
+        "weights_told_of_none": float(told[~there].sum() / len(posed)),
+        **{f"off_{name}": float(value) for name, value in each.items()},
+    }
 
 
 def _table(rows: list[Row], labels: tuple[str, ...]) -> str:

@@ -2,8 +2,10 @@
 
 Where most cameras contradict the others, other readings are tried: all pictures reflected about their principal points,
 as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 where they are
-square. The reading under which tangent planes touch both outlines of each pair is named. Where there is none, the
-calibration is another rig's, or of this one before it was rearranged.
+square; and poses that were written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
+sphere about the world's origin does not show by itself. The reading under which tangent planes touch both outlines of
+each pair is named. Where there is none, the calibration is another rig's, or of this one before it was rearranged.
+Where one camera alone contradicts the others, it is named.
 
 Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
 """
@@ -14,15 +16,18 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.camera_assignment import INSET_PX, mean_misfit, own_misses, with_masks
+from pipeline.multiview.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, own_misses, with_masks
 from pipeline.multiview.tangency import outer_hull
 from rig.camera import Intrinsics
+from rig.plausibility import readings as other_conventions
 from rig.rig import Rig
 
 CAMERAS_LEAST = 4  # three have six planes at most: too few to refuse a capture by
 PLANES_LEAST = 4  # of a camera whose word counts
 WRONG_LEAST = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
 RIGHT_MOST = 0.25  # of a reading that is believed
+MISPLACED_LEAST = 0.6  # of one camera among good ones: 0.95 with its rotation transposed; good ones reach 0.25
+MISPLACED_AMONG = 5  # cameras; of four, one that is wrong leaves three, who have six planes at most
 
 Pixels = Float[np.ndarray, "_ 2"]
 Turn = Callable[[Pixels, Intrinsics], Pixels]
@@ -39,20 +44,38 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
     if len(seen) < CAMERAS_LEAST:
         return None
     hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
-    if _median_misfit(hulls, seen) < WRONG_LEAST:
+    if not _median_misfit(hulls, seen) >= WRONG_LEAST:
         return None
     square = all(camera.intrinsics.width == camera.intrinsics.height for camera in seen)
     readings = (*_READINGS, *(_SQUARE_READINGS if square else ()))
-    misfits = [_median_misfit(_read(hulls, seen, turn), seen) for _, turn in readings]
-    best = int(np.argmin(misfits))
-    return readings[best][0] if misfits[best] <= RIGHT_MOST else OTHER_RIG
+    found = [(_median_misfit(_read(hulls, seen, turn), seen), told) for told, turn in readings]
+    for other, read, remedy in other_conventions(seen):
+        found.append((_median_misfit(hulls, read), _CONVENTION.format(other, remedy)))
+    believed = [(misfit, told) for misfit, told in found if misfit <= RIGHT_MOST]
+    return min(believed)[1] if believed else OTHER_RIG
+
+
+def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
+    """The one camera that contradicts all others, who agree without it: it was moved farther than a shift of its
+    picture tells (``camera_drift``), its pose is wrong in the file, or its mask is. None where there is none."""
+    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    if len(seen) < MISPLACED_AMONG:
+        return None
+    misses = own_misses([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
+    misfit, planes = mean_misfit(misses), np.isfinite(misses).sum(axis=(1, 2))
+    worst = int(np.argmax(misfit))
+    if misfit[worst] < MISPLACED_LEAST or planes[worst] < PLANES_LEAST:
+        return None
+    others = np.delete(np.arange(len(seen)), worst)
+    agree = mean_misfit(misses[np.ix_(others, others)]).max() <= FITTING_MISFIT
+    return seen.names[worst] if agree else None
 
 
 def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
-    """Median over the cameras of the mean robust misfit of their planes (0 to 1); 0 where too few planes speak."""
+    """Median over the cameras of the mean robust misfit of their planes (0 to 1); NaN where too few planes speak."""
     misses = own_misses(hulls, rig)
     speaking = np.isfinite(misses).sum(axis=(1, 2)) >= PLANES_LEAST
-    return float(np.median(mean_misfit(misses)[speaking])) if speaking.sum() >= CAMERAS_LEAST else 0.0
+    return float(np.median(mean_misfit(misses)[speaking])) if speaking.sum() >= CAMERAS_LEAST else np.nan
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:
@@ -90,6 +113,7 @@ OTHER_RIG = (
     "cameras.json is of another rig, or of this one before it was rearranged; give this rig's own, or calibrate it "
     "again"
 )
+_CONVENTION = "camera_from_world holds {}: the outlines agree once it is read so; {}"
 _MIRRORED = (
     "the rig is mirrored: the outlines agree once its poses are reflected. cameras.json was written in a left-handed "
     "world or with one axis negated; write it right-handed (x right, y down, z forward in each camera)"

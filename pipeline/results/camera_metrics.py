@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
-from pipeline.fitting.rim import find_rim, make_topology, pack_views
+from pipeline.fitting.problem import level_topology
+from pipeline.fitting.rim import find_rim, pack_views
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
@@ -42,7 +43,7 @@ def camera_figures(
     level = model.levels["full"]
     vertices = fit.world_from_head.apply(model.vertices(fit.coefficients))
     views = pack_views(rig, {camera.name: silhouettes[camera.name].distance for camera in rig})
-    rim = find_rim(make_topology(level.faces, level.face_region), vertices, views)
+    rim = find_rim(level_topology(model, "full"), vertices, views)
     face = vertices[level.face_region]
 
     def figures_of(k: int, camera: Camera) -> CameraFigures:

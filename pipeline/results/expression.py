@@ -13,7 +13,8 @@ from rig.geometry import Similarity
 from rig.mesh import Mesh
 
 TOLD = 0.05  # a smaller weight is nothing to speak of
-LEAST_SIGMA = 2.0  # nor one that its own deviation explains
+LEAST_SIGMA = 2.0  # nor one that its own deviation explains ...
+READ_SIGMA = 1.0  # ... which takes less where the finished surface was asked: the prior has asked for more already
 CLOSED = 0.8  # lids that are so far closed show no eye
 
 
@@ -48,14 +49,14 @@ def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
     return dict(zip(model.expressions.names, (float(w) for w in given), strict=False))
 
 
-def found_expressions(model: HeadModel, fit: Fit) -> tuple[Found, ...]:
-    """What the head does, the strongest first."""
+def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = LEAST_SIGMA) -> tuple[Found, ...]:
+    """What the head does, the strongest first: weights of more than ``least_sigma`` deviations."""
     weights = fitted_weights(model, fit)
     spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]
     found = []
     for k, (name, weight) in enumerate(weights.items()):
         std = None if spread is None else float(spread[k])
-        if weight >= TOLD and weight > LEAST_SIGMA * (std or 0.0):
+        if weight >= TOLD and weight > least_sigma * (std or 0.0):
             found.append(Found(name, weight, std))
     return tuple(sorted(found, key=lambda each: -each.weight))
 

@@ -3,7 +3,8 @@
 head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm,
 z up.
 texture/albedo.png: in the layout of head.glb and head.obj, where the settings ask for it.
-With a texture the first vertices of head.glb are head.ply's, in its order; those at the seam follow once more.
+With a texture the first vertices of head.glb are head.ply's, in its order; those at the seam follow once more. With a
+normal map it has some of them alone (``rows_of_ply``).
 """
 
 from pathlib import Path
@@ -15,6 +16,7 @@ from jaxtyping import UInt8
 from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
+from pipeline.texture.normal_map import normal_mapped, png
 from pipeline.texture.uv_unwrap import Atlas
 from rig.atomic_write import write_atomically
 from rig.formats.glb import Skin, glb_bytes
@@ -85,6 +87,11 @@ def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
     source = atlas.layout.source
     if outputs.skin == "albedo" and result.albedo is not None:
         atlas = result.albedo.atlas
+    if result.reduced is not None:
+        mapped = normal_mapped(head.vertices, normals, atlas.layout, result.reduced)
+        extras["rows_of_ply"] = mapped.rows.tolist()
+        skin = Skin(mapped.uv, encoded(atlas, kind), ENCODINGS[kind][1], png(mapped.image), mapped.tangents)
+        return glb_bytes(mapped.mesh, normals=mapped.normals, skin=skin, extras=extras)
     extras["repeated_vertices"] = source[len(head.vertices) :].tolist()
     opened = Mesh(head.vertices[source], atlas.layout.faces)
     skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1])

@@ -17,6 +17,7 @@ from pipeline.imaging.contour_distance import chamfer
 from pipeline.imaging.cpu_raster import picture
 from pipeline.imaging.masks import box_around
 from pipeline.parallel_for import thread_count
+from pipeline.results.overlay_kernels import tint
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.mesh import Mesh
@@ -57,10 +58,8 @@ def overlay(
 
 def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
     """Each pixel moved towards the parts' colours by their probabilities."""
-    own = box_around(np.asarray(parts.any(axis=2)), 0)
-    share, out = TINT * parts[own], image.copy()
-    colours = np.array(list(PART_COLOURS.values()), np.float32)
-    out[own] = np.rint(out[own] * (1.0 - share.sum(axis=2, keepdims=True)) + share @ colours).astype(np.uint8)
+    colours, out = np.array(list(PART_COLOURS.values()), np.float32), np.empty_like(image)
+    tint(np.ascontiguousarray(image), parts, colours, np.float32(TINT), out)
     return out
 
 

@@ -19,6 +19,7 @@ from pipeline.results.expression import Found, Posable
 from pipeline.results.measurements import Landmark, Measurement
 from pipeline.settings import Settings
 from pipeline.texture.delight import Albedo
+from pipeline.texture.reduced_layout import ReducedLayout
 from pipeline.texture.uv_unwrap import Atlas
 from rig.mesh import Mesh
 
@@ -71,6 +72,7 @@ class Reconstruction:
     gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
     pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
     atlas: Atlas | None = None  # where a format has a texture and the model a layout
+    reduced: ReducedLayout | None = None  # of the atlas, where the settings ask for a normal map
     expression: tuple[Found, ...] = ()  # the face that the head makes, the strongest part first
     posed: range = range(0)  # which of the fit's coefficients are weights of expressions
     posable: Posable | None = None  # where the settings ask for it

@@ -13,6 +13,7 @@ from pipeline.results.bust import Bust
 from pipeline.results.expression import Posable
 from pipeline.results.reconstruction import CameraFigures, Reconstruction
 from pipeline.settings import document_from_settings
+from pipeline.templates.header import TemplateHeader
 from pipeline.texture.light import HARMONICS, Light
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
@@ -87,6 +88,16 @@ class MorphsReport(TypedDict):
     without_counterpart: list[str]
 
 
+class TemplateReport(TypedDict):
+    """Of head-NAME.obj: whose vertex order it has. ``sha256`` is of the mesh's file; ``registration``: the figures of
+    ``eigenhead template add``."""
+
+    name: str
+    source: str
+    sha256: str
+    registration: dict[str, float]
+
+
 class SimilarityReport(TypedDict):
     scale: float
     rotation: list[list[float]]
@@ -120,6 +131,7 @@ class Report(TypedDict):
     coefficients: list[float]
     expression: list[ExpressionReport]
     morphs: MorphsReport | None
+    template: TemplateReport | None
     world_from_head: SimilarityReport
     landmarks: dict[str, Placed]
     measurements: dict[str, Measured]
@@ -134,8 +146,9 @@ class Report(TypedDict):
     warnings: list[WarningReport]
 
 
-def report_document(result: Reconstruction) -> Report:
-    """The decoded report: JSON types only, every number finite (what is not known is null)."""
+def report_document(result: Reconstruction, template: TemplateHeader | None = None) -> Report:
+    """The decoded report: JSON types only, every number finite (what is not known is null). ``template``: the one in
+    whose order the head was written, too."""
     filled = int(np.count_nonzero(result.views == 0))
     document = {
         "format": FORMAT,
@@ -152,6 +165,7 @@ def report_document(result: Reconstruction) -> Report:
             for each in result.expression
         ],
         "morphs": None if result.posable is None else _morphs(result.posable),
+        "template": None if template is None else _template(template),
         "world_from_head": similarity_document(result.fit.world_from_head),
         "landmarks": {k: {"position": p.position_mm, "std": p.std_mm} for k, p in result.landmarks.items()},
         "measurements": {k: {"value": m.value_mm, "std": m.std_mm} for k, m in result.measurements.items()},
@@ -196,6 +210,15 @@ def similarity_document(transform: Similarity) -> SimilarityReport:
 def _morphs(posable: Posable) -> dict[str, object]:
     used = {name: weight for name, weight in posable.weights.items() if weight}
     return {"weights": used, "without_counterpart": list(posable.missing)}
+
+
+def _template(template: TemplateHeader) -> dict[str, object]:
+    return {
+        "name": template.name,
+        "source": template.source,
+        "sha256": template.source_sha256,
+        "registration": template.figures,
+    }
 
 
 def _bust(bust: Bust) -> dict[str, object]:

@@ -54,7 +54,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
         ]
         for job in jobs:
             job.result()
-    text = json.dumps(report_document(result), indent=1, allow_nan=False)
+    text = json.dumps(report_document(result, template), indent=1, allow_nan=False)
     write_atomically(folder / "report.json", text.encode())
 
 

@@ -12,6 +12,7 @@ from typing import Literal
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_drift import find_drift
+from pipeline.multiview.rig_agreement import misplaced_camera
 from pipeline.silhouettes.own_pictures import own_pictures
 from rig.capture import Capture
 from rig.errors import EigenheadError
@@ -82,6 +83,14 @@ def without_moved_cameras(
             quality = replace(silhouettes[drift.camera].quality, usable=False)
             kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
         warnings.append(ReportWarning(drift.code, str(drift)))
+    misplaced = misplaced_camera(kept, rig)
+    if misplaced is not None:
+        kept[misplaced] = replace(kept[misplaced], quality=replace(kept[misplaced].quality, usable=False))
+        told = (
+            "contradicts all other cameras, and no shift of its picture explains it; it is left out: it was moved far"
+        )
+        remedy = "its pose in cameras.json is wrong, or its mask; look at its overlay, and calibrate again"
+        warnings.append(ReportWarning("camera-moved", f"{misplaced} {told}, {remedy}"))
     return kept, warnings
 
 

@@ -3,10 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.dense.part_cells import head_guide, make_cells
+from pipeline.dense.part_kernels import spread_parts
 from pipeline.dense.parts import (
     CLOTHES,
     HAIR,
@@ -221,3 +223,18 @@ def test_guided_filter_knows_nothing_of_what_has_no_weight():
     weight[:, :15], values[:, :15], values[:, 15:] = 1.0, 0.7, 1e3
     slope, offset = guided(np.full((30, 30), 0.3, np.float32), values, weight, 3, 0.05)
     np.testing.assert_allclose((slope * 0.3 + offset)[:, :15], 0.7, rtol=1e-4)
+
+
+def test_parts_are_spread_to_pixels_as_an_image_is_enlarged():
+    """OpenCV's enlargement is the oracle, its outermost pixels repeated beyond the whole cells."""
+    rng, size = np.random.default_rng(1), 5
+    slope, offset = rng.normal(size=(2, 6, 8, 3)).astype(np.float32)
+    grey = rng.integers(0, 256, (33, 44), dtype=np.uint8)
+    mask = rng.random((33, 44)) < 0.7
+    wide, level = (cv2.resize(each, (40, 30), interpolation=cv2.INTER_LINEAR) for each in (slope, offset))
+    wide, level = (cv2.copyMakeBorder(each, 0, 3, 0, 4, cv2.BORDER_REPLICATE) for each in (wide, level))
+    expected = np.clip(wide * (grey / 255.0)[..., None] + level, 0.0, 1.0) * mask[..., None]
+    expected /= np.maximum(expected.sum(axis=2, keepdims=True), 1.0)
+    found = np.zeros((33, 44, 3), np.float32)
+    spread_parts(slope, offset, size, grey, mask, found)
+    np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import load_model
-from pipeline.experiments.expressions import JAW, WEIGHTS, _correlation, drawn_weights
+from pipeline.experiments.expressions import JAW, WEIGHTS, _correlation, _weights, drawn_weights
 
 
 def test_draws_are_faces_that_people_make() -> None:
@@ -28,3 +28,16 @@ def test_the_correlation_counts_what_was_found_and_is_not_there() -> None:
     assert _correlation([exact], "m") == pytest.approx(1.0)
     wrong = row({"a": 0.2, "b": 0.8}, {"a": 0.2, "b": 0.8, "c": 0.9})
     assert _correlation([wrong], "m") < 0.5
+
+
+def test_weights_are_judged_over_the_true_ones_over_all_and_each() -> None:
+    first = {"model": "m", "kind": "posed", "truth": {"a": 0.2, "b": 0.8}, "after": {"weights": {"a": 0.3, "b": 0.8}}}
+    other = {"model": "m", "kind": "posed", "truth": {"a": 0.4}, "after": {"weights": {"c": 0.5}}}
+    found = _weights([first, other], "m")
+    assert found["off_a"] == pytest.approx(0.25)
+    assert found["off_b"] == 0.0
+    assert "off_c" not in found  # nobody has it
+    assert found["weights_off"] == pytest.approx(0.5 / 3.0)
+    assert found["weights_told_of_none"] == pytest.approx(0.25)
+    assert found["weights_correlation_true"] == pytest.approx(np.corrcoef([0.2, 0.8, 0.4], [0.3, 0.8, 0.0])[0, 1])
+    assert found["weights_correlation_all"] < found["weights_correlation_true"]

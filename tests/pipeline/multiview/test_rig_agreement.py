@@ -8,8 +8,9 @@ import pytest
 from pipeline.eigenheads.model import load_model
 from pipeline.experiments.subjects import off_by
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.multiview.rig_agreement import wrong_rig
-from rig.geometry import RigidTransform
+from pipeline.multiview.rig_agreement import misplaced_camera, wrong_rig
+from rig.geometry import RigidTransform, rotation_from_vector
+from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.studio.scene.layout import ARRANGEMENTS_DEG, HEIGHT, WIDTH, arrangement, default_layout
 
@@ -55,6 +56,40 @@ def test_a_mirrored_rig_is_named(seen, axis):
     assert found is not None
     assert found.startswith("the rig is mirrored")
     assert "write it right-handed" in found
+
+
+def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_origin(seen):
+    """Such a rig looks at one point in either reading: only the outlines can tell."""
+    _, _, of_all = seen
+    rig = default_layout().scaled(0.5)
+
+    def pose(of):
+        return RigidTransform(of.rotation.T, of.translation)
+
+    written = Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
+    assert rig_faults(written) == []
+    found = wrong_rig(of_all, written)
+    assert found is not None
+    assert "camera_from_world holds the rotation transposed" in found
+    assert "transpose each rotation" in found
+
+
+def test_one_camera_far_from_its_place_is_named_and_no_good_one(seen):
+    rig, _, of_all = seen
+    rng = np.random.default_rng(8)
+    assert misplaced_camera(of_all, rig) is None
+    for count in range(5, 11):
+        assert misplaced_camera(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
+    for name in ("cam01", "cam04", "cam09"):
+        for degrees in (15.0, 180.0):  # a shift of its picture tells turns of a few degrees
+            turn = rotation_from_vector(np.radians(degrees) * np.array([0.0, 0.0, 1.0]))
+            changed = [
+                replace(c, camera_from_world=RigidTransform(turn, np.zeros(3)) @ c.camera_from_world)
+                if c.name == name
+                else c
+                for c in rig
+            ]
+            assert misplaced_camera(of_all, Rig(tuple(changed))) == name
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
 """What a face does, the head without it, and morphs whose weights give it back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
 from pipeline.fitting.fine.blink import with_lids
 from pipeline.fitting.fit import Fit
-from pipeline.results.expression import found_expressions, neutral_mesh, posable_head, shut_eyes
+from pipeline.results.expression import READ_SIGMA, found_expressions, neutral_mesh, posable_head, shut_eyes
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 
@@ -33,6 +35,15 @@ def test_a_report_names_what_is_strong_and_sure(posed: tuple[HeadModel, Fit, Mes
         ("mouth corner puller", 0.3),
     ]
     assert found[0].std == pytest.approx(0.1)
+
+
+def test_a_weight_must_be_surer_unless_the_finished_surface_tells_it(posed: tuple[HeadModel, Fit, Mesh]) -> None:
+    model, fit, _ = posed
+    z = np.zeros(len(fit.coefficients))
+    z[model.posed.start + model.expressions.names.index("browInnerUp")] = 0.15  # one and a half deviations
+    unsure = replace(fit, coefficients=z)
+    assert found_expressions(model, unsure) == ()
+    assert [each.words for each in found_expressions(model, unsure, READ_SIGMA)] == ["brow inner up"]
 
 
 def test_closed_eyes_blink(posed: tuple[HeadModel, Fit, Mesh]) -> None:

@@ -13,15 +13,18 @@ import pytest
 import trimesh
 
 from pipeline.eigenheads.model import load_model
+from pipeline.results.expression import posable_head
 from pipeline.results.head_files import write_head
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.write import head_mesh
+from pipeline.results.write_expression import write_expression
 from pipeline.settings import OutputSettings, Settings, settings_from_document
 from pipeline.texture.delight import Albedo
 from pipeline.texture.light import Light
 from pipeline.texture.model_layout import model_layout
+from pipeline.texture.reduced_layout import reduced_layout
 from pipeline.texture.uv_unwrap import Atlas
 from rig.errors import InputError
 from rig.formats.ply import read_head_ply
@@ -145,15 +148,54 @@ def test_wrong_outputs_are_named() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("image", ["jpeg", "png", "webp"])
+@pytest.mark.timeout(900)  # the layout is reduced once, in half a minute of a free core
+def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(result: Reconstruction, tmp_path: Path) -> None:
+    assert result.atlas is not None
+    mapped = replace(result, reduced=reduced_layout(load_model(), result.atlas.layout))
+    written(mapped, tmp_path)
+    document, payload = opened_glb(tmp_path / "head.glb")
+    primitive, head = document["meshes"][0]["primitives"][0], head_mesh(mapped)
+    rows = document["asset"]["extras"]["rows_of_ply"]
+    view = document["bufferViews"][document["accessors"][primitive["attributes"]["POSITION"]]["bufferView"]]
+    places = np.frombuffer(payload, "<f4", 3 * len(rows), view["byteOffset"]).reshape(-1, 3)
+    np.testing.assert_allclose(places * 1000.0, head.vertices[rows], atol=1e-3)
+    assert document["accessors"][primitive["indices"]]["count"] < 3 * 10_500  # the border is kept whole
+    assert document["materials"][0]["normalTexture"] == {"index": 1}
+    assert len(read_head_ply(tmp_path / "head.ply")[0].vertices) == len(head.vertices)  # it is whole
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("kind", ["jpeg", "png", "webp", "normal map", "morphs"])
 def test_the_khronos_validator_has_nothing_to_say(
-    image: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path
+    kind: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path
 ) -> None:
-    written(result, tmp_path, image=image)
-    script = gltf_validator / "validate.js"
-    command = ["node", str(script), str(tmp_path / "head.glb")]
+    assert result.atlas is not None
+    name = "head.glb"
+    if kind == "normal map":
+        written(replace(result, reduced=reduced_layout(load_model(), result.atlas.layout)), tmp_path, image="webp")
+    elif kind == "morphs":
+        model, name = load_model(), "posed.glb"
+        posable = posable_head(model, result.fit.world_from_head, result.mesh_world, ())
+        chosen = replace(result, settings=Settings(outputs=OutputSettings(morphs=True, neutral=True)))
+        write_expression(tmp_path, chosen, posable)
+        assert validated(tmp_path / "neutral.glb", gltf_validator) == (0, 0, [])
+    else:
+        written(result, tmp_path, image=kind)
+    assert validated(tmp_path / name, gltf_validator) == (0, 0, [])
+
+
+def opened_glb(path: Path) -> tuple[dict[str, Any], bytes]:
+    data = path.read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def validated(path: Path, validator: Path) -> tuple[int, int, list[Any]]:
+    """Errors, warnings and all messages."""
+    command = ["node", str(validator / "validate.js"), str(path)]
     told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout)
-    assert (told["numErrors"], told["numWarnings"], told["messages"]) == (0, 0, [])
+    return told["numErrors"], told["numWarnings"], told["messages"]
 
 
 @pytest.fixture(scope="session")
