@@ -16,6 +16,9 @@ LENS_LOST_MOST = 0.1  # share of the picture's middle that no ray meets
 MIDDLE = (
     0.6  # of width and height: where boards are shown and subjects stand; beyond it a good calibration may fold over
 )
+FOCAL_LEAST = 0.15  # of the picture's width; 0.26 is a fisheye of 220 degrees, a pinhole of 0.15 sees 147
+FRAME_LEAST_MM = 100.0  # longer side of what the pictures show where the cameras look: half a head
+UNITS = {10: "centimetres", 100: "decimetres", 1000: "metres"}
 GRID = (9, 7)
 CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
 
@@ -29,6 +32,11 @@ def rig_faults(rig: Rig) -> list[str]:
 
 def _lens_fault(camera: Camera) -> str | None:
     k = camera.intrinsics
+    if min(k.fx / k.width, k.fy / k.height) < FOCAL_LEAST:
+        return (
+            f"{camera.name}: a focal length of {min(k.fx, k.fy):g} px is absurd for {k.width} x {k.height} pixels: "
+            "of one in mm give mm times the picture's width in px, divided by the sensor's in mm"
+        )
     edge = 0.5 * (1.0 - MIDDLE)
     sides = zip((k.width, k.height), GRID, strict=True)
     columns, rows = (np.linspace(edge * size, (1.0 - edge) * size - 1, count) for size, count in sides)
@@ -56,21 +64,44 @@ def _spread_faults(rig: Rig) -> list[str]:
             f"the cameras stand within {spread:.3g} mm of each other: their translations look like metres, "
             "and millimetres are wanted; multiply them by 1000"
         ]
+    frame = frame_mm(rig)
+    unit = next((unit for unit in UNITS if frame * unit >= FRAME_LEAST_MM), None)
+    if frame < FRAME_LEAST_MM and unit is not None:
+        return [
+            f"the pictures show {frame:.3g} mm where the cameras look, and no head fits: their translations look like "
+            f"{UNITS[unit]}, and millimetres are wanted; multiply them by {unit}"
+        ]
     return []
+
+
+def frame_mm(rig: Rig) -> float:
+    """What the pictures' longer side shows at the point nearest to all optical axes: the median over the cameras."""
+    sides = []
+    for camera in rig:
+        k, distance = camera.intrinsics, float(np.linalg.norm(camera.centre_world - rig.centre_world()))
+        sides.append(distance * max(k.width / k.fx, k.height / k.fy))
+    return float(np.median(sides))
 
 
 def _convention_fault(rig: Rig) -> str | None:
     """Poses that look at no common point as they are written, and all at one when read in another convention."""
     if _share_looking_at_one_point(rig) > DIVERGING_MOST:
         return None
-    for other, remedy in _CONVENTIONS.items():
-        read = Rig(tuple(replace(camera, camera_from_world=remedy[0](camera.camera_from_world)) for camera in rig))
+    for other, read, remedy in readings(rig):
         if _share_looking_at_one_point(read) >= CONVERGING_LEAST:
             return (
                 f"camera_from_world holds {other}: as written the cameras look at no common point, "
-                f"and read so they do; {remedy[1]}"
+                f"and read so they do; {remedy}"
             )
     return None
+
+
+def readings(rig: Rig) -> list[tuple[str, Rig, str]]:
+    """The rig with its poses read in other conventions: what they would hold, the rig so read, and the remedy."""
+    return [
+        (other, Rig(tuple(replace(c, camera_from_world=read(c.camera_from_world)) for c in rig)), remedy)
+        for other, (read, remedy) in _CONVENTIONS.items()
+    ]
 
 
 def _share_looking_at_one_point(rig: Rig) -> float:

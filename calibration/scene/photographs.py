@@ -51,7 +51,8 @@ def find_photographs(folder: Path) -> Photographs:
     files = folders or {path.stem: [path] for path in flat}
     faults = [f"camera {fault}: rename it" for name in files if (fault := name_fault(name))]
     if len(files) < CAMERAS_LEAST:
-        faults.append(f"{len(files)} photographs; at least {CAMERAS_LEAST} from different places are needed, better 20")
+        there = f"{len(files)} {'photograph' if len(files) == 1 else 'photographs'}"
+        faults.append(f"{there}; at least {CAMERAS_LEAST} from different places are needed, better 20")
     for name, paths in (folders or {"the folder": flat}).items():
         stems = [path.stem for path in paths]
         twice = sorted({stem for stem in stems if stems.count(stem) > 1})
@@ -78,7 +79,7 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
         if pixels is None:
             faults.append(fault)
         elif pixels.shape != (k.height, k.width):
-            faults.append(size_fault(f"masks/{path.name}", (pixels.shape[1], pixels.shape[0]), (k.width, k.height)))
+            faults.append(size_fault(f"masks/{path.name}", (pixels.shape[1], pixels.shape[0]), k))
         else:
             masks[path.stem] = pixels > 0
     if faults:

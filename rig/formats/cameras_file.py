@@ -1,12 +1,12 @@
 """Rigs in other programs' files: COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML,
-Metashape's XML, RealityCapture's XMP and CSV, nerfstudio's ``transforms.json``, EasyMocap's YAML; and out to Blender.
+Metashape's XML, RealityCapture's XMP and CSV, nerfstudio's ``transforms.json``, OpenCV's YAML; and out to Blender.
 
 Every reader turns its file into the ``eigenhead-cameras/1`` document and lets ``rig_from_document`` judge it, so that
 all formats meet the same checks. Where each layout is described stands at its module's head.
 
 Pixels: this project and OpenCV put (0, 0) at the centre of the top-left pixel; COLMAP, Metashape, RealityCapture and
-nerfstudio (0.5, 0.5). Lengths become millimetres: caliscope, Metashape, RealityCapture and EasyMocap are in metres;
-COLMAP's scale is free and taken as millimetres; aniposelib's and nerfstudio's are told by the size of the rig.
+nerfstudio (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and RealityCapture are in metres; COLMAP's
+scale is free and taken as millimetres; aniposelib's, nerfstudio's and OpenCV's are told by the size of the rig.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ WRITERS: dict[str, Callable[[Rig, Path], None]] = {
 FORMATS = tuple(WRITERS)
 NO_RIG = (
     "holds no cameras.json (nor a file of COLMAP, caliscope, aniposelib, Metashape, RealityCapture, nerfstudio or "
-    "EasyMocap)"
+    "OpenCV)"
 )
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
 
@@ -49,7 +49,8 @@ def find_rig_file(folder: Path) -> Path | None:
 
     In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
     ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
-    an XML file of Metashape's; RealityCapture's XMP files, beside the pictures or at the top, or its CSV.
+    any other YAML file of OpenCV's with a ``K_<camera>``; an XML file of Metashape's; RealityCapture's XMP files,
+    beside the pictures or at the top, or its CSV.
     """
     if (folder / "cameras.json").is_file():
         return folder / "cameras.json"
@@ -62,10 +63,11 @@ def find_rig_file(folder: Path) -> Path | None:
         return folder / "camera_array.toml"
     aniposelib = (path for path in sorted(folder.glob("*.toml")) if looks_like_aniposelib(path))
     named = (folder / name for name in ("transforms.json", "intri.yml") if (folder / name).is_file())
+    opencv = (path for path in sorted([*folder.glob("*.yml"), *folder.glob("*.yaml")]) if b"\nK_" in _head(path))
     metashape = (path for path in sorted(folder.glob("*.xml")) if b"<chunk" in _head(path))
     sidecars = (path for place in ("images", ".") for path in sorted((folder / place).glob("*.xmp")))
     tables = (path for path in sorted(folder.glob("*.csv")) if _head(path).startswith(",".join(COLUMNS[:8]).encode()))
-    return next((path for found in (aniposelib, named, metashape, sidecars, tables) for path in found), None)
+    return next((path for found in (aniposelib, named, opencv, metashape, sidecars, tables) for path in found), None)
 
 
 def read_rig_file(path: Path) -> Rig:

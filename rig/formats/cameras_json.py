@@ -187,7 +187,7 @@ def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
 def _rotation_faults(rotation: np.ndarray, where: str) -> list[str]:
     # Files with six digits are off by 1e-6; a mirrored or scaled matrix is off by far more than 1e-3.
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        return [f"{where}.camera_from_world.rotation is not orthonormal"]
+        return [f"{where}.camera_from_world.rotation is not orthonormal: give every digit of a rotation matrix"]
     if np.linalg.det(rotation) < 0:
         told = f"{where}.camera_from_world.rotation has determinant -1: a mirrored frame; negate one axis of the world"
         return [f"{told} in every pose, so that it is right-handed"]
@@ -215,7 +215,7 @@ def _read_numbers(
     entry: Any, keys: tuple[str, ...], where: str, faults: list[str], default: float | None = None
 ) -> list[float]:
     if not isinstance(entry, dict):
-        faults.append(f"{where} is missing or no object")
+        faults.append(f"{where} is missing or no object: wanted are {', '.join(keys)} by name")
         return [0.0] * len(keys)
     values = [entry.get(key, default) for key in keys]
     for key, value in zip(keys, values, strict=True):
@@ -230,7 +230,9 @@ def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[str
     except ValueError:
         array = np.zeros(0)
     if array.shape != shape:
-        faults.append(f"{where} is missing or not {' x '.join(map(str, shape))} numbers")
+        told = f"{where} is missing or not {' x '.join(map(str, shape))} numbers"
+        vector = shape == (3, 3) and array.squeeze().shape == (3,)
+        faults.append(f"{told}: of a rotation vector write the matrix (cv2.Rodrigues)" if vector else told)
         return None
     if not all(_is_number(entry) for entry in array.flat):
         faults.append(f"{where} holds a value that is no finite number")

@@ -8,20 +8,23 @@ masks/<camera>.png                 optional; then background/ may be absent
 
 Without background/ and masks/ altogether the subject is found from the photographs. Without images/ the pictures lie
 beside cameras.json; a folder of a camera's name may hold its one picture, whatever that is called; and so may a picture
-be called whose EXIF has the serial number of a camera (``rig.formats.serials``).
+be called whose EXIF has the serial number of a camera (``rig.formats.serials``), or that differs in case alone.
 """
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from difflib import SequenceMatcher
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
 from rig.atomic_write import write_atomically
+from rig.camera import Intrinsics
 from rig.capture import Capture, Features
 from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
@@ -36,6 +39,7 @@ from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera
 BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
+ALIKE_LEAST = 0.75  # of the names of two folders, by difflib: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
@@ -51,8 +55,9 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
         rig = read_rig_file(rig_file)
     except InputError as error:
         raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+    check_folders(folder, rig)
     faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
-    capture = read_shot(folder, rig, faults, by_serial(folder, rig, faults), pixels_most=pixels_most)
+    capture = read_shot(folder, rig, faults, by_other_names(folder, rig, faults), pixels_most=pixels_most)
     if faults:
         raise InputError("capture", faults)
     digests = dict(capture.digests)
@@ -70,10 +75,44 @@ def capture_root(folder: Path) -> Path:
     return entries[0] if len(entries) == 1 and entries[0].is_dir() and entries[0].name != "sparse" else folder
 
 
-def by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, dict[str, Path]]:
-    """Pictures and plates that do not have their camera's name but its body's serial number, by kind and camera."""
-    folders = {"images": picture_folder(folder), "background": folder / "background"}
-    return {kind: pictures_by_serial(inner, rig, faults) for kind, inner in folders.items() if inner.is_dir()}
+def by_other_names(folder: Path, rig: Rig, faults: list[str]) -> dict[str, dict[str, Path]]:
+    """Pictures, plates and masks that are not called exactly as their camera, by kind and camera: the case differs, the
+    camera's name in the rig's file ends like a picture's, or EXIF has the serial number of the camera's body."""
+    found: dict[str, dict[str, Path]] = {}
+    for kind, inner in (("images", picture_folder(folder)), *((kind, folder / kind) for kind in BESIDE_PICTURES)):
+        if inner.is_dir():
+            found[kind] = _by_spelling(inner, rig)
+            if not found[kind] and kind != "masks":
+                found[kind] = pictures_by_serial(inner, rig, faults)
+    return found
+
+
+def _by_spelling(folder: Path, rig: Rig) -> dict[str, Path]:
+    """Pictures whose name is that of one camera alone but for case, or an ending that the camera's name has, too."""
+    pictures = listed_pictures(folder)
+    exact = {path.stem for path in pictures}
+    cameras = Counter(name.casefold() for name in rig.names)
+    lacking = {name.casefold(): name for name in rig.names if name not in exact and cameras[name.casefold()] == 1}
+    fitting: dict[str, list[Path]] = {}
+    for path in pictures:
+        keys = [key for key in (path.stem.casefold(), path.name.casefold()) if key in lacking]
+        if path.stem not in rig and keys:
+            fitting.setdefault(lacking[keys[0]], []).append(path)
+    return {name: paths[0] for name, paths in fitting.items() if len(paths) == 1}
+
+
+def check_folders(folder: Path, rig: Rig) -> None:
+    """Raises InputError for folders that nobody would read, and that are meant to be one of a capture's own: without a
+    word the subject would be found without its plates, or every picture be missing."""
+    kinds = ("images", *BESIDE_PICTURES)
+    others = [p.name for p in sorted(folder.iterdir()) if p.is_dir() and p.name not in (*kinds, *rig.names)]
+    faults = []
+    for kind in kinds:
+        alike = [name for name in others if SequenceMatcher(None, name.casefold(), kind).ratio() >= ALIKE_LEAST]
+        if alike and not (folder / kind).is_dir():
+            faults.append(f"{alike[0]}/ is not read: call it {kind}/")
+    if faults:
+        raise InputError("capture", faults)
 
 
 def read_shot(
@@ -85,13 +124,13 @@ def read_shot(
     pixels_most: int | None = None,
 ) -> Capture:
     """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``. ``filed``:
-    files that do not have their camera's name, as ``by_serial`` finds them."""
+    files that do not have their camera's name, as ``by_other_names`` finds them."""
     jobs: list[tuple[str, str, Path]] = []
     pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
     for camera in rig:
         image = _image_file(pictures, camera.name, faults) or _only_picture(pictures / camera.name, faults)
         image = image or filed.get("images", {}).get(camera.name)
-        mask = _image_file(folder / "masks", camera.name, faults)
+        mask = _image_file(folder / "masks", camera.name, faults) or filed.get("masks", {}).get(camera.name)
         plates = _plate_files(folder / "background", camera.name, faults)
         plates = plates or [path for name, path in filed.get("background", {}).items() if name == camera.name]
         if image is None:
@@ -187,7 +226,7 @@ def _decode(
         return None, digest, fault
     size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
     if size != wanted:
-        return None, "", size_fault(where, size, wanted)
+        return None, "", size_fault(where, size, camera.intrinsics)
     if whole:  # whatever is not zero is the subject, so that it is told before pixels are averaged
         pixels = at_share((pixels > 0).astype(np.uint8) * np.uint8(255), size, share)
     if camera.recorded is not None:
@@ -201,10 +240,20 @@ def _decode(
     return pixels, digest, fault
 
 
-def size_fault(where: str, size: tuple[int, int], wanted: tuple[int, int]) -> str:
-    """A sentence for a picture that is not of its camera's size (width, height)."""
-    fault = f"{where} is {size[0]} x {size[1]} pixels, but its camera is {wanted[0]} x {wanted[1]}"
-    return f"{fault}: it was turned by 90 degrees; turn it back" if size == wanted[::-1] else fault
+def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> str:
+    """A sentence for a picture whose size (width, height) is not that of its camera."""
+    fault = f"{where} is {size[0]} x {size[1]} pixels, but its camera is {k.width} x {k.height}"
+    if size == (k.height, k.width):
+        as_told, turned = (abs(k.cx - w / 2) + abs(k.cy - h / 2) for w, h in ((k.width, k.height), size))
+        if turned < as_told:
+            return f"{fault}: its principal point is that of the picture; exchange the camera's width and height"
+        return f"{fault}: it was turned by 90 degrees; turn it back"
+    share = size[0] / k.width
+    if abs(size[1] - share * k.height) <= 1.0:
+        return (
+            f"{fault}, and the shape is the same: give it in the size that was calibrated, or calibrate with this one"
+        )
+    return fault
 
 
 def stray_faults(folder: Path, rig: Rig) -> list[str]:

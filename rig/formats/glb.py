@@ -22,11 +22,14 @@ VERTICES, INDICES = 34962, 34963
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skin:
-    """A texture: coordinates a vertex, from the image's upper left corner, v downwards; the encoded image."""
+    """A texture: coordinates a vertex, from the image's upper left corner, v downwards; the encoded image. Where there
+    is a normal map (PNG, linear, +Y up), the tangents that it is given in, with the bitangents' signs."""
 
     uv: Float[np.ndarray, "v 2"]
     image: bytes
     mime: str = "image/jpeg"
+    normal_map: bytes | None = None
+    tangents: Float[np.ndarray, "v 4"] | None = None
 
 
 def glb_bytes(
@@ -61,15 +64,16 @@ def glb_bytes(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "head"}],
         "meshes": [{"name": "head", "primitives": [{"attributes": attributes, "indices": 2, "material": 0}]}],
-        "materials": [{"name": "skin", "pbrMetallicRoughness": surface, "doubleSided": True}],
+        "materials": [{"name": "skin", "pbrMetallicRoughness": surface, "doubleSided": True} | _bumps(skin)],
         "accessors": [{"bufferView": k} | shape for k, (_, _, shape) in enumerate(parts)],
         "bufferViews": views,
     }
     if skin is not None:
         surface["baseColorTexture"] = {"index": 0}
-        views.append({"buffer": 0, "byteOffset": len(payload), "byteLength": len(skin.image)})
-        payload += skin.image
-        document |= _texture(skin.mime, len(views) - 1)
+        document |= _texture(skin, len(views))
+        for image in (skin.image, *([] if skin.normal_map is None else [skin.normal_map])):
+            views.append({"buffer": 0, "byteOffset": len(payload), "byteLength": len(image)})
+            payload += image
     return _container(document | {"buffers": [{"byteLength": len(payload)}]}, bytes(payload))
 
 
@@ -94,6 +98,10 @@ def _parts(
         shape = {"componentType": FLOAT, "count": len(position), "type": "VEC2"}
         parts.append((skin.uv.astype("<f4").tobytes(), VERTICES, shape))
         attributes["TEXCOORD_0"] = 3
+        if skin.tangents is not None:
+            shape = {"componentType": FLOAT, "count": len(position), "type": "VEC4"}
+            parts.append((skin.tangents.astype("<f4").tobytes(), VERTICES, shape))
+            attributes["TANGENT"] = 4
     elif colours is not None:
         linear = np.round(linear_from_srgb(colours / 255.0) * 65535).astype("<u2")
         padded = np.concatenate([linear, np.full((len(linear), 1), 65535, "<u2")], axis=1)  # 4-byte alignment
@@ -103,14 +111,22 @@ def _parts(
     return parts, attributes
 
 
-def _texture(mime: str, view: int) -> dict[str, Any]:
-    webp = mime == WEBP
+def _bumps(skin: Skin | None) -> dict[str, Any]:
+    return {} if skin is None or skin.normal_map is None else {"normalTexture": {"index": 1}}
+
+
+def _texture(skin: Skin, view: int) -> dict[str, Any]:
+    """Images, from buffer view ``view`` on, and how they are read: the skin's, then its normal map."""
+    webp, bumps = skin.mime == WEBP, skin.normal_map is not None
     source = {"extensions": {"EXT_texture_webp": {"source": 0}}} if webp else {"source": 0}
     used = ["EXT_texture_webp"]
     return {
-        "images": [{"bufferView": view, "mimeType": mime}],
+        "images": [
+            {"bufferView": view, "mimeType": skin.mime},
+            *([{"bufferView": view + 1, "mimeType": "image/png"}] if bumps else []),
+        ],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],  # clamped to the edge
-        "textures": [{"sampler": 0} | source],
+        "textures": [{"sampler": 0} | source, *([{"sampler": 0, "source": 1}] if bumps else [])],
     } | ({"extensionsUsed": used, "extensionsRequired": used} if webp else {})
 
 

@@ -1,19 +1,20 @@
 """OpenCV's YAML of several cameras, as EasyMocap lays it out (https://chingswy.github.io/easymocap-public-doc).
 
 ``names``, ``K_<name>`` and ``dist_<name>`` in ``intri.yml``, ``Rot_<name>`` (or ``R_<name>``, a rotation vector) and
-``T_<name>`` in ``extri.yml``, camera_from_world in metres. ``W_<name>`` and ``H_<name>`` are the size; without them the
-pictures tell it.
+``T_<name>`` in ``extri.yml``, camera_from_world; or all of them in one file of any other name. Lengths are metres where
+the cameras lie within 30 of the origin, else mm. ``W_<name>`` and ``H_<name>`` are the size; without them the pictures
+tell it.
 """
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.foreign import MATRIX_PLACES, judged_rig, lens_entry, number_array, parsed, sized
+from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, judged_rig, lens_entry, number_array, parsed, sized
 from rig.geometry import rotation_from_vector
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
@@ -22,15 +23,19 @@ if TYPE_CHECKING:
     import cv2
 
 FILES = ("intri.yml", "extri.yml")
+WANTED = "K_<name>, dist_<name>, R_<name> and T_<name> of each camera"
 
 
 def read_yaml(path: Path) -> Rig:
-    """The rig in ``intri.yml`` and the ``extri.yml`` beside it. Raises InputError naming every fault."""
-    lenses = parsed(path.with_name(FILES[0]), _matrices)
-    poses = parsed(path.with_name(FILES[1]), _matrices)
+    """The rig in ``intri.yml`` and the ``extri.yml`` beside it, or in ``path`` alone. Raises InputError naming every
+    fault."""
+    parts = [path.with_name(name) for name in FILES] if path.name in FILES else [path, path]
+    lenses, poses = (parsed(part, _matrices) for part in parts)
     names = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
+    if not names:
+        raise InputError(path.name, [f"holds no camera; wanted are {WANTED}"])
     faults: list[str] = []
-    entries = []
+    entries: list[dict[str, Any]] = []
     for name in names:
         matrix = number_array(lenses[f"K_{name}"], (3, 3), f"K_{name}", faults)
         lens = number_array(lenses.get(f"dist_{name}", np.zeros(5)), None, f"dist_{name}", faults).ravel()
@@ -40,8 +45,8 @@ def read_yaml(path: Path) -> Rig:
         if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
             faults.append(f"K_{name} has skew, which is not supported")
         turned = poses.get(f"Rot_{name}")
-        if turned is None and (vector := poses.get(f"R_{name}")) is not None and vector.size == 3:
-            turned = rotation_from_vector(vector.ravel())
+        if turned is None and (given := poses.get(f"R_{name}")) is not None:
+            turned = rotation_from_vector(given.ravel()) if given.size == 3 else given
         rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
         translation = number_array(poses.get(f"T_{name}", np.zeros(0)).ravel(), (3,), f"T_{name}", faults)
         size: tuple[float, float]
@@ -57,9 +62,14 @@ def read_yaml(path: Path) -> Rig:
                 "height": size[1],
                 "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
                 "distortion": lens_entry(dict(zip(keys, lens.tolist(), strict=False))),
-                "camera_from_world": {"rotation": rotation.tolist(), "translation": (1000.0 * translation).tolist()},
+                "camera_from_world": {"rotation": rotation.tolist(), "translation": translation},
             }
         )
+    reach = max(float(np.abs(entry["camera_from_world"]["translation"]).max()) for entry in entries)
+    millimetres = 1000.0 if reach < METRES_MOST else 1.0
+    for entry in entries:
+        pose = entry["camera_from_world"]
+        pose["translation"] = (millimetres * pose["translation"]).tolist()
     return judged_rig(entries, path.name, faults)
 
 

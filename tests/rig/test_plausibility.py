@@ -53,6 +53,20 @@ def test_an_absurd_lens_is_named(k1):
     assert fault.startswith("cam05: the lens is absurd (k1 = ")
 
 
+def test_a_focal_length_in_mm_is_named_and_not_its_lens():
+    rig = default_layout()
+    in_mm = Rig(tuple(replace(c, intrinsics=replace(c.intrinsics, fx=50.0, fy=50.0)) for c in rig))
+    for camera, fault in zip(rig, rig_faults(in_mm), strict=True):
+        assert fault.startswith(f"{camera.name}: a focal length of 50 px is absurd")
+
+
+@pytest.mark.parametrize(("unit", "name"), [(10, "centimetres"), (100, "decimetres")])
+def test_other_units_are_recognised_by_what_the_pictures_show(unit, name):
+    (fault,) = rig_faults(posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation / unit)))
+    assert f"look like {name}" in fault
+    assert f"multiply them by {unit}" in fault
+
+
 def test_cameras_at_one_place_are_named():
     place = np.array([1.0, 2.0, 3.0])
     one = posed(default_layout(), lambda pose: RigidTransform(pose.rotation, -pose.rotation @ place))

@@ -2,10 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from calibration.scene.photographs import find_photographs
+from calibration.scene.photographs import find_masks, find_photographs
 from rig.errors import InputError
+from rig.formats.cameras_json import read_rig
+from rig.formats.images import write_image
+from tests.support.services import small_capture
 
 
 def fill(folder: Path, *files: str) -> Path:
@@ -49,3 +53,14 @@ def test_faults_are_named(tmp_path: Path, files: tuple[str, ...], told: str) -> 
 def test_what_is_no_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is no folder"):
         find_photographs(tmp_path / "nowhere")
+
+
+def test_a_mask_of_another_size_is_a_fault(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "shot")  # 24 x 24 pixels
+    for name, size in (("cam00", 24), ("cam01", 12)):
+        write_image(folder / "masks" / f"{name}.png", np.full((size, size), 255, np.uint8))
+    rig = read_rig(folder / "cameras.json")
+    with pytest.raises(InputError) as refused:
+        find_masks(folder, find_photographs(folder / "images"), rig)
+    (fault,) = refused.value.faults
+    assert fault.startswith("masks/cam01.png is 12 x 12 pixels, but its camera is 24 x 24")

@@ -13,7 +13,7 @@ import pytest
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.capture_folder import capture_root, read_capture, write_capture
+from rig.formats.capture_folder import capture_root, read_capture, size_fault, write_capture
 from rig.formats.features_json import features_from_bytes
 from rig.formats.images import read_image, write_image
 from rig.geometry import look_at
@@ -178,6 +178,56 @@ def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str
         read_capture(folder)
     assert len(caught.value.faults) == 1
     assert words in caught.value.faults[0]
+
+
+def test_names_may_differ_in_case_and_a_camera_may_be_called_as_its_picture(folder: Path) -> None:
+    (folder / "images" / "a.png").rename(folder / "images" / "A.PNG")
+    (folder / "background" / "a.png").rename(folder / "background" / "A.png")
+    (folder / "masks" / "c.png").rename(folder / "masks" / "C.png")
+    document = json.loads((folder / "cameras.json").read_text())
+    document["cameras"][1]["name"] = "b.png"
+    (folder / "cameras.json").write_text(json.dumps(document))
+    (folder / "background" / "b").rename(folder / "background" / "b.png")
+    (folder / "features.json").unlink()
+    capture, rig = read_capture(folder)
+    assert set(capture.images) == set(rig.names) == {"a", "b.png", "c"}
+    assert set(capture.backgrounds) == {"a", "b.png"}
+    assert set(capture.masks) == {"c"}
+
+
+def test_two_spellings_of_one_name_are_no_guess(folder: Path) -> None:
+    document = json.loads((folder / "cameras.json").read_text())
+    document["cameras"][1]["name"] = "A"  # beside "a"
+    (folder / "cameras.json").write_text(json.dumps(document))
+    (folder / "features.json").unlink()
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    assert any("images/A.png is missing" in fault for fault in caught.value.faults)
+
+
+@pytest.mark.parametrize(
+    ("called", "meant"), [("backgrounds", "background"), ("Images", "images"), ("mask", "masks"), ("image", "images")]
+)
+def test_a_folder_that_nobody_would_read_is_named(folder: Path, called: str, meant: str) -> None:
+    (folder / meant).rename(folder / called)
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    assert caught.value.faults == (f"{called}/ is not read: call it {meant}/",)
+
+
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        ({"width": HEIGHT, "height": WIDTH}, "exchange the camera's width and height"),  # of cx 31.5, cy 23.5
+        ({"width": HEIGHT, "height": WIDTH, "cx": 23.5, "cy": 31.5}, "it was turned by 90 degrees; turn it back"),
+        ({"width": 2 * WIDTH, "height": 2 * HEIGHT}, "give it in the size that was calibrated"),
+        ({"width": WIDTH + 9}, f"its camera is {WIDTH + 9} x {HEIGHT}"),
+    ],
+)
+def test_a_picture_of_another_size_is_told_with_its_remedy(change: dict[str, float], remedy: str) -> None:
+    fault = size_fault("images/a.png", (WIDTH, HEIGHT), replace(small_rig()["a"].intrinsics, **change))
+    assert fault.startswith(f"images/a.png is {WIDTH} x {HEIGHT} pixels")
+    assert remedy in fault
 
 
 def test_all_faults_are_named_at_once(folder: Path) -> None:

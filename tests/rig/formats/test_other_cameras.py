@@ -4,6 +4,7 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -107,6 +108,35 @@ def test_every_format_is_written_and_found_again(kind: str, tmp_path: Path) -> N
         np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
         assert back[camera.name].intrinsics.width == camera.intrinsics.width
     assert all(part.is_file() for part in rig_file_parts(file))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+@pytest.mark.parametrize("vectors", [True, False])
+def test_opencv_matrices_in_one_file(unit: float, vectors: bool, tmp_path: Path) -> None:
+    """As who calibrated with OpenCV writes K, dist, R and T by FileStorage, in mm or in metres."""
+    rig = fan()
+    file = cv2.FileStorage(str(tmp_path / "studio.yaml"), cv2.FILE_STORAGE_WRITE)
+    for camera in rig:
+        pose = camera.camera_from_world
+        file.write(f"K_{camera.name}", camera.intrinsics.matrix())
+        file.write(f"dist_{camera.name}", camera.intrinsics.distortion.opencv())
+        file.write(f"R_{camera.name}", cv2.Rodrigues(pose.rotation)[0] if vectors else pose.rotation)
+        file.write(f"T_{camera.name}", pose.translation / unit)
+        pixels = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+        write_image(tmp_path / "images" / f"{camera.name}.png", pixels)
+    file.release()
+    (tmp_path / "compose.yaml").write_text("services: {}\n")  # no rig, and before it by name
+    path = find_rig_file(tmp_path)
+    assert path == tmp_path / "studio.yaml"
+    back = read_rig_file(tmp_path / "studio.yaml")
+    for camera in rig:
+        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
+
+
+def test_a_yaml_of_opencv_without_cameras_says_what_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "board.yml").write_text("%YAML:1.0\n---\nsquare: 25.\n")
+    with pytest.raises(InputError, match=r"board\.yml: holds no camera; wanted are K_<name>, dist_<name>, R_<name>"):
+        read_rig_file(tmp_path / "board.yml")
 
 
 def test_an_unknown_format_is_named(tmp_path: Path) -> None:
