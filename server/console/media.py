@@ -203,7 +203,7 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
 @pages.get("/console/jobs/{job_id}/all.zip")
 def all_files(who: Reader, request: Request, job_id: str) -> Response:
     """Every file of the result in one archive."""
-    return send_archive(request, _result_folder(who[0], job_id), who[0].jobs.files(job_id))
+    return send_archive(request, _result_folder(who[0], job_id), who[0].jobs.files(job_id), name=None)
 
 
 @pages.get("/console/jobs/{job_id}/{name}")

@@ -295,12 +295,13 @@ def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
 
 class Status(TypedDict):
     """What the frame shows of the service; ``faults``: what to do, by what is wrong; ``starting``: what is not there
-    yet."""
+    yet; ``empty``: nobody took or uploaded a capture."""
 
     starting: list[str]
     faults: dict[str, str]
     jobs: int
     disk: str
+    empty: bool
     local: bool
 
 
@@ -314,12 +315,13 @@ def status_of(service: Service, caller: Caller) -> Status | None:
         wrong = {name: check.detail for name, check in checks.items() if not check.ok and not check.starting}
         starting = [name for name, check in checks.items() if check.starting]
         counts = service.jobs.counts()
-        disk = checks["disk"].detail.partition(" free")[0] + " free"
+        free = checks["disk"].detail.partition(" free")[0]
         return {
             "faults": wrong,
             "starting": starting,
             "jobs": counts["queued"] + counts["running"],
-            "disk": disk,
+            "disk": f"{free} free",
+            "empty": service.captures.newest() is None,
             "local": False,
         }
 

@@ -42,7 +42,7 @@ class Frame(Element, component="static/frame.js"):
 
     def say(self, kind: str, text: str, faults: list[str] | None = None) -> None:
         """A message in the corner: ``kind`` is done, warning or fault; ``faults`` are all listed."""
-        self.run_method("say", kind, text, faults or [])
+        self.run_method("announce", kind, text, faults or [])
 
 
 def install() -> None:

@@ -14,14 +14,13 @@ from rig.errors import InputError
 from server.console.identity import permit
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
+from server.console.work_form import PresetLine, TemplateLine, WorkForm, chosen_work, preset_lines, template_lines
 from server.errors import NotFound, Unusable
 from server.services.bulk import each
 from server.services.captures import TEXT_MOST, About
-from server.services.presets import PRESETS, settings_of
 from server.services.records import Session
 from server.services.service import Service
 from server.services.tags import typed_tags
-from server.services.work import Work
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
@@ -88,12 +87,6 @@ class SessionLine(TypedDict):
     captures: int
 
 
-class PresetLine(TypedDict):
-    id: str
-    title: str
-    explanation: str
-
-
 class CapturesState(TypedDict):
     """One page of captures; ``chosen`` is the one that is looked at, which may lie on another page."""
 
@@ -105,13 +98,7 @@ class CapturesState(TypedDict):
     tags: list[str]
     models: list[str]
     presets: list[PresetLine]
-
-
-class WorkForm(Chosen):
-    """``method`` is a preset's id."""
-
-    model: NotRequired[str | None]
-    method: NotRequired[str | None]
+    templates: list[TemplateLine]
 
 
 class EditForm(Chosen):
@@ -142,8 +129,14 @@ class BulkForm(WorkForm):
 
 class CapturesPage(Page, component="captures.js"):
     def look(self) -> CapturesState:
+        """What is looked at stays, whatever comes in meanwhile: nobody erases another capture than the one they see."""
         asked = {name: self.choice.get(name) or None for name in ASKED}
-        return shared.get(("captures", *asked.values()), 0.3, lambda: captures_state(self.service, asked))
+        state: CapturesState = shared.get(
+            ("captures", *asked.values()), 0.3, lambda: captures_state(self.service, asked)
+        )
+        if state["chosen"] is not None and (self.choice.get("capture") or None) == asked["capture"]:
+            self.choice["capture"] = state["chosen"]["id"]
+        return state
 
 
 def captures_state(service: Service, asked: Mapping[str, str | None]) -> CapturesState:
@@ -163,7 +156,8 @@ def captures_state(service: Service, asked: Mapping[str, str | None]) -> Capture
         "sessions": sessions_list(service, asked["session"]),
         "tags": shared.get("tags", 1.0, service.captures.tags),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
-        "presets": [{"id": p.id, "title": p.title, "explanation": p.explanation} for p in PRESETS],
+        "presets": preset_lines(),
+        "templates": shared.get("templates", 5.0, template_lines),
     }
 
 
@@ -255,11 +249,6 @@ def reconstruct_session(page: Page, event: WorkForm) -> str:
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
     page.started(*(job.id for job in jobs))
     return f"Queued {len(jobs)} {'job' if len(jobs) == 1 else 'jobs'}. Watch them on the page Jobs."
-
-
-def chosen_work(event: WorkForm) -> Work:
-    """Model and preset of the form; what is not chosen is the service's default."""
-    return Work(event.get("model") or None, settings_of(event.get("method")))
 
 
 def sample(page: Page, event: object) -> str:

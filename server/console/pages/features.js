@@ -1,5 +1,6 @@
 // Up to four views side by side; what is drawn over them is in pixels of the image, pixel (0, 0) being a centre.
-import { clock, keepAddress, typing } from "/console/static/words.js";
+import { say, spoken } from "/console/static/language.js";
+import { clock, fixed, keepAddress, typing } from "/console/static/words.js";
 
 const TITLES = { exocanthion_right: "Right eye, outer corner", exocanthion_left: "Left eye, outer corner", pronasale: "Tip of the nose", subnasale: "Below the nose",
   cheilion_right: "Right corner of the mouth", cheilion_left: "Left corner of the mouth", gnathion: "Underside of the chin" };
@@ -9,7 +10,7 @@ const DRAG_PX = 3; // of the screen, which the pointer moves before a click is a
 const SEVEN = 7;
 const VIEWS_LEAST = 2, POINTS_LEAST = 3;
 
-export default {
+export default spoken({
   props: { state: Object },
   emits: ["act", "choose"],
   watch: {
@@ -27,37 +28,37 @@ export default {
     views() { return (this.capture?.views || []).slice(0, this.count).map((name, i) => this.chosen[i] || name); },
     ready() { return this.names.filter((n) => Object.keys(this.capture.points[n] || {}).length >= VIEWS_LEAST).length; },
     lead() {
-      if (!this.capture) return this.state.loading ? "Reading" : "";
-      if (!Object.keys(this.capture.points).length) return "Optional. Without points the head is found by itself.";
-      return this.ready < POINTS_LEAST ? `${this.ready} of at least ${POINTS_LEAST} points are in two views` : `${this.ready} points in two views or more` + (this.capture.dirty ? ", not saved" : ", saved");
+      if (!this.capture) return this.state.loading ? say("Reading") : "";
+      if (!Object.keys(this.capture.points).length) return say("Optional. Without points the head is found by itself.");
+      return this.ready < POINTS_LEAST ? say("{ready} of at least {least} points are in two views", { ready: this.ready, least: POINTS_LEAST }) : say(this.capture.dirty ? "{ready} points in two views or more, not saved" : "{ready} points in two views or more, saved", { ready: this.ready });
     },
   },
   template: `
-    <section class="page" aria-label="Features">
+    <section class="page" aria-label="Features" :data-digits="capture ? '1 2 3 4 5 6 7' : null">
       <header><h1>Features</h1>
         <select v-if="capture" :value="capture.id" aria-label="Capture" @change="$emit('choose', { capture: $event.target.value })"><option v-for="c in state.captures" :key="c.id" :value="c.id">{{ c.label || clock(c.created) }} &middot; {{ c.id.slice(-6) }}</option></select>
         <span class="lead" role="status">{{ lead }}</span>
-        <template v-if="capture"><span class="group" role="group" aria-label="Number of views"><button v-for="n in [3, 4]" :key="n" class="b" :aria-pressed="count === n" @click="count = n">{{ n }} views</button></span>
+        <template v-if="capture"><span class="group" role="group" aria-label="Number of views"><button v-for="n in [3, 4]" :key="n" class="b" :aria-pressed="count === n" @click="count = n">{{ say('{count} view | {count} views', { count: n }) }}</button></span>
         <button class="b" id="save" :disabled="!capture.dirty || !!busy" @click="act('save')">Save <kbd>S</kbd></button>
-        <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct')">{{ ready ? 'Reconstruct' : 'Skip and reconstruct' }}</button></template></header>
+        <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct')">{{ say(ready ? 'Reconstruct' : 'Skip and reconstruct') }}</button></template></header>
       <div v-if="capture && capture.asked && wrong.length" class="panel pad stack small" role="alertdialog" aria-label="Points contradict each other" id="contradictions" style="border-color: var(--warn)">
         <p><strong class="warn">Not saved yet: views contradict each other.</strong> A job would leave these out. Right and left confused, or another point clicked?</p>
-        <ul class="faults"><li v-for="[name, text] in wrong" :key="name"><button class="b quiet" @click="at = names.indexOf(name)">{{ title(name) }}</button> {{ text }}</li></ul>
+        <ul class="faults"><li v-for="[name, text] in wrong" :key="name"><button class="b quiet" @click="at = names.indexOf(name)">{{ title(name) }}</button> {{ say(text) }}</li></ul>
         <div class="line wrap"><button class="b main-action" @click="at = names.indexOf(wrong[0][0])">Look at them</button><button class="b" id="save-anyway" :disabled="!!busy" @click="act('save', { sure: true })">Save all the same</button></div></div>
-      <div v-if="!state.loading && !capture" class="panel grow" style="display: grid"><div class="empty"><h2>{{ state.asked ? 'This capture is not there' : 'No captures yet' }}</h2><p>Points are picked in the pictures of a capture.</p><a class="b main-action" :href="state.asked ? '/captures' : '/'">{{ state.asked ? 'Go to captures' : 'Go to the rig' }}</a></div></div>
+      <div v-if="!state.loading && !capture" class="panel grow" style="display: grid"><div class="empty"><h2>{{ say(state.asked ? 'This capture is not there' : 'No captures yet') }}</h2><p>Points are picked in the pictures of a capture.</p><a class="b main-action" :href="state.asked ? '/captures' : '/'">{{ say(state.asked ? 'Go to captures' : 'Go to the rig') }}</a></div></div>
       <div v-else-if="capture" class="columns" style="grid-template-columns: 15rem minmax(0, 1fr)">
         <div class="panel scroll" tabindex="0" role="region" aria-label="The points" data-scroll="points">
           <button v-for="{ name, i } in offered" :key="name" class="row-button" :data-point="name" :aria-current="i === at" @click="at = i">
             <span class="line"><kbd v-if="i < 7">{{ i + 1 }}</kbd><span class="grow">{{ title(name) }}</span></span>
-            <span class="small muted line"><span class="grow">{{ placed(name) }}</span><span v-if="capture.contradictions[name]" class="tag fault" :title="capture.contradictions[name]">contradicts</span><span v-if="worst(name) !== null" class="num" :class="{ warn: worst(name) > 3 }">{{ worst(name).toFixed(1) }} px</span></span></button>
-          <button class="b quiet small" style="margin: .5rem .75rem 0" :aria-pressed="all" @click="all = !all">{{ all ? 'The seven points alone' : 'All 26 points' }}</button>
+            <span class="small muted line"><span class="grow">{{ placed(name) }}</span><span v-if="capture.contradictions[name]" class="tag fault" :title="say(capture.contradictions[name])">contradicts</span><span v-if="worst(name) !== null" class="num" :class="{ warn: worst(name) > 3 }">{{ fixed(worst(name), 1) }} px</span></span></button>
+          <button class="b quiet small" style="margin: .5rem .75rem 0" :aria-pressed="all" @click="all = !all">{{ say(all ? 'The seven points alone' : 'All 26 points') }}</button>
           <p class="small muted" style="padding: .7rem .75rem">Right and left are the subject's. Click the point in each view where you see it; lines show where the other views expect it, the ring where all of them do, the diamond where the model has it. <kbd>Enter</kbd> takes that place, arrows move it, <kbd>Del</kbd> takes it back.</p>
         </div>
         <div :style="{ display: 'grid', gap: '.6rem', minHeight: 0, gridTemplateColumns: 'repeat(2, minmax(0, 1fr))', gridTemplateRows: 'repeat(2, minmax(0, 1fr))' }">
           <div v-for="(camera, i) in views" :key="i" class="panel" style="display: flex; flex-direction: column; min-height: 0; overflow: hidden">
-            <div class="line" style="padding: .25rem .5rem"><select :value="camera" :aria-label="'Camera of view ' + (i + 1)" @change="chosen[i] = $event.target.value"><option v-for="c in capture.cameras" :key="c.name">{{ c.name }}</option></select>
+            <div class="line" style="padding: .25rem .5rem"><select :value="camera" :aria-label="say('Camera of view {number}', { number: i + 1 })" @change="chosen[i] = $event.target.value"><option v-for="c in capture.cameras" :key="c.name">{{ c.name }}</option></select>
               <span class="small muted cut grow">{{ position(camera) }}</span></div>
-            <svg tabindex="0" role="application" :aria-label="title(point) + ' in ' + camera + ', ' + (position(camera) || 'not set')" :data-view="camera" :viewBox="'0 0 ' + sizes[camera].width + ' ' + sizes[camera].height" style="flex: 1; min-height: 0; width: 100%; cursor: crosshair; background: #08090b; touch-action: none"
+            <svg tabindex="0" role="application" :aria-label="say('{point} in {camera}, {place}', { point: title(point), camera, place: position(camera) || say('not set') })" :data-view="camera" :viewBox="'0 0 ' + sizes[camera].width + ' ' + sizes[camera].height" style="flex: 1; min-height: 0; width: 100%; cursor: crosshair; background: #08090b; touch-action: none"
               @pointerdown="press($event, camera)" @pointermove="move($event, camera)" @pointerup="release" @pointerleave="lens = null" @keydown="nudge($event, camera)">
               <image :href="address(camera)" :width="sizes[camera].width" :height="sizes[camera].height"></image>
               <g fill="none" :stroke-width="unit(camera)">
@@ -77,15 +78,15 @@ export default {
         <g fill="none" stroke="#6cb2ff"><polyline v-for="(curve, k) in curves(lens.camera)" :key="k" :points="line(curve)" :stroke-width="lens.step * 1.2" opacity=".8"></polyline>
         <path :d="'M' + (lens.x + .5) + ' ' + (lens.y - 999) + 'v1998M' + (lens.x - 999) + ' ' + (lens.y + .5) + 'h1998'" stroke="#ffffff" :stroke-width="lens.step" opacity=".8"></path></g></svg>
     </section>`,
-  created() { this.clock = clock; },
+  created() { Object.assign(this, { clock, fixed }); },
   mounted() { window.addEventListener("keydown", this.key); },
   unmounted() { window.removeEventListener("keydown", this.key); },
   methods: {
-    title(name) { return TITLES[name] || name.replaceAll("_", " "); },
+    title(name) { return say(TITLES[name] || name.replaceAll("_", " ")); },
     address(camera) { return `/console/captures/${this.capture.id}/${encodeURIComponent(camera)}.image`; },
     act(name, more) { this.busy = name; this.$emit("act", { name, ...more }); },
     acted(name) { this.busy = ""; if (name === "place" && --this.sent === 0) this.pending = {}; },
-    placed(name) { const n = Object.keys(this.capture.points[name] || {}).length; return n ? `${n} view${n > 1 ? "s" : ""}` : "not set"; },
+    placed(name) { const n = Object.keys(this.capture.points[name] || {}).length; return n ? say("{count} view | {count} views", { count: n }) : say("not set"); },
     worst(name) { const off = Object.values(this.capture.off_px[name] || {}); return off.length ? Math.max(...off) : null; },
     here(camera) {
       if (this.drag?.camera === camera) return this.drag.at;
@@ -154,4 +155,4 @@ export default {
       else if (event.key.toLowerCase() === "s" && this.capture.dirty && !this.busy) this.act("save");
     },
   },
-};
+});

@@ -1,5 +1,6 @@
 // The queue at the left, one job at the right.
 import { Pager, paged } from "/console/static/list.js";
+import { say, spoken } from "/console/static/language.js";
 import { clock, fixed, keepDraft, kept, span, stageWords } from "/console/static/words.js";
 
 const asked = new URLSearchParams(location.search);
@@ -7,7 +8,7 @@ const asked = new URLSearchParams(location.search);
 const MOSTLY = 0.25; // of the rim: beyond it hair or clothes hide the face, and the residual says nothing
 const POOR_PX = 3.0; // contour residual from which a camera is worth a look
 
-export default {
+export default spoken({
   mixins: [paged],
   components: { Pager },
   props: { state: Object },
@@ -24,14 +25,14 @@ export default {
     job() { return this.state.job || null; },
     active() { return this.job && ["queued", "running"].includes(this.job.state); },
     waiting() {
-      if (this.job.notice) return this.job.notice;
+      if (this.job.notice) return say(this.job.notice);
       const before = this.job.ahead || 0;
-      return before ? `Waiting, ${before} ${before === 1 ? "job" : "jobs"} before it` : "Waiting for the worker";
+      return before ? say("Waiting, {count} job before it | Waiting, {count} jobs before it", { count: before }) : say("Waiting for the worker");
     },
     sheet() { return `/console/jobs/${this.job.id}/contact_sheet.png`; },
     lead() {
       const { running = 0, queued = 0, succeeded = 0, failed = 0, cancelled = 0 } = this.state.counts || {};
-      return this.state.loading ? "Reading" : `${running} running, ${queued} queued, ${succeeded + failed + cancelled} ended`;
+      return this.state.loading ? say("Reading") : say("{running} running, {queued} queued, {ended} ended", { running, queued, ended: succeeded + failed + cancelled });
     },
   },
   template: `
@@ -46,26 +47,26 @@ export default {
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
         <div class="stack" style="min-height: 0">
           <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, solver, id" aria-label="Find jobs"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
-          <div class="line"><select v-model="only" id="state" class="grow" aria-label="State"><option value="">every state</option><option v-for="(n, s) in state.counts" :key="s" :value="s">{{ s }} ({{ n }})</option></select>
+          <div class="line"><select v-model="only" id="state" class="grow" aria-label="State"><option value="">every state</option><option v-for="(n, s) in state.counts" :key="s" :value="s">{{ say(s) }} ({{ n }})</option></select>
             <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="-finished">ended last first</option></select></div>
-          <div v-if="picking" class="panel pad line wrap small" role="region" aria-label="Selected jobs"><strong>{{ picked.length }} selected</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button>
+          <div v-if="picking" class="panel pad line wrap small" role="region" aria-label="Selected jobs"><strong>{{ say('{count} selected', { count: picked.length }) }}</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button>
             <button class="b" id="bulk-cancel" :disabled="!picked.length || !!busy" @click="bulk('cancel')">Cancel</button><button class="b" id="bulk-restart" :disabled="!picked.length || !!busy" @click="bulk('restart')">Restart</button><button class="b" id="bulk-remove" :disabled="!picked.length || !!busy" @click="bulk('remove')">Remove</button></div>
         <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of jobs" data-scroll="jobs" @keydown="walk">
           <p v-if="(sought || only) && !jobs.length" class="muted small" style="padding: .5rem .75rem">No job matches.</p>
-          <div v-for="j in jobs" :key="j.id" class="row-line"><input v-if="picking" type="checkbox" :value="j.id" v-model="picked" :aria-label="'Select job ' + j.id.slice(-6)">
+          <div v-for="j in jobs" :key="j.id" class="row-line"><input v-if="picking" type="checkbox" :value="j.id" v-model="picked" :aria-label="say('Select job {id}', { id: j.id.slice(-6) })">
           <button class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="choose(j.id)">
-            <span class="line"><strong class="cut grow">{{ j.capture || clock(j.captured) }}</strong><span class="tag" :class="kind(j)">{{ j.state }}</span></span>
-            <span class="bar" role="progressbar" :aria-label="'Progress of ' + j.id.slice(-6)" :aria-valuenow="Math.round(100 * j.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * j.progress + '%' }"></i></span>
-            <span class="small muted line"><span class="grow cut">{{ j.state === 'running' ? stageWords(j.stage) : clock(j.created) }}<template v-if="j.restart_of"> &middot; after {{ j.restart_of.slice(-6) }}</template></span>
-              <span class="num">{{ j.state === 'running' && j.eta_s !== null ? span(j.eta_s) + ' left' : j.state === 'queued' ? place(j) : took(j) }}</span></span>
+            <span class="line"><strong class="cut grow">{{ captureOf(j) }}</strong><span class="tag" :class="kind(j)">{{ say(j.state) }}</span></span>
+            <span class="bar" role="progressbar" :aria-label="say('Progress of {id}', { id: j.id.slice(-6) })" :aria-valuenow="Math.round(100 * j.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * j.progress + '%' }"></i></span>
+            <span class="small muted line"><span class="grow cut">{{ j.state === 'running' ? stageWords(j.stage) : clock(j.created) }}<template v-if="j.restart_of"> &middot; {{ say('after {id}', { id: j.restart_of.slice(-6) }) }}</template></span>
+              <span class="num">{{ j.state === 'running' && j.eta_s !== null ? say('{time} left', { time: span(j.eta_s) }) : j.state === 'queued' ? place(j) : took(j) }}</span></span>
           </button></div>
-          <p v-if="state.waiting" class="muted small" style="padding: .5rem .75rem">{{ state.waiting }} more wait in the queue.</p>
+          <p v-if="state.waiting" class="muted small" style="padding: .5rem .75rem">{{ say('{count} more waits in the queue. | {count} more wait in the queue.', { count: state.waiting }) }}</p>
           <pager :behind="behind.length" :next="state.next" :size="jobs.length" :total="state.total" @back="back" @forward="forward"></pager>
         </div></div>
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="The chosen job">
           <template v-if="job">
-            <div class="line wrap"><h2>{{ job.capture || clock(job.captured) }}</h2><span class="tag" :class="kind(job)">{{ job.state }}</span><span class="muted small mono">{{ job.id.slice(-6) }}</span>
-              <span class="muted small push">{{ job.model || 'default model' }} &middot; {{ job.settings.method || 'contour' }} &middot; queue {{ job.queue }}</span></div>
+            <div class="line wrap"><h2>{{ captureOf(job) }}</h2><span class="tag" :class="kind(job)">{{ say(job.state) }}</span><span class="muted small mono">{{ job.id.slice(-6) }}</span>
+              <span class="muted small push">{{ job.model || say('default model') }} &middot; {{ say(job.settings.method || 'contour') }} &middot; {{ say('queue {name}', { name: job.queue }) }}</span></div>
             <form v-if="form" class="panel pad stack" style="background: var(--raised)" @submit.prevent="restart" aria-label="Restart with other settings">
               <div class="line wrap" style="align-items: end">
                 <label class="field">Method<select v-model="form.method"><option value="">as set</option><option value="contour">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
@@ -75,31 +76,32 @@ export default {
               <label class="field">Further settings, JSON<textarea v-model="form.more" rows="3" spellcheck="false"></textarea></label>
               <div class="line"><button class="b main-action" :disabled="!!busy">Queue the new job</button><button type="button" class="b quiet" @click="form = null">Keep it as it is</button></div>
             </form>
-            <div v-if="job.error" class="stack" role="alert"><p class="fault">{{ job.error.detail }}</p><ul class="faults small"><li v-for="(e, i) in job.error.errors" :key="i">{{ e }}</li></ul></div>
-            <ul v-if="state.detail.warnings.length" class="faults small"><li v-for="(w, i) in state.detail.warnings" :key="i" class="warn">{{ w.message }}</li></ul>
+            <div v-if="job.error" class="stack" role="alert"><p class="fault">{{ say(job.error.detail) }}</p><ul class="faults small"><li v-for="(e, i) in job.error.errors" :key="i">{{ say(e) }}</li></ul></div>
+            <ul v-if="state.detail.warnings.length" class="faults small"><li v-for="(w, i) in state.detail.warnings" :key="i" class="warn">{{ say(w.message) }}</li></ul>
             <div class="columns" style="grid-template-columns: minmax(0, 1fr) 15rem; flex: none">
               <div v-if="state.detail.cameras.length" class="scroll" tabindex="0" role="region" aria-label="Residuals by camera"><table>
                 <thead><tr><th>Camera</th><th class="num" title="Overlap of silhouette and fitted head in the face region">IoU</th><th class="num" title="From the fitted rim to the silhouette, hair and clothes among it">contour, px</th><th class="num" title="Share of the rim farther than 3 px from the silhouette: hair, clothes or misfit">excluded</th><th class="num" title="Silhouette difference of the starting head">XOR before</th><th class="num" title="The same of the fitted head">XOR after</th><th>Use</th></tr></thead>
-                <tbody><tr v-for="c in state.detail.cameras" :key="c.name"><td>{{ c.name }}</td><td class="num">{{ fixed(c.iou, 3) }}</td><td class="num" :class="{ warn: c.contour_rms_px > poor && c.excluded_share < mostly }">{{ fixed(c.contour_rms_px, 2) }}</td><td class="num">{{ c.excluded_share === null ? '-' : (100 * c.excluded_share).toFixed(0) + ' %' }}</td><td class="num">{{ fixed(c.xor_cost_start, 0) }}</td><td class="num">{{ fixed(c.xor_cost, 0) }}</td><td :class="{ warn: !c.used }">{{ c.used ? '' : 'left out' }}</td></tr></tbody></table></div>
-              <div v-else-if="active" class="stack"><div class="line"><strong class="grow">{{ job.state === 'running' ? stageWords(job.stage) : waiting }}</strong><span class="num">{{ Math.round(100 * job.progress) }} %</span><span v-if="job.state === 'running' && job.eta_s !== null" class="num muted">about {{ span(job.eta_s) }} left</span></div>
+                <tbody><tr v-for="c in state.detail.cameras" :key="c.name"><td>{{ c.name }}</td><td class="num">{{ fixed(c.iou, 3) }}</td><td class="num" :class="{ warn: c.contour_rms_px > poor && c.excluded_share < mostly }">{{ fixed(c.contour_rms_px, 2) }}</td><td class="num">{{ c.excluded_share === null ? '-' : (100 * c.excluded_share).toFixed(0) + ' %' }}</td><td class="num">{{ fixed(c.xor_cost_start, 0) }}</td><td class="num">{{ fixed(c.xor_cost, 0) }}</td><td :class="{ warn: !c.used }">{{ c.used ? '' : say('left out') }}</td></tr></tbody></table></div>
+              <div v-else-if="active" class="stack"><div class="line wrap"><strong class="grow" style="flex-basis: 12rem">{{ job.state === 'running' ? stageWords(job.stage) : waiting }}</strong><span class="num">{{ Math.round(100 * job.progress) }} %</span><span v-if="job.state === 'running' && job.eta_s !== null" class="num muted">{{ say('about {time} left', { time: span(job.eta_s) }) }}</span></div>
                 <div class="bar" aria-hidden="true"><i :style="{ width: 100 * job.progress + '%' }"></i></div><p class="muted small">Residuals by camera, silhouettes and overlays stand here when the job is done.</p></div>
               <p v-else class="muted">The job left no report.</p>
               <div class="stack"><h3>Log</h3><table class="small log"><tbody><tr v-for="(l, i) in state.detail.log" :key="i"><td class="num muted">{{ fixed(l.at_s, 1) }} s</td><td>{{ stageWords(l.text) }}</td></tr></tbody></table>
-                <p v-if="state.detail.stopped_because" class="small muted">{{ state.detail.stopped_because }}, {{ state.detail.evaluations }} evaluations, {{ span(state.detail.seconds.total) }}</p></div>
+                <p v-if="state.detail.stopped_because" class="small muted">{{ say('{reason}, {count} evaluation, {time} | {reason}, {count} evaluations, {time}', { reason: say(state.detail.stopped_because), count: state.detail.evaluations, time: span(state.detail.seconds.total) }) }}</p></div>
             </div>
             <template v-if="state.detail.pictures">
               <div class="line"><h3>Silhouette difference before and after</h3></div>
               <a :href="sheet" target="_blank" rel="noopener" aria-label="Open the contact sheet"><img :src="sheet" alt="Contact sheet: input, silhouette difference before and after the fit, and the head from new views" style="width: 100%; border-radius: 3px; display: block" @error="$event.target.style.display = 'none'"></a>
               <h3>Input contour and fitted contour</h3>
-              <div class="thumbs"><a v-for="c in state.detail.cameras" :key="c.name" class="thumb" :href="overlay(c.name)" target="_blank" rel="noopener" :aria-label="'Overlay of ' + c.name"><img :src="overlay(c.name)" :alt="'Contours in ' + c.name" loading="lazy"><span>{{ c.name }}</span></a></div>
+              <div class="thumbs"><a v-for="c in state.detail.cameras" :key="c.name" class="thumb" :href="overlay(c.name)" target="_blank" rel="noopener" :aria-label="say('Overlay of {name}', { name: c.name })"><img :src="overlay(c.name)" :alt="say('Contours in {name}', { name: c.name })" loading="lazy"><span>{{ c.name }}</span></a></div>
             </template>
           </template>
-          <div v-else-if="!state.loading" class="empty"><h2>{{ jobs.length ? 'Choose a job' : 'No jobs yet' }}</h2><template v-if="!jobs.length"><p>Choose a capture and press Reconstruct.</p><a class="b main-action" href="/captures">Go to captures</a></template></div>
+          <div v-else-if="!state.loading" class="empty"><h2>{{ say(jobs.length ? 'Choose a job' : 'No jobs yet') }}</h2><template v-if="!jobs.length"><p>Choose a capture and press Reconstruct.</p><a class="b main-action" href="/captures">Go to captures</a></template></div>
         </div>
       </div>
     </section>`,
   created() { Object.assign(this, { clock, fixed, span, stageWords, poor: POOR_PX, mostly: MOSTLY }); },
   methods: {
+    captureOf(j) { return j.captured ? j.capture || clock(j.captured) : say(j.capture); },
     kind(j) { return j.state === "failed" ? "fault" : j.state === "running" || j.state === "succeeded" ? "accent" : ""; },
     took(j) { return j.started && j.finished ? span((new Date(j.finished) - new Date(j.started)) / 1000) : ""; },
     overlay(name) { return `/console/jobs/${this.job.id}/overlays/${name}.png`; },
@@ -109,11 +111,11 @@ export default {
       if (name === "restart" && done) { this.form = null; this.chosen = this.state.job?.id || ""; }
       if (name === "bulk") this.picked = [];
     },
-    place(j) { return j.ahead ? `${j.ahead} before it` : "next"; },
+    place(j) { return j.ahead ? say("{count} before it", { count: j.ahead }) : say("next"); },
     fields() { return { job: this.job?.id, find: this.sought, state: this.only, sort: this.sort }; },
     question() { return { find: this.sought, state: this.only, sort: this.sort, job: this.chosen, after: this.behind.at(-1) || "" }; },
     bulk(action) { this.busy = "bulk"; this.$emit("act", { name: "bulk", action, ids: [...this.picked] }); },
     open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { job: this.job.id, method, model: "", detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
     restart() { this.busy = "restart"; this.$emit("act", { name: "restart", id: this.job.id, ...this.form }); },
   },
-};
+});

@@ -14,7 +14,7 @@ from rig.errors import InputError
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.pages.rig import read_report
 from server.console.removal import removals
-from server.errors import Conflict, Unusable
+from server.errors import SEND_AGAIN, Conflict, Unusable
 from server.services.bulk import each
 from server.services.documents import JobLine
 from server.services.jobs import FINISHED, STATUSES
@@ -175,6 +175,8 @@ def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
 
 def job_line(listed: ListedJob) -> ShownJob:
     job = {key: value for key, value in asdict(listed.job).items() if key != "files"}
+    if listed.job.error is not None:  # who reads a page sends no document again
+        job["error"] |= {"detail": listed.job.error.detail.removesuffix(SEND_AGAIN).strip()}
     return cast(ShownJob, {**job, "capture": listed.capture, "captured": listed.captured})
 
 

@@ -2,8 +2,10 @@
 import { GLTFLoader, OrbitControls, THREE } from "nicegui-scene";
 import { besideIt } from "/console/static/beside.js";
 import { exports3d } from "/console/static/exports.js";
+import { say, spoken } from "/console/static/language.js";
 import { fitted, lookThrough } from "/console/static/look_through.js";
-import { clock, fixed, size, span, typing } from "/console/static/words.js";
+import { views3d } from "/console/static/views.js";
+import { clock, fixed, keepAddress, size, span, typing } from "/console/static/words.js";
 
 // viridis sampled at nine places (dark is small), as linear steps between them; it stays readable without colour vision
 const RAMP = [[0.267, 0.005, 0.329], [0.283, 0.141, 0.458], [0.254, 0.265, 0.53], [0.207, 0.372, 0.553], [0.164, 0.471, 0.558],
@@ -31,8 +33,8 @@ function nice(value) {
   return [1, 1.5, 2, 3, 4, 5, 7.5, 10].map((step) => step * power).find((candidate) => candidate >= value * 0.999);
 }
 
-export default {
-  mixins: [besideIt, exports3d],
+export default spoken({
+  mixins: [besideIt, exports3d, views3d],
   props: { state: Object },
   emits: ["act", "choose"],
   data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", digits: 1 }),
@@ -44,14 +46,18 @@ export default {
     elsewhere() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)).length; },
     ofSubject() { return (this.state.results || []).filter((r) => r.id === this.job?.id || this.same(r)); },
     ofOthers() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)); },
+    fileName() { // head-<subject>-<label>-<id>, of what every disk takes as a name
+      const told = [this.job.subject, this.job.capture].filter(Boolean).join("-").normalize("NFC").replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "").slice(0, 60);
+      return ["head", told, this.job.id.slice(-6)].filter(Boolean).join("-");
+    },
     distance() { return this.points.length === 2 ? MM * this.points[0].distanceTo(this.points[1]) : null; },
   },
   watch: {
-    "job.id"(id) { if (id) { this.strangers = false; this.load(id); this.readCameras(id); } },
+    "job.id"(id) { if (id) { this.keepPlace(); this.strangers = false; this.load(id); this.readCameras(id); } },
     sought(text) { clearTimeout(this.typed); this.typed = setTimeout(() => this.$emit("choose", { find: text }), 250); },
     surface() { if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture"; this.load(this.job.id); },
     through() { this.fit(); },
-    async colouring() { await this.paint(); this.paintMate(); this.shine(); }, other() { this.compare(); },
+    async colouring() { await this.paint(); this.paintMate(); this.shine(); }, other() { this.compare(); this.keepPlace(); },
     wire() { this.showWire(); this.paintMate(); this.draw(); },
     lights() { this.shine(); }, measuring(on) { if (!on) this.clearPoints(); },
   },
@@ -59,49 +65,59 @@ export default {
     <section class="page" aria-label="Result">
       <header class="wraps"><h1>Result</h1>
         <label class="line grow"><span v-if="job" class="muted small">Head</span><select v-if="job" :value="job.id" aria-label="Head" style="max-width: 24rem" @change="$emit('choose', { job: $event.target.value })"><optgroup label="Of this subject"><option v-for="r in ofSubject" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup><optgroup v-if="ofOthers.length" label="Of others"><option v-for="r in ofOthers" :key="r.id" :value="r.id">{{ headName(r) }}</option></optgroup></select><input v-if="state.total > 8" v-model="sought" id="find" type="search" maxlength="200" placeholder="Find a head" aria-label="Find heads" style="width: 9rem"></label>
-        <template v-if="job"><span v-if="surfaces.length > 1" class="group" role="group" aria-label="Surface"><button v-for="[name, title, k] in surfaces" :key="name" class="b" :aria-pressed="surface === name" @click="surface = name">{{ title }} <kbd>{{ k }}</kbd></button></span>
-        <span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="(!other || !!mateId) && colouring === name" @click="paintAs(name)">{{ title }} <kbd>{{ k }}</kbd></button></span>
+        <template v-if="job"><span v-if="surfaces.length > 1" class="group" role="group" aria-label="Surface"><button v-for="[name, title, k] in surfaces" :key="name" class="b" :aria-pressed="surface === name" @click="surface = name">{{ say(title) }} <kbd>{{ k }}</kbd></button></span>
+        <span class="group" role="group" aria-label="Colouring"><button v-for="[name, title, k] in colourings" :key="name" class="b" :aria-pressed="(!other || !!mateId) && colouring === name" @click="paintAs(name)">{{ say(title) }} <kbd>{{ k }}</kbd></button></span>
         <button class="b" :aria-pressed="wire" @click="wire = !wire">Wireframe <kbd>W</kbd></button>
         <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button></template></header>
       <div class="columns beside">
         <div class="panel view3d" ref="view">
-          <img v-if="picture" :src="picture.address" :alt="'Photograph of ' + through" :style="picture.style">
+          <img v-if="picture" :src="picture.address" :alt="say('Photograph of {name}', { name: through })" :style="picture.style">
           <canvas ref="canvas" v-show="job" :style="{ opacity: through ? 1 - fade : 1 }" tabindex="0" role="img" aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded" @keydown="turn" @pointerdown="press" @click="pick"></canvas>
-          <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ state.asked ? 'This job has no head' : 'No heads yet' }}</h2><p>{{ state.asked ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.' }}</p><a class="b main-action" :href="state.asked ? '/jobs' : '/captures'">{{ state.asked ? 'Go to jobs' : 'Go to captures' }}</a></div>
-          <div v-if="scale" class="scale" role="img" :aria-label="scale.title + ', 0 to ' + fixed(scale.most, digits) + ' mm'"><i :style="{ background: gradient }"></i><div><span>{{ scale.beyond ? '≥ ' : '' }}{{ fixed(scale.most, digits) }} mm</span><span>{{ fixed(scale.most / 2, digits) }}</span><span>0</span></div></div>
-          <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">median {{ fixed(scale.median, 2) }} mm, 95 % below {{ fixed(scale.p95, 2) }} mm</span></p>
-          <template v-if="split"><p class="small cut" id="left-head" style="position: absolute; left: .9rem; bottom: .8rem; max-width: 45%">{{ headName(job) }}</p><p class="small cut" id="right-head" style="position: absolute; left: 50%; bottom: .8rem; max-width: 45%">{{ headName(others.find(r => r.id === mateId) || job) }}</p></template>
-          <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts"><li v-for="[name, colour] in parts" :key="name"><i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ name }}</li></ul>
-          <p v-if="measuring" class="small" style="position: absolute; left: .9rem; bottom: 2.2rem" role="status">{{ points.length === 0 ? 'Click the first point' : points.length === 1 ? 'Click the second point' : '' }}<strong v-if="distance" class="mono">{{ distance.toFixed(1) }} mm, straight</strong></p>
-          <p v-if="loading || fault" :class="['small', { fault }]" style="position: absolute; right: .9rem; bottom: .8rem" role="status">{{ fault || 'Loading ...' }}</p>
+          <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ say(state.asked ? 'This job has no head' : 'No heads yet') }}</h2><p>{{ say(state.asked ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.') }}</p><a class="b main-action" :href="state.asked ? '/jobs' : '/captures'">{{ say(state.asked ? 'Go to jobs' : 'Go to captures') }}</a></div>
+          <div v-if="scale" class="scale" role="img" :aria-label="say('{title}, 0 to {most} mm', { title: scale.title, most: fixed(scale.most, digits) })"><i :style="{ background: gradient }"></i><div><span>{{ scale.beyond ? '≥ ' : '' }}{{ fixed(scale.most, digits) }} mm</span><span>{{ fixed(scale.most / 2, digits) }}</span><span>0</span></div></div>
+          <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">{{ say('median {median} mm, 95 % below {p95} mm', { median: fixed(scale.median, 2), p95: fixed(scale.p95, 2) }) }}</span></p>
+          <template v-if="split"><p class="small cut" id="left-head" style="position: absolute; left: .9rem; top: 3.4rem; max-width: 45%">{{ headName(job) }}</p><p class="small cut" id="right-head" style="position: absolute; left: 50%; top: 3.4rem; max-width: 45%">{{ headName(others.find(r => r.id === mateId) || job) }}</p></template>
+          <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts"><li v-for="[name, colour] in parts" :key="name"><i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ say(name) }}</li></ul>
+          <div v-if="job && loaded && !through" class="views" role="group" aria-label="Views"><button v-for="[name, title] in sides" :key="name" class="b small" :data-side="name" :aria-pressed="side === name" @click="lookFrom(name)">{{ say(title) }}</button><button v-if="canFill" class="b small" id="full" :aria-pressed="full" @click="fill">Full screen <kbd>F</kbd></button></div>
+          <p v-if="measuring" id="measured" class="told" role="status">{{ points.length === 0 ? say('Click the first point') : points.length === 1 ? say('Click the second point') : '' }}<strong v-if="distance" class="mono">{{ say('{distance} mm, straight', { distance: fixed(distance, 1) }) }}</strong></p>
+          <p v-if="loading || fault" :class="['small', { fault }]" style="position: absolute; right: .9rem; bottom: 3.4rem" role="status">{{ say(fault || 'Loading ...') }}</p>
           <span v-for="(pin, i) in pins" :key="i" class="pin small mono" :style="{ left: pin.x + 'px', top: pin.y + 'px', visibility: pin.shown ? 'visible' : 'hidden' }">{{ i ? 'B' : 'A' }}</span>
         </div>
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="About the head">
           <template v-if="job">
-            <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ w.message }}</li></ul>
-            <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? '' : 'ANOTHER PERSON? ' }}{{ headName(r) }}</option></select></label>
+            <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ say(w.message) }}</li></ul>
+            <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? headName(r) : say('ANOTHER PERSON? {head}', { head: headName(r) }) }}</option></select></label>
               <label v-if="other && other !== 'truth'" class="check small"><input type="checkbox" v-model="beside" id="beside">side by side, turned together</label>
-              <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">offer {{ elsewhere }} {{ elsewhere === 1 ? 'head' : 'heads' }} of other subjects, too</label>
+              <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">{{ say('offer {count} head of other subjects, too | offer {count} heads of other subjects, too', { count: elsewhere }) }}</label>
               <label v-if="cameras.length" class="field">Look through<select v-model="through" id="through"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
               <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
-            <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="'head-' + job.id.slice(-6) + '.zip'">All files (.zip)</a></div>
-            <div class="line wrap"><button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours" @click="savePicture">Picture (PNG)</button><template v-if="video"><button class="b" id="turntable" :disabled="!!through || loading" :title="through ? 'Not through a camera' : 'One turn, as the view shows the head'" @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? 'Turntable (video)' : 'Stop, ' + Math.round(100 * turning) + ' %' }}</button><select v-model.number="turnS" aria-label="Seconds of the turn"><option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option></select></template></div>
+            <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="fileName + '.zip'">All files (.zip)</a></div>
+            <div class="line wrap"><button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours" @click="savePicture">Picture (PNG)</button><template v-if="video"><button class="b" id="turntable" :disabled="!!through || loading" :title="say(through ? 'Not through a camera' : 'One turn, as the view shows the head')" @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? say('Turntable (video)') : say('Stop, {share} %', { share: Math.round(100 * turning) }) }}</button><select v-model.number="turnS" aria-label="Seconds of the turn"><option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option></select></template></div>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
             <h2 class="third">Measurements, mm</h2>
-            <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">&plusmn;</th><th class="num">other</th><th class="num">difference</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ m.name.replaceAll('_', ' ') }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>
+            <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">&plusmn;</th><th class="num">other</th><th class="num">difference</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ say(m.name.replaceAll('_', ' ')) }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>
             <h2 class="third">Fit</h2>
-            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">contour residual, {{ job.clear_views }} clear {{ job.clear_views === 1 ? 'view' : 'views' }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ job.method }}</td></tr><tr><td>level of detail</td><td class="num">{{ job.level }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
+            <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">{{ say('contour residual, {count} clear view | contour residual, {count} clear views', { count: job.clear_views }) }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ say(job.method) }}</td></tr><tr><td>level of detail</td><td class="num">{{ say(job.level) }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
           </template>
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { three: { THREE, GLTFLoader }, clock, fixed, size, span, parts: PARTS, gradient: `linear-gradient(to top, ${this.gradientStops().join(", ")})` }); },
-  mounted() { this.build(); window.addEventListener("keydown", this.key); if (this.job) { this.load(this.job.id); this.readCameras(this.job.id); } },
+  created() { Object.assign(this, { resumed: new URLSearchParams(location.search).get("other") || "", three: { THREE, GLTFLoader }, clock, fixed, size, span, parts: PARTS, gradient: `linear-gradient(to top, ${this.gradientStops().join(", ")})` }); },
+  mounted() { this.build(); window.addEventListener("keydown", this.key); if (this.job) { this.keepPlace(); this.load(this.job.id); this.readCameras(this.job.id); } },
   unmounted() { window.removeEventListener("keydown", this.key); this.observer?.disconnect(); this.renderer?.dispose(); },
   methods: {
     acted() {},
+    keepPlace() { // which head, and with which it is compared, outlive a reload
+      history.replaceState(history.state, "", `/result/${this.job.id}`);
+      keepAddress({ find: this.sought, other: this.other || this.resumed });
+    },
+    goOnComparing() {
+      const other = this.resumed, known = (this.state.results || []).find((r) => r.id === other);
+      this.resumed = "";
+      if (known || (other === "truth" && this.job.truth)) { this.strangers ||= !!known && !this.same(known); this.other = other; }
+    },
     build() {
       try { this.renderer = new THREE.WebGLRenderer({ canvas: this.$refs.canvas, antialias: true, alpha: true }); }
       catch (error) { this.fault = "This browser shows no 3D (WebGL is off). The downloads work."; return; }
@@ -109,7 +125,7 @@ export default {
       this.scene = new THREE.Scene();
       this.camera = new THREE.PerspectiveCamera(FOV_DEG, 1, 0.01, 10);
       this.controls = new OrbitControls(this.camera, this.$refs.canvas);
-      this.controls.addEventListener("change", this.draw);
+      this.controls.addEventListener("change", this.draw); this.controls.addEventListener("end", this.turned);
       this.material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85, metalness: 0, side: THREE.DoubleSide });
       this.flat = new THREE.MeshBasicMaterial({ vertexColors: true, side: THREE.DoubleSide }); // data are not lit: shading would shift them off the legend
       this.rig3d = new THREE.Group(); this.scene.add(this.rig3d); this.marks = new THREE.Group(); this.scene.add(this.marks);
@@ -141,8 +157,8 @@ export default {
     },
     same(r) { return r.capture_id === this.job?.capture_id || (!!r.session && r.session === this.job?.session) || (!!r.subject && r.subject === this.job?.subject); },
     headName(r) {
-      const how = [r.settings.method || "contour", r.settings.detail, r.model && r.model !== "default" && r.model].filter(Boolean).join(", ");
-      return [r.subject, r.capture || "capture " + clock(r.captured), how, "made " + clock(r.finished)].filter(Boolean).join(" · ");
+      const how = [say(r.settings.method || "contour"), say(r.settings.detail), r.model && r.model !== "default" && r.model].filter(Boolean).join(", ");
+      return [r.subject, r.captured ? r.capture || say("capture {time}", { time: clock(r.captured) }) : say(r.capture), how, say("made {time}", { time: clock(r.finished) })].filter(Boolean).join(" · ");
     },
     draw() {
       if (!this.renderer || this.waiting) return;
@@ -180,17 +196,15 @@ export default {
         this.repeated = head.asset.extras?.repeated_vertices || []; // at the texture's seam, after those of the .ply
         this.scene.add(this.mesh);
         this.mesh.geometry.computeBoundingSphere();
-        const { center, radius } = this.mesh.geometry.boundingSphere;
-        if (first) { // another surface of the same head is looked at from the same place
-          this.controls.target.copy(center);
-          this.camera.position.copy(center).add(new THREE.Vector3(radius * 1.1, radius * 0.25, radius * 4.1));
-          this.controls.minDistance = radius * 0.4; this.controls.maxDistance = radius * 12; this.controls.update();
-          this.shown = id;
-        }
+        const { radius } = this.mesh.geometry.boundingSphere;
+        this.controls.minDistance = radius * 0.4; this.controls.maxDistance = radius * 12;
+        if (first || this.side) this.lookFrom(this.side || "threequarter"); // where somebody turned it to, another surface of the head stays
+        this.shown = id;
         this.other = ""; this.kept = {};
         await this.paint();
+        if (first) this.goOnComparing();
         this.loaded = `${id} ${surface}`;
-      } catch (error) { this.fault = `The head cannot be shown: ${error.message}`; }
+      } catch (error) { this.fault = say("The head cannot be shown: {reason}", { reason: say(error.message) }); }
       this.loading = false;
     },
     paintAs(name) { if (!this.mateId) this.other = ""; this.colouring = name; this.paint(); },
@@ -203,7 +217,7 @@ export default {
         try {
           this.kept[name] = this.kept[name] || (await this.numbers(`${surface}.${name}.f32`));
           if (surface !== this.surface) return;
-          if (name === "quality") this.spread(this.kept.quality, "Standard deviation"); else this.paintParts(this.kept.part);
+          if (name === "quality") this.spread(this.kept.quality, say("Standard deviation")); else this.paintParts(this.kept.part);
         } catch (error) { this.fault = error.message; }
       } else if (this.colouring === "clay") {
         this.mesh.material = this.material;
@@ -232,7 +246,7 @@ export default {
       const wanted = this.other;
       try {
         const values = await this.numbers(`distance.f32?other=${wanted}`);
-        if (wanted === this.other && !this.mateId) this.spread(values, wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT");
+        if (wanted === this.other && !this.mateId) this.spread(values, say(wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT"));
       } catch (error) { this.fault = error.message; }
       this.loading = false; this.draw();
     },
@@ -278,7 +292,7 @@ export default {
       event.preventDefault();
       const s = new THREE.Spherical().setFromVector3(this.camera.position.clone().sub(this.controls.target));
       s.theta += by[0] * 0.08; s.phi = Math.min(3.0, Math.max(0.14, s.phi + by[1] * 0.08));
-      this.camera.position.setFromSpherical(s).add(this.controls.target); this.controls.update(); this.draw();
+      this.camera.position.setFromSpherical(s).add(this.controls.target); this.controls.update(); this.turned(); this.draw();
     },
     key(event) {
       if (typing(event) || !this.job) return;
@@ -286,8 +300,10 @@ export default {
       if (named) this.paintAs(named[0]);
       else if (solid && this.surfaces.length > 1) this.surface = solid[0];
       else if (key === "w") this.wire = !this.wire;
+      else if (key === "f" && this.canFill) this.fill();
+      else if (key === "v" && !this.through) this.nextSide();
       else if (key === "m") this.measuring = !this.measuring;
       else if (event.key === "Escape") this.measuring = false;
     },
   },
-};
+});

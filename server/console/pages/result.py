@@ -82,6 +82,8 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
             known = next(iter(result_lines(self.service, done)), None)
         if known is None:
             return {"results": results, "total": total, "job": None, "asked": self.choice.get("job")}
+        if self.choice.get("job") is None:  # a head that comes in meanwhile does not take the place of the shown one
+            self.choice["job"] = known["id"]
         theirs: list[ResultLine] = shared.get(
             ("results", "of", known["session"], known["capture_id"]), 1.0, lambda: heads_of_subject(self.service, known)
         )

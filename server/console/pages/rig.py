@@ -18,9 +18,7 @@ from server.console.pages.captures import (
     SessionEditForm,
     SessionForm,
     SessionLine,
-    WorkForm,
     capture_line,
-    chosen_work,
     discard,
     edit_consent,
     new_session,
@@ -28,7 +26,8 @@ from server.console.pages.captures import (
     sync_of,
 )
 from server.console.removal import removals
-from server.errors import Conflict, NotFound
+from server.console.work_form import WorkForm, chosen_work
+from server.errors import SEND_AGAIN, Conflict, NotFound
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
@@ -117,7 +116,7 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
     if not found:
         return None
     job = found[0]
-    told = job.error.detail if job.error is not None else job.notice
+    told = job.error.detail.removesuffix(SEND_AGAIN).strip() if job.error is not None else job.notice
     return {
         "id": job.id,
         "state": job.state,

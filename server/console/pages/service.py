@@ -16,7 +16,7 @@ from server.errors import Conflict
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.retention import clear_caches, sweep, upcoming
 from server.services.service import Service
-from server.services.storage_use import FAILED, StorageCount
+from server.services.storage_use import FAILED
 from server.settings import PREFIX, ServiceSettings
 from server.storage.job_index import JobQuery
 
@@ -72,7 +72,7 @@ class ServicePage(Page, component="service.js"):
             "admin": admin,
             "retention": setting_lines(service.settings),
             "upcoming": shared.get("upcoming", 5.0, lambda: [asdict(one) for one in upcoming(service)]),
-            "storage": shared.get("storage", 2.0, lambda: asdict(counted.of(service))),
+            "storage": shared.get("storage", 2.0, lambda: asdict(service.storage.use())),
         }
 
     async def _act(self, event: GenericEventArguments) -> None:
@@ -81,9 +81,6 @@ class ServicePage(Page, component="service.js"):
             pages.storage.user[KEY_ID] = self.caller.key
             self.run_method("show_key", self.secret)
             self.secret = None
-
-
-counted = StorageCount()
 
 
 def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
@@ -155,7 +152,7 @@ def revoke(page: ServicePage, event: Chosen) -> str:
 
 def clear(page: ServicePage, event: object) -> str:
     gone = clear_caches(page.service)
-    forget_storage()
+    forget_storage(page.service)
     return f"Cleared what was kept of {gone} {'capture' if gone == 1 else 'captures'}; what is asked for is made anew."
 
 
@@ -165,22 +162,23 @@ def remove_failed(page: ServicePage, event: object) -> str:
     if not ids:
         raise Conflict("none-failed", "No job failed or was cancelled.")
     remove_all_later(ids, jobs.delete, f"{len(ids)} jobs that failed or were cancelled", "admin")
-    forget_storage()
+    forget_storage(page.service)
     return f"{len(ids)} removed."
 
 
 def sweep_now(page: ServicePage, event: object) -> str:
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
-    forget_storage()
-    return "Swept: " + (", ".join(f"{count} {kind}" for kind, count in gone.items()) or "nothing was due") + "."
+    forget_storage(page.service)
+    told = ", ".join(f"{count} {kind}" for kind, count in gone.items()) or "nothing was due"
+    return f"Swept: {told}."
 
 
 def count_again(page: ServicePage, event: object) -> None:
-    forget_storage()
+    forget_storage(page.service)
 
 
-def forget_storage() -> None:
-    counted.forget()
+def forget_storage(service: Service) -> None:
+    service.storage.forget()
     shared.forget("storage", "upcoming")
 
 

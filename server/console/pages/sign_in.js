@@ -1,4 +1,6 @@
-export default {
+import { say, spoken } from "/console/static/language.js";
+
+export default spoken({
   emits: ["key"],
   data: () => ({ key: "", fault: "", busy: false }),
   template: `
@@ -7,13 +9,13 @@ export default {
         <h1>eigenhead</h1>
         <p class="muted">This service asks for an API key. It stays between this browser and the service.</p>
         <label class="field">API key<input ref="key" v-model="key" type="password" autocomplete="off" placeholder="eh_..." spellcheck="false"></label>
-        <p class="fault small" role="alert" style="min-height: 1.3em">{{ fault }}</p>
-        <button class="b main-action" :disabled="busy || !key" style="justify-content: center">{{ busy ? 'Looking ...' : 'Sign in' }}</button>
+        <p class="fault small" role="alert" style="min-height: 1.3em">{{ say(fault) }}</p>
+        <button class="b main-action" :disabled="busy || !key" style="justify-content: center">{{ say(busy ? 'Looking ...' : 'Sign in') }}</button>
       </form>
     </div>`,
-  mounted() { this.$refs.key.focus(); },
+  mounted() { document.title = say("Sign in") + " - eigenhead"; this.$refs.key.focus(); },
   methods: {
     send() { this.busy = true; this.fault = ""; this.$emit("key", this.key); },
     refuse(text) { this.busy = false; this.fault = text; this.key = ""; this.$nextTick(() => this.$refs.key.focus()); },
   },
-};
+});

@@ -1,5 +1,7 @@
 // Another head beside the shown one, seen by the same camera, so that both turn together; each lies in its head's frame.
 // A page that mixes it in has THREE and GLTFLoader as this.three, mesh, material, flat, colouring, other, numbers(), heat(), draw() and fit().
+import { say } from "/console/static/language.js";
+
 export const besideIt = {
   data: () => ({ beside: false, theirs: null, split: false }),
   computed: {
@@ -37,7 +39,7 @@ export const besideIt = {
         this.mateSkin = found.material.map ? new THREE.MeshStandardMaterial({ map: found.material.map, roughness: 0.85, metalness: 0, side: THREE.DoubleSide }) : null;
         this.split = true; this.fit();
         await this.paintMate();
-      } catch (error) { this.fault = `The other head cannot be shown: ${error.message}`; }
+      } catch (error) { this.fault = say("The other head cannot be shown: {reason}", { reason: say(error.message) }); }
       finally { this.loading = false; }
     },
     async paintMate() { // uncertainty by the scale of the shown head

@@ -1,5 +1,7 @@
 // What the 3D view shows as a picture, and a whole turn of it as a video, with the legend of colours that stand for
-// numbers. A page that mixes it in has renderOnce(), camera, controls, renderer, scale, gradientStops and job.
+// numbers. A page that mixes it in has renderOnce(), camera, controls, renderer, scale, gradientStops, job and fileName.
+import { fixed } from "/console/static/words.js";
+
 const FRAMES_A_SECOND = 30;
 const LAST_MS = 120; // until the last picture has reached the recorder
 const BITS_A_SECOND = 12e6;
@@ -32,14 +34,14 @@ export const exports3d = {
       this.gradientStops().forEach((colour, i, all) => ramp.addColorStop(i / (all.length - 1), colour));
       pen.fillStyle = ramp; pen.fillRect(right - rem, rem, rem, 10 * rem);
       pen.fillStyle = ground ? "#e8ebf0" : "#6b7686"; pen.font = `${rem}px sans-serif`; pen.textAlign = "right"; pen.textBaseline = "middle";
-      const digits = this.digits, end = (this.scale.beyond ? "≥ " : "") + this.scale.most.toFixed(digits) + " mm";
-      [[end, 1.5], [(this.scale.most / 2).toFixed(digits), 6], ["0", 10.5]].forEach(([text, at]) => pen.fillText(text, right - 1.5 * rem, at * rem));
+      const digits = this.digits, end = (this.scale.beyond ? "≥ " : "") + fixed(this.scale.most, digits) + " mm";
+      [[end, 1.5], [fixed(this.scale.most / 2, digits), 6], ["0", 10.5]].forEach(([text, at]) => pen.fillText(text, right - 1.5 * rem, at * rem));
       pen.textAlign = "left"; pen.fillText(this.scale.title, rem, 1.5 * rem);
     },
     async savePicture() {
       const paper = this.paper();
       this.compose(paper);
-      save(await new Promise((done) => paper.toBlob(done, "image/png")), `head-${this.job.id.slice(-6)}.png`);
+      save(await new Promise((done) => paper.toBlob(done, "image/png")), `${this.fileName}.png`);
     },
     async turntable() { // by the clock: a slow machine gives fewer pictures, not a slower turn
       const paper = this.paper(), start = this.camera.position.clone(), offset = start.clone().sub(this.controls.target), axis = this.camera.up, parts = [];
@@ -62,7 +64,7 @@ export const exports3d = {
       const whole = this.turning === 1;
       this.turning = null; this.controls.enabled = true;
       this.camera.position.copy(start); this.controls.update(); this.draw();
-      if (whole) save(new Blob(parts, { type: this.video }), `head-${this.job.id.slice(-6)}.${this.video.includes("mp4") ? "mp4" : "webm"}`);
+      if (whole) save(new Blob(parts, { type: this.video }), `${this.fileName}.${this.video.includes("mp4") ? "mp4" : "webm"}`);
     },
     stopTurning() { this.turning = null; },
   },

@@ -1,14 +1,15 @@
 // A list that the service pages, searches and sorts: what is sought stands in the address, and the arrows walk in it.
 // A page that uses it has fields() for the address, question() for the service, and listed, the rows with their ids.
+import { say, spoken } from "/console/static/language.js";
 import { keepAddress } from "/console/static/words.js";
 
 const TYPING_MS = 250;
 
-export const Pager = {
+export const Pager = spoken({
   props: { behind: Number, next: String, size: Number, total: Number },
   emits: ["back", "forward"],
-  template: `<div v-if="behind || next" class="line small pager"><button class="b" :disabled="!behind" @click="$emit('back')">Newer page</button><span class="muted grow" style="text-align: center" role="status">page {{ behind + 1 }}, {{ total }} in all</span><button class="b" :disabled="!next" @click="$emit('forward')">Next page</button></div>`,
-};
+  template: `<div v-if="behind || next" class="line small pager"><button class="b" :disabled="!behind" @click="$emit('back')">Newer page</button><span class="muted grow" style="text-align: center" role="status">{{ say('page {number}, {total} in all', { number: behind + 1, total }) }}</span><button class="b" :disabled="!next" @click="$emit('forward')">Next page</button></div>`,
+});
 
 export const paged = {
   data: () => ({ chosen: "", sought: new URLSearchParams(location.search).get("find") || "", behind: [], picking: false, picked: [] }),

@@ -1,10 +1,15 @@
 // Jobs that were begun in this tab: how far they are stands in the tab's title; a head that is ready opens on the page
 // where its job was begun, unless somebody types or decides something there, and is told of everywhere else.
-const KEPT = "eigenhead started", OPENED = "eigenhead opened";
+import { say } from "/console/static/language.js";
+
+const KEPT = "eigenhead started", OPENED = "eigenhead opened", LEFT = "eigenhead left";
 const TONES_HZ = [660, 880], TONE_S = 0.22, LOUDNESS = 0.04;
 const BUSY = "[role=dialog], [role=alertdialog], [data-shot], [data-holds]";
 
 const read = () => JSON.parse(sessionStorage.getItem(KEPT) || "[]");
+// The newest job that was begun on this page and is not done; a page that was left and comes back shows it again.
+export const begunHere = () => read().findLast((job) => job.opens && job.path === location.pathname && job.id !== sessionStorage.getItem(LEFT))?.id;
+export const leaveBegun = (id) => sessionStorage.setItem(LEFT, id);
 const written = (field) => field.matches?.("textarea, input:not([type=checkbox], [type=radio], [type=range], [type=file])");
 
 function chime() { // a browser that lets pages sound only after a click leaves it silent
@@ -31,8 +36,9 @@ export const started = {
     document.addEventListener("input", this.note, true); document.addEventListener("visibilitychange", this.seen);
     window.addEventListener("pointerdown", this.seen); window.addEventListener("keydown", this.seen);
     const opened = sessionStorage.getItem(OPENED);
-    if (opened && location.pathname.endsWith(opened)) { this.tell(); this.say("done", "This head was finished just now.", []); }
+    if (opened && location.pathname.endsWith(opened)) { this.tell(); this.announce("done", "This head was finished just now.", []); }
     sessionStorage.removeItem(OPENED);
+    this.entitle();
     if (this.mine.length) this.$emit("follow", this.mine.map((job) => job.id));
   },
   unmounted() {
@@ -48,12 +54,12 @@ export const started = {
       const job = this.mine.find((one) => one.id === id);
       if (!job) return;
       this.mine = this.mine.filter((one) => one.id !== id);
-      if (state === "failed") { this.tell("Job failed"); this.say("fault", `Job ${id.slice(-6)} failed.`, [], `/jobs?job=${id}`); }
+      if (state === "failed") { this.tell("Job failed"); this.announce("fault", say("Job {id} failed.", { id: id.slice(-6) }), [], `/jobs?job=${id}`); }
       if (state !== "succeeded") return;
       if (job.opens && job.path === location.pathname && !this.occupied()) {
         sessionStorage.setItem(KEPT, JSON.stringify(this.mine)); sessionStorage.setItem(OPENED, id);
         location.href = `/result/${id}`;
-      } else { this.tell(); this.say("done", "A head is ready.", [], `/result/${id}`); }
+      } else { this.tell(); this.announce("done", "A head is ready.", [], `/result/${id}`); }
     },
     occupied() {
       const at = document.activeElement;
@@ -68,7 +74,7 @@ export const started = {
     entitle() {
       const running = (this.followed || []).filter((job) => this.mine.some((one) => one.id === job.id)), page = this.links.find((link) => link.name === this.current)?.title;
       const share = running.length && running.reduce((sum, job) => sum + job.progress, 0) / running.length;
-      if (page) document.title = [this.news || (running.length ? `${Math.round(100 * share)} % ${page}` : page), "eigenhead"].join(" - ");
+      if (page) document.title = [this.news ? say(this.news) : running.length ? `${Math.round(100 * share)} % ${say(page)}` : say(page), "eigenhead"].join(" - ");
     },
     turnSound() { this.sound = !this.sound; localStorage.setItem("eigenhead-sound", this.sound ? "on" : "off"); if (this.sound) chime(); },
   },

@@ -1,50 +1,53 @@
 // What a capture is worth, in words: every fault with its camera and remedy, and the subject's outline in its picture.
+import { say, spoken } from "/console/static/language.js";
+import { fixed } from "/console/static/words.js";
+
 const WORDS = { good: "Good", usable: "Usable", poor: "Poor" };
 const KINDS = { good: "good", usable: "warn", poor: "fault" };
 const CODES = { moved: "moved", overexposed: "burnt out", blurred: "out of focus", setting: "setting not taken", plates: "no clean plates",
   empty: "nobody there", "cut-off": "head cut off", dark: "dark", "lights-off": "lamps off", view: "another view", swapped: "swapped" };
 
 export function verdictTag(capture) {
-  return capture.verdict ? { text: WORDS[capture.verdict], kind: KINDS[capture.verdict] } : { text: "not judged", kind: "" };
+  return capture.verdict ? { text: say(WORDS[capture.verdict]), kind: KINDS[capture.verdict] } : { text: say("not judged"), kind: "" };
 }
 
 // One line a fault; the same fault of several cameras is one line.
 export function faultLines(faults) {
   const lines = new Map();
   for (const fault of faults || []) {
-    const line = lines.get(fault.code) || { code: fault.code, title: CODES[fault.code] || fault.code, cameras: [], details: [], remedy: fault.remedy };
-    line.cameras.push(fault.camera || "all cameras");
-    line.details.push(fault.detail);
+    const line = lines.get(fault.code) || { code: fault.code, title: say(CODES[fault.code] || fault.code), cameras: [], details: [], remedy: say(fault.remedy) };
+    line.cameras.push(fault.camera || say("all cameras"));
+    line.details.push(say(fault.detail));
     lines.set(fault.code, line);
   }
   return [...lines.values()].map((line) => ({ ...line, details: [...new Set(line.details)] }));
 }
 
 export function faultsOf(capture, camera) {
-  return (capture.faults || []).filter((fault) => fault.camera === camera || fault.camera === null).map((fault) => CODES[fault.code] || fault.code);
+  return (capture.faults || []).filter((fault) => fault.camera === camera || fault.camera === null).map((fault) => say(CODES[fault.code] || fault.code));
 }
 
-export const Verdict = {
+export const Verdict = spoken({
   props: { capture: Object },
   computed: {
     tag() { return verdictTag(this.capture); },
     lines() { return faultLines(this.capture.faults); },
     sentence() {
       const named = new Set((this.capture.faults || []).map((fault) => fault.camera)), all = this.capture.cameras.length;
-      if (!this.capture.verdict) return "This capture was made before pictures were judged.";
-      if (this.capture.verdict === "good") return `All ${all} pictures are exposed, sharp and framed, and no camera moved.`;
-      if (named.has(null)) return "Something is wrong with all pictures: shoot again.";
-      const sound = `${all - named.size} of ${all} cameras are without a fault.`;
-      return this.capture.verdict === "usable" ? `${sound} Enough for a head; better ones are had by mending what is listed.` : `${sound} Too few for a sound head: mend what is listed and shoot again.`;
+      if (!this.capture.verdict) return say("This capture was made before pictures were judged.");
+      if (this.capture.verdict === "good") return say("All {all} pictures are exposed, sharp and framed, and no camera moved.", { all });
+      if (named.has(null)) return say("Something is wrong with all pictures: shoot again.");
+      const sound = say("{sound} of {all} cameras are without a fault.", { sound: all - named.size, all });
+      return this.capture.verdict === "usable" ? `${sound} ${say("Enough for a head; better ones are had by mending what is listed.")}` : `${sound} ${say("Too few for a sound head: mend what is listed and shoot again.")}`;
     },
   },
   template: `
     <div class="stack verdict" role="region" aria-label="Verdict" :data-verdict="capture.verdict || 'none'" style="gap: .35rem">
-      <div class="line wrap"><span class="tag" :class="tag.kind">{{ tag.text }}</span><span>{{ sentence }}</span><span v-if="capture.sync" class="muted small push" :class="{ warn: !capture.sync.good }">{{ capture.sync.text }}</span></div>
-      <ul v-if="lines.length" class="faults small"><li v-for="line in lines" :key="line.code" :data-fault="line.code"><strong class="warn">{{ line.cameras.join(', ') }}: {{ line.title }}.</strong> {{ line.details.slice(0, 3).join('; ') }}{{ line.details.length > 3 ? ' ...' : '' }}. <span>To do: {{ line.remedy }}.</span></li></ul>
-      <ul v-if="capture.warnings?.length" class="faults small" aria-label="Warnings"><li v-for="told in capture.warnings" :key="told.message" :data-warning="told.code" class="warn">{{ told.message }}</li></ul>
+      <div class="line wrap"><span class="tag" :class="tag.kind">{{ tag.text }}</span><span>{{ sentence }}</span><span v-if="capture.sync" class="muted small push" :class="{ warn: !capture.sync.good }">{{ say(capture.sync.text) }}</span></div>
+      <ul v-if="lines.length" class="faults small"><li v-for="line in lines" :key="line.code" :data-fault="line.code"><strong class="warn">{{ line.cameras.join(', ') }}: {{ line.title }}.</strong> {{ line.details.slice(0, 3).join('; ') }}{{ line.details.length > 3 ? ' ...' : '' }}. <span>{{ say('To do: {remedy}.', { remedy: line.remedy }) }}</span></li></ul>
+      <ul v-if="capture.warnings?.length" class="faults small" aria-label="Warnings"><li v-for="told in capture.warnings" :key="told.message" :data-warning="told.code" class="warn">{{ say(told.message) }}</li></ul>
     </div>`,
-};
+});
 
 export const Outline = {
   props: { view: Object, size: Array },
@@ -65,8 +68,8 @@ export const checksOf = {
     measures(id, camera) {
       const view = this.view(id, camera);
       if (!view) return "";
-      const parts = [view.subject && `subject ${Math.round(100 * view.subject.share)} %`, view.mean !== undefined && `exp ${Math.round(view.mean)}`,
-        view.blur_px !== undefined && view.blur_px !== null && `blur ${view.blur_px.toFixed(1)} px`];
+      const parts = [view.subject && say("subject {share} %", { share: Math.round(100 * view.subject.share) }), view.mean !== undefined && say("exp {mean}", { mean: Math.round(view.mean) }),
+        view.blur_px !== undefined && view.blur_px !== null && say("blur {blur} px", { blur: fixed(view.blur_px, 1) })];
       return parts.filter(Boolean).join(" · ");
     },
   },

@@ -1,4 +1,6 @@
 // What several pages share: keys, times, numbers.
+import { decimal, locale, say } from "/console/static/language.js";
+
 export function typing(event) {
   const target = event.target;
   return target.isContentEditable || /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName) || event.ctrlKey || event.metaKey || event.altKey;
@@ -8,30 +10,30 @@ export function clock(moment) {
   if (!moment) return "";
   const date = new Date(moment);
   const today = new Date().toDateString() === date.toDateString();
-  const time = date.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit", hour12: false });
-  return today ? time : `${date.toLocaleDateString([], { day: "numeric", month: "short" })} ${time}`;
+  const time = date.toLocaleTimeString(locale, { hour: "2-digit", minute: "2-digit", second: "2-digit", hour12: false });
+  return today ? time : `${date.toLocaleDateString(locale, { day: "numeric", month: "short" })} ${time}`;
 }
 
 export function span(seconds) {
   if (seconds === null || seconds === undefined) return "";
-  if (seconds < 60) return `${Math.max(0, seconds).toFixed(seconds < 10 ? 1 : 0)} s`;
+  if (seconds < 60) return `${fixed(Math.max(0, seconds), seconds < 10 ? 1 : 0)} s`;
   if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
   return `${Math.floor(seconds / 3600)} h ${Math.round((seconds % 3600) / 60)} min`;
 }
 
 export function size(bytes) {
-  return bytes > 1e9 ? `${(bytes / 1e9).toFixed(1)} GB` : bytes > 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.ceil(bytes / 1e3)} kB`;
+  return bytes > 1e9 ? `${fixed(bytes / 1e9, 1)} GB` : bytes > 1e6 ? `${fixed(bytes / 1e6, 1)} MB` : `${Math.ceil(bytes / 1e3)} kB`;
 }
 
 export function fixed(value, digits) {
-  return value === null || value === undefined ? "-" : Number(value).toFixed(digits);
+  return value === null || value === undefined ? "-" : decimal(Number(value).toFixed(digits));
 }
 
 const STAGES = { ingest: "taking the pictures in", read: "reading the pictures", segmentation: "finding silhouettes", alignment: "placing the head", fit: "fitting the head",
   texture: "colouring the head", evidence: "judging the fit", write: "writing the files", parts: "telling skin, hair and clothes apart", "fit again": "fitting the head again", depth: "measuring depths in the photographs", fine: "drawing the head to the photographs",
   bust: "closing the surface of the bust", atlas: "painting the texture", compiling: "compiling, once on this machine", done: "done", detection: "finding the board in the pictures", lenses: "estimating the lenses", "pose graph": "placing the cameras", bundle: "adjusting cameras and boards together", checks: "checking the result",
   features: "finding distinct points in the photographs", matches: "finding the same points in other photographs", structure: "placing the cameras", scale: "measuring the scale", silhouettes: "comparing silhouettes" };
-export function stageWords(stage) { return STAGES[stage] || stage; }
+export function stageWords(stage) { return say(STAGES[stage] || stage); }
 
 // The session that the operator works in, kept for the pages of this browser tab.
 export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
@@ -48,7 +50,7 @@ export function keepAddress(fields) {
 export function sessionName(session, all) {
   if (!session) return "";
   const twice = all.some((other) => other.id !== session.id && other.label === session.label);
-  return session.label ? session.label + (twice ? `, begun ${clock(session.created)}` : "") : clock(session.created);
+  return session.label ? session.label + (twice ? ", " + say("begun {time}", { time: clock(session.created) }) : "") : clock(session.created);
 }
 
 // Sends one file as the form part "file"; resolves with {status, document} and never rejects.

@@ -83,6 +83,84 @@ def test_what_is_shown_is_what_the_files_hold(
     v.check_clean()
 
 
+def test_views_from_fixed_sides_fit_the_head(browser: Browser, heads: RunningService, screenshots: Path) -> None:
+    """By the lamp at the subject's left: their left side is the brightest, their right one dark, and from the front
+    the half at the right of the picture is brighter. The ball keeps off the rims from every side, on either surface."""
+    v = visit(browser, heads.url)
+    page = v.go("/result")
+    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    page.get_by_label("Light").select_option("side")
+    page.locator("canvas").focus()
+    page.keyboard.press("g")
+    level, halves = {}, {}
+    for side in ("left", "front", "right", "top", "threequarter"):
+        page.locator(f"[data-side={side}]").click()
+        expect(page.locator(f"[data-side={side}]")).to_have_attribute("aria-pressed", "true")
+        page.wait_for_timeout(500)
+        found = pixels(page)
+        level[side], halves[side] = found.mean(), found[:, found.shape[1] // 2 :].mean() - found.mean()
+        assert_clear_of_rims(page)
+    assert level["left"] > level["front"] + 10 > level["right"] + 20
+    assert min(halves["front"], halves["top"]) > 5
+    page.locator("[data-side=left]").click()
+    page.keyboard.press("b")
+    page.wait_for_selector("canvas[data-loaded$=bust]", timeout=60_000)
+    page.wait_for_timeout(500)
+    assert_clear_of_rims(page)
+    assert abs(pixels(page).mean() - level["left"]) < 5, "the other surface is seen from the same side"
+    page.keyboard.press("ArrowLeft")  # on a button: the page stays as it is
+    page.locator("canvas").focus()
+    page.keyboard.press("ArrowLeft")
+    expect(page.locator("[data-side=left]")).to_have_attribute("aria-pressed", "false")
+    page.keyboard.press("v")
+    expect(page.locator("[data-side=front]")).to_have_attribute("aria-pressed", "true")
+    page.keyboard.press("f")
+    page.wait_for_function("document.fullscreenElement?.matches('.view3d')")
+    expect(page.locator("#full")).to_have_attribute("aria-pressed", "true")
+    page.keyboard.press("f")
+    page.wait_for_function("!document.fullscreenElement")
+    keep_widths(page, screenshots, "viewer-sides")
+    v.check_clean()
+
+
+def assert_clear_of_rims(page: Page) -> None:
+    shown = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("L"), float)
+    upper = shown[: round(0.9 * len(shown))]  # the row of buttons lies below
+    assert (shown > 60).mean() > 0.05, "there is a ball"
+    for rim in (upper[3], upper[:, 3], upper[:, -4]):
+        assert rim.max() < 60
+
+
+def test_a_head_and_its_comparison_outlive_a_reload_and_its_files_bear_its_name(
+    browser: Browser, heads: RunningService
+) -> None:
+    v = visit(browser, heads.url)
+    page = v.go("/result")
+    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    job = page.url.rpartition("/")[2]
+    with page.expect_download() as download:
+        page.locator("#all").click()
+    assert download.value.suggested_filename == f"head-Anna-{job[-6:]}.zip"
+    with page.expect_download() as download:
+        page.locator("#picture").click()
+    assert download.value.suggested_filename == f"head-Anna-{job[-6:]}.png"
+    page.locator("#strangers").check()
+    page.get_by_label("Compare with").select_option(index=2)
+    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=30_000)
+    page.reload()
+    expect(page.get_by_text("Distance to a head of ANOTHER SUBJECT")).to_be_visible(timeout=60_000)
+    assert page.url.startswith(f"{heads.url}/result/{job}?other=")
+    capture = httpx.get(heads.url + "/v1/captures").json()["captures"][0]["id"]
+    made = httpx.post(heads.url + "/v1/jobs", json={"capture_id": capture}).json()["id"]
+    with httpx.Client(base_url=heads.url, timeout=60) as http:
+        await_state(http, made, ("succeeded",))
+    expect(page.get_by_label("Compare with").locator("option")).to_have_count(4, timeout=30_000)
+    expect(page.locator("canvas")).to_have_attribute(
+        "data-loaded", f"{job} head"
+    )  # a newer one does not take its place
+    v.check_clean()
+
+
 def check_subjects(v: Visit, screenshots: Path) -> None:
     """A card a person with a picture of the newest head, which opens it."""
     page = v.go("/subjects")

@@ -25,8 +25,11 @@ from server.console.live_frame import LiveFrame
 from server.console.mount import path_below
 from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
+from server.console.work_form import chosen_work
 from server.errors import Conflict, Forbidden, NotFound, Unknown
 from server.services.keys import Keys
+from server.services.presets import settings_of
+from server.services.work import Work
 from server.settings import ServiceSettings
 from server.storage.events import JobEvent
 
@@ -252,6 +255,13 @@ def test_the_restart_form_becomes_settings() -> None:
     for wrong in ("{", "[1]"):
         with pytest.raises(InputError):
             chosen_settings({"more": wrong})
+
+
+def test_the_captures_form_becomes_work() -> None:
+    assert chosen_work({"id": "", "model": "", "method": "", "template": ""}) == Work(None, {})
+    work = chosen_work({"id": "", "model": "ict", "method": "texture", "template": "flame"})
+    assert work == Work("ict", {"outputs": {"formats": ["glb", "ply", "obj", "usdz"], "template": "flame"}})
+    assert settings_of("texture") == {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}}  # as it was
 
 
 def test_a_look_on_the_wire_holds_every_picture() -> None:

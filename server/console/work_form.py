@@ -1,0 +1,45 @@
+"""What a page asks before a job is sent: model, preset and template."""
+
+from typing import NotRequired, TypedDict, cast
+
+from server.console.page import Chosen
+from server.services.presets import PRESETS, settings_of
+from server.services.templates import templates_at_hand
+from server.services.work import Work
+
+
+class PresetLine(TypedDict):
+    id: str
+    title: str
+    explanation: str
+
+
+class TemplateLine(TypedDict):
+    """``models``: names of the one that carries it."""
+
+    name: str
+    models: list[str]
+
+
+class WorkForm(Chosen):
+    """``method`` is a preset's id."""
+
+    model: NotRequired[str | None]
+    method: NotRequired[str | None]
+    template: NotRequired[str | None]
+
+
+def preset_lines() -> list[PresetLine]:
+    return [{"id": p.id, "title": p.title, "explanation": p.explanation} for p in PRESETS]
+
+
+def template_lines() -> list[TemplateLine]:
+    return [{"name": found.name, "models": list(found.models)} for found in templates_at_hand() if found.models]
+
+
+def chosen_work(event: WorkForm) -> Work:
+    """Model, preset and template of the form; what is not chosen is the service's default."""
+    settings, template = dict(settings_of(event.get("method"))), event.get("template")
+    if template:
+        settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}
+    return Work(event.get("model") or None, settings)

@@ -1,0 +1,201 @@
+"""The pages in German, and that no word of theirs escapes the table.
+
+What of the table is missing or unused is told without a browser in ``tests/server/console/test_language.py``.
+"""
+
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, Route, expect
+
+from tests.support.browser import Visit, violations, visit
+from tests.support.services import RunningService, await_state, packed_capture, running_service, uploaded_capture
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service")
+
+# A table in which every text is its own translation, in brackets: what stands outside of brackets was never said.
+BRACKETS = """export default new Proxy({}, {
+  get: (_, text) => typeof text === "string" ? text.split(" | ").map((form) => `⟦${form}⟧`).join(" | ") : undefined,
+  ownKeys: () => [],
+});"""
+SHOWN = """() => {
+  const seen = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  const silent = "script, style, kbd, .mono, #esm-fallback, button[lang]";
+  while (walker.nextNode())
+    if (!walker.currentNode.parentElement.closest(silent)) seen.push(walker.currentNode.textContent);
+  for (const name of ["aria-label", "title", "placeholder", "alt"])
+    for (const at of document.querySelectorAll(`[${name}]`)) seen.push(at.getAttribute(name));
+  return seen.map((text) => text.trim()).filter(Boolean);
+}"""
+# Of what is shown: names of cameras, people and files, times, numbers with units, and names that are typed elsewhere.
+NAMES = (
+    r"cam\d+|eigenhead|EIGENHEAD_\w+|\w+\.(json|zip|glb|ply|obj|png|html)\b|subject \d|\b[0-9a-f]{6}\b"
+    r"|\b(px|mm|GB|MB|kB|min|IoU|cpu|Nov|Dec)\b"
+)
+# Whatever reaches beyond the window, unless it lies in something that scrolls; and what its words do not fit.
+OUTSIDE = """() => {
+  const scrolls = (at) => at && (/auto|scroll/.test(getComputedStyle(at).overflowX) || scrolls(at.parentElement));
+  const worded = "button, a.b, .tag, th, h1, h2:not(.cut), h3, .grow:not(.cut, .bar, .scroll, input, select)";
+  const found = [], tell = (what, at) => found.push(`${what}: ${at.outerHTML.slice(0, 120)}`);
+  for (const at of document.querySelectorAll(".page *")) {
+    const box = at.getBoundingClientRect();
+    if (!box.width || !box.height || at.closest(".unseen, svg, canvas")) continue;
+    if (box.right > innerWidth + 1 && !scrolls(at.parentElement)) tell("beyond the window", at);
+    if (at.matches(worded) && at.clientWidth && at.scrollWidth > at.clientWidth + 1) tell("does not fit", at);
+  }
+  return found;
+}"""
+
+
+def german(browser: Browser, service: RunningService) -> Visit:
+    context = browser.new_context(viewport={"width": 1366, "height": 768}, locale="de-DE")
+    return Visit(context.new_page(), service.url)
+
+
+def fill(service: RunningService, folder: Path) -> None:
+    capture = uploaded_capture(service, folder)
+    for settings in ({}, {"front": "fail"}):
+        httpx.post(service.url + "/v1/jobs", json={"capture_id": capture, "settings": settings})
+
+
+def misfits(page: Page, folder: Path, name: str) -> list[str]:
+    """At a desk's, a tablet's and a telephone's width: what does not fit, and what axe-core finds."""
+    found = []
+    for width, height in ((1366, 768), (1024, 768), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(400)
+        page.screenshot(path=folder / f"{name}-{width}.png")
+        found += [f"{name} at {width}: {told}" for told in (*page.evaluate(OUTSIDE), *violations(page))]
+    page.set_viewport_size({"width": 1366, "height": 768})
+    return found
+
+
+def test_every_page_fits_in_german(
+    browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
+) -> None:
+    v, found = german(browser, service), []
+    for state in ("empty", "filled"):
+        for path in PATHS:
+            page = v.go(path)
+            page.wait_for_timeout(1500)
+            assert page.evaluate("document.documentElement.lang") == "de"
+            found += misfits(page, screenshots, f"german-{state}{path.replace('/', '-').rstrip('-')}")
+        if state == "empty":
+            fill(service, tmp_path)
+    assert found == []
+    v.check_clean()
+
+
+def test_a_persons_heads_fit_in_german(browser: Browser, screenshots: Path, tmp_path: Path) -> None:
+    with running_service(tmp_path / "data", work="tests.support.ball_results:work", console="true") as running:
+        client = httpx.Client(base_url=running.url, timeout=60)
+        session = client.post("/v1/sessions", json={"label": "Anna"}).json()["id"]
+        for seed in range(2):
+            file = {"file": packed_capture(tmp_path, seed).read_bytes()}
+            capture = client.post("/v1/captures/uploads", files=file, data={"session": session}).json()["id"]
+            await_state(client, client.post("/v1/jobs", json={"capture_id": capture}).json()["id"], ("succeeded",))
+        v = german(browser, running)
+        page = v.go("/result")
+        page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+        page.keyboard.press("u")
+        expect(page.locator(".view3d").get_by_text("Standardabweichung")).to_be_visible()
+        found = misfits(page, screenshots, "german-head")
+        page.get_by_label("Vergleichen mit").select_option(index=1)
+        expect(page.get_by_text("Abstand zum anderen Kopf")).to_be_visible(timeout=30_000)
+        page.get_by_label("nebeneinander").check()
+        expect(page.locator("#left-head")).to_contain_text("Anna")
+        found += misfits(page, screenshots, "german-two-heads")
+        page = v.go("/result")
+        page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+        page.keyboard.press("b")
+        page.wait_for_selector("canvas[data-loaded$=bust]", timeout=60_000)
+        page.keyboard.press("p")
+        expect(page.get_by_label("Teile")).to_contain_text("Haar")
+        page = v.go("/subjects")
+        page.wait_for_timeout(1500)
+        found += misfits(page, screenshots, "german-anna")
+        assert found == []
+        v.check_clean()
+
+
+def test_the_language_is_the_browsers_until_one_is_chosen(
+    browser: Browser, service: RunningService, tmp_path: Path
+) -> None:
+    v = german(browser, service)
+    page = v.go("/captures")
+    expect(page.get_by_role("heading", name="Aufnahmen", level=1)).to_be_visible()
+    expect(page).to_have_title("Aufnahmen - eigenhead")
+    page.get_by_role("button", name="English").click()
+    expect(page.get_by_role("heading", name="Captures", level=1)).to_be_visible(timeout=30_000)
+    assert page.evaluate("document.documentElement.lang") == "en"
+    v.go("/jobs")
+    expect(page.get_by_role("heading", name="Jobs", level=1)).to_be_visible()  # it is kept
+    page.get_by_role("button", name="Deutsch").click()
+    expect(page.get_by_role("heading", name="Aufträge", level=1)).to_be_visible(timeout=30_000)
+    v.check_clean()
+    english = visit(browser, service.url).go("/captures")
+    expect(english.get_by_role("heading", name="Captures", level=1)).to_be_visible()
+    assert english.evaluate("document.documentElement.lang") == "en"
+
+
+def test_what_the_service_tells_is_german_too(browser: Browser, service: RunningService, tmp_path: Path) -> None:
+    fill(service, tmp_path)
+    v = german(browser, service)
+    page = v.go("/captures")
+    page.locator("#reconstruct").click()
+    expect(page.get_by_text("ist eingereiht. Zu verfolgen auf der Seite Aufträge.")).to_be_visible(timeout=30_000)
+    expect(page.get_by_text("GB frei")).to_be_visible(timeout=20_000)
+    understood = {
+        "Captured 11 pictures. Verdict: good.": "11 Bilder aufgenommen. Urteil: gut.",
+        "Queued 3 jobs. Watch them on the page Jobs.": "3 Aufträge eingereiht. Zu verfolgen auf der Seite Aufträge.",
+        "The job is failed; it has no result.": "Der Auftrag hat kein Ergebnis (Status: gescheitert).",
+        "cam03, cam04: the board was never near the rim of the picture: bring it there": (
+            "cam03, cam04: die Tafel war nie nahe am Bildrand: sie dorthin halten"
+        ),
+        "0.31 px in 4 held-out shots, 0.29 px in all": "0,31 px in 4 zurückgehaltenen Aufnahmen, 0,29 px in allen",
+        "squares are 1.0003 +- 0.0002 times as high as wide; enter measured_width_mm in board.toml to check the scale "
+        "itself": "Felder sind 1,0003 +- 0,0002 mal so hoch wie breit; measured_width_mm in board.toml eintragen, um "
+        "den Maßstab selbst zu prüfen",
+        "2 captures erased for good.": "2 Aufnahmen endgültig gelöscht.",
+        "nobody translates what a camera's maker says": "nobody translates what a camera's maker says",
+    }
+    say = "(texts) => import('/console/static/language.js').then(({ say }) => texts.map((text) => say(text)))"
+    assert dict(zip(understood, page.evaluate(say, [*understood]), strict=True)) == understood
+    shots = "[0, 1, 2].map((count) => say('{count} shot | {count} shots', { count }))"
+    counted = page.evaluate(f"import('/console/static/language.js').then(({{ say }}) => {shots})")
+    assert counted == ["0 Aufnahmen", "1 Aufnahme", "2 Aufnahmen"]
+    v.check_clean()
+
+
+def test_no_word_of_a_page_escapes_the_table(browser: Browser, service: RunningService, tmp_path: Path) -> None:
+    v, escaped, said = german(browser, service), [], 0
+    v.page.route("**/console/static/de.js", lambda route: _brackets(route))
+    for state in ("empty", "filled"):
+        for path in PATHS:
+            page = v.go(path)
+            page.keyboard.press("?")
+            page.wait_for_timeout(1500)
+            texts = page.evaluate(SHOWN)
+            said += sum("⟦" in text for text in texts)
+            escaped += [f"{state} {path}: {text}" for text in unsaid(page, texts)]
+        if state == "empty":
+            fill(service, tmp_path)
+    assert sorted(set(escaped)) == []
+    assert said > 1000  # of sixteen pages
+
+
+def _brackets(route: Route) -> None:
+    route.fulfill(body=BRACKETS, content_type="text/javascript")
+
+
+def unsaid(page: Page, texts: list[str]) -> list[str]:
+    """Those with words outside of brackets."""
+    strip = """([texts, names]) => texts.filter((text) => {
+      let rest = text, before;
+      do { before = rest; rest = rest.replace(/⟦[^⟦⟧]*⟧/g, " "); } while (rest !== before);
+      return /[A-Za-z]{3,}/.test(rest.replace(new RegExp(names, "g"), " "));
+    })"""
+    return page.evaluate(strip, [texts, NAMES])

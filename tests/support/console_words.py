@@ -1,0 +1,149 @@
+"""The words of the operator's pages, read from their source: what their components and the service's modules say."""
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from html import unescape
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+CONSOLE = ROOT / "server" / "console"
+PACKAGES = ("server", "calibration", "pipeline", "rig")
+
+# As in static/language.js: tags with quoted values, and the text between them.
+PARTS = re.compile(r"(<[^!](?:\"[^\"]*\"|[^\">])*>)|([^<]+)")
+READ_OUT = re.compile(r"\s(?:aria-label|title|placeholder|alt|label)=\"([^\"]+)\"")
+EXPRESSION = re.compile(r"\s(?:[:@]|v-)[\w.:-]+=\"([^\"]*)\"")
+INTERPOLATION = re.compile(r"\{\{(.*?)\}\}", re.DOTALL)
+
+TOKEN = re.compile(
+    r"""(?P<comment>//[^\n]*|/\*.*?\*/)
+      | (?P<regex>(?<=[(,=:\[!&|?+;{}\n ])/(?![/*\s])(?:\\.|\[(?:\\.|[^\]\n])*\]|[^/\n\\])+/[a-z]*)
+      | (?P<string>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')
+      | (?P<tick>`)""",
+    re.VERBOSE | re.DOTALL,
+)
+
+
+@dataclass
+class Component:
+    """What stands in one script: ``literals`` of its code and of expressions in its markup; ``markup``: words between
+    tags and in attributes that are read out; ``mixed``: words beside an interpolation, which nobody can translate."""
+
+    literals: set[str] = field(default_factory=set)
+    markup: set[str] = field(default_factory=set)
+    mixed: set[str] = field(default_factory=set)
+
+
+def component(script: str) -> Component:
+    found = Component()
+    for literal in literals_of(script):
+        if "<" in literal and re.search(r"<\w+[\s>]", literal):
+            _read_markup(literal, found)
+        else:
+            found.literals.add(literal)
+    return found
+
+
+def literals_of(script: str) -> Iterator[str]:
+    """String literals and template literals; a value within the latter is written ``{}``, and its literals follow."""
+    at = 0
+    while match := TOKEN.search(script, at):
+        at = match.end()
+        if match["string"]:
+            yield _unquoted(match["string"])
+        elif match["tick"]:
+            text, inner, at = _template(script, at)
+            yield text
+            for code in inner:
+                yield from literals_of(code)
+
+
+def _template(script: str, at: int) -> tuple[str, list[str], int]:
+    text, inner = "", []
+    while script[at] != "`":
+        if script[at] == "\\":
+            text, at = text + script[at : at + 2], at + 2
+        elif script.startswith("${", at):
+            end = _closing(script, at + 2)
+            inner.append(script[at + 2 : end])
+            text, at = text + "{}", end + 1
+        else:
+            text, at = text + script[at], at + 1
+    return text, inner, at + 1
+
+
+def _closing(script: str, at: int) -> int:
+    depth = 1
+    while depth:
+        if script[at] in "\"'":
+            at = script.index(script[at], at + 1)
+        elif script[at] == "`":
+            at = _template(script, at + 1)[2] - 1
+        depth += {"{": 1, "}": -1}.get(script[at], 0)
+        at += 1
+    return at - 1
+
+
+def _unquoted(literal: str) -> str:
+    return re.sub(r"\\(.)", r"\1", literal[1:-1])
+
+
+def _read_markup(markup: str, found: Component) -> None:
+    for tag, text in PARTS.findall(markup):
+        for code in EXPRESSION.findall(tag):
+            found.literals.update(literals_of(unescape(code)))
+        found.markup.update(words for words in READ_OUT.findall(tag) if is_words(words))
+        for code in INTERPOLATION.findall(text):
+            found.literals.update(literals_of(code))
+        around = unescape(INTERPOLATION.sub("{}", text))
+        if is_words(around.replace("{}", " ")):
+            (found.mixed if "{}" in around else found.markup).add(" ".join(text.split()))
+
+
+NAMES = frozenset(["px", "mm", "eigenhead", "IoU"])
+
+
+def is_words(text: str) -> bool:
+    """Whether a text between tags is more than signs, letters, units and names."""
+    return any(word not in NAMES for word in re.findall(r"[A-Za-z]{2,}", unescape(text)))
+
+
+@cache
+def german() -> dict[str, str]:
+    """The table. Its lines are those of JSON, but for comments and the comma after the last."""
+    lines = (CONSOLE / "static" / "de.js").read_text().splitlines()
+    pairs = [json.loads(f"{{{line.strip().rstrip(',')}}}") for line in lines if line.lstrip().startswith('"')]
+    found = {key: value for pair in pairs for key, value in pair.items()}
+    assert len(found) == len(pairs), "an English text stands in the table twice"
+    return found
+
+
+def sentences(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and text of every string of a Python module but documents; a formatted value is written ``{}``."""
+    tree = ast.parse(path.read_text())
+    within = set[int]()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            within |= {id(value) for value in node.values}
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            within.add(id(node.value))
+    for node in ast.walk(tree):
+        if id(node) not in within and (text := _text(node)) is not None:
+            yield getattr(node, "lineno", 0), text
+
+
+def _text(node: ast.AST) -> str | None:
+    if isinstance(node, ast.Constant):
+        return node.value if isinstance(node.value, str) else None
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(value.value) if isinstance(value, ast.Constant) else "{}" for value in node.values)
+    return None
+
+
+def opened(text: str) -> str:
+    """``{1} of {2}`` as the source has it: ``{} of {}``."""
+    return re.sub(r"\{#?\d\}", "{}", text)
