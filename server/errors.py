@@ -64,10 +64,13 @@ class DiskFull(Refused):
         super().__init__("disk-full", detail)
 
 
+SEND_AGAIN = "Mend what 'errors' lists and send it again."
+
+
 def unusable_input(error: InputError) -> Unusable:
     """An InputError as a refusal: its subject becomes part of the kind."""
     kind = "invalid-" + ("".join(c for c in error.subject.split(".")[0] if c.isalnum() or c == "-").lower() or "input")
     count = len(error.faults)
     faults = "1 fault" if count == 1 else f"{count} faults"
-    detail = f"{error.subject}: {faults} found. Mend what 'errors' lists and send it again."
+    detail = " ".join([f"{error.subject}: {faults} found.", SEND_AGAIN])
     return Unusable(kind, detail, error.faults)

@@ -4,7 +4,7 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -75,6 +75,23 @@ def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str
         return value
 
     return check
+
+
+def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """What a shell offers for the begun word of such an option."""
+    return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]  # typer tells by name
+
+
+def chosen(help_text: str, choices: Callable[[], tuple[str, ...]], *names: str) -> Any:
+    """An option that takes one of ``choices``: asked for when it is given, or completed."""
+    return typer.Option(*names, help=help_text, callback=one_of(choices), autocompletion=completing(choices))
+
+
+def model_names() -> tuple[str, ...]:
+    """Of the head models at hand."""
+    from pipeline.eigenheads.model_names import list_models
+
+    return tuple(list_models())
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, Overwrite, answer, one_of, prepare_file, progress_bar, warn, wrong_usage
+from server.cli.answers import Json, Overwrite, answer, chosen, prepare_file, progress_bar, warn, wrong_usage
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -16,6 +16,12 @@ def _sources() -> tuple[str, ...]:
 
 def _lenses() -> tuple[str, ...]:
     return ("one", "each")
+
+
+def _formats() -> tuple[str, ...]:
+    from rig.formats.cameras_file import FORMATS
+
+    return FORMATS
 
 
 @app.command(epilog="Example: eigenhead board --kind charuco --squares 9x6 --square-mm 25 --out board.pdf")
@@ -59,15 +65,13 @@ def calibrate(
     ],
     out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
     board: Annotated[Path | None, typer.Option(help="The board.toml.", exists=True, dir_okay=False)] = None,
-    source: Annotated[
-        str, typer.Option("--from", help="board, or scene: photographs of anything.", callback=one_of(_sources))
-    ] = "board",
+    source: Annotated[str, chosen("board, or scene: photographs of anything.", _sources, "--from")] = "board",
     scale: Annotated[
         Path | None, typer.Option(help="From a scene: a known length, scale.json.", exists=True, dir_okay=False)
     ] = None,
     lenses: Annotated[
         str | None,
-        typer.Option(help="From a scene: one (all of one camera) or each; guessed.", callback=one_of(_lenses)),
+        chosen("From a scene: one (all of one camera) or each; guessed.", _lenses),
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
@@ -178,18 +182,18 @@ def convert(
     ],
     to: Annotated[
         str,
-        typer.Option(
-            help="eigenhead, colmap, colmap-text, caliscope, aniposelib, metashape, realitycapture, "
-            "realitycapture-csv, nerfstudio, opencv-yaml or blender."
+        chosen(
+            "eigenhead, colmap, colmap-text, caliscope, aniposelib, metashape, realitycapture, "
+            "realitycapture-csv, nerfstudio, opencv-yaml or blender.",
+            _formats,
         ),
     ] = "eigenhead",
     json_out: Json = False,
 ) -> None:
     """Convert calibrations to and from other programs."""
     from rig.errors import InputError
-    from rig.formats.cameras_file import FORMATS, NO_RIG, find_rig_file, read_rig_file, write_rig_file
+    from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, write_rig_file
 
-    one_of(lambda: FORMATS)(to)
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:
         raise InputError(str(source), [NO_RIG])

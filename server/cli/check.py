@@ -16,7 +16,7 @@ from rig.formats.capture_folder import capture_root, read_capture
 from rig.formats.work_size import WORK_PIXELS
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
-from server.tasks.ingest import check_capture, filed_by_serial
+from server.tasks.ingest import check_capture, filed_by_other_names
 from server.tasks.photographs import SCALE, photographs_alone
 from server.tasks.prepare import prepare_kernels
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pipeline.settings import Settings
 
 Report = Callable[[str, float], None]
+RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 
 
 class Warned(TypedDict):
@@ -70,7 +71,7 @@ def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Ch
 @contextmanager
 def _named_by_camera(root: Path) -> Iterator[Path]:
     """The folder, or links to its files under the names of the cameras that took them. Raises InputError."""
-    filed = filed_by_serial(root)
+    filed = filed_by_other_names(root)
     names = {path: name for files in filed.values() for name, path in files.items()}
     if not names:
         yield root
@@ -100,7 +101,10 @@ def _told_by_photographs(folder: Path) -> tuple[list[str], list[str]]:
     )
     given = [kind for kind in ("masks", "background") if (root / kind).is_dir()]
     masks = f"{given[0]}/ tells the subject" if given else "the subject will be found from the photographs"
-    return list(names), [f"no cameras.json: {len(names)} photographs will be calibrated from the scene", scale, masks]
+    aside = [path.name for path in sorted(root.iterdir()) if path.suffix in RIG_SUFFIXES and path.name != SCALE]
+    unread = [f"{name} will not be read: it is no rig's file of a known program" for name in aside]
+    begun = f"no cameras.json: {len(names)} photographs will be calibrated from the scene"
+    return list(names), [begun, *unread, scale, masks]
 
 
 def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[Warned]:

@@ -15,7 +15,9 @@ from server.cli.answers import (
     Overwrite,
     Overwrites,
     answer,
-    one_of,
+    chosen,
+    completing,
+    model_names,
     prepare_file,
     progress_bar,
     warn,
@@ -25,8 +27,8 @@ from server.cli.answers import (
 app = typer.Typer(rich_markup_mode=None)
 
 
-def _of_setting(name: str) -> Callable[[str | None], str | None]:
-    """A callback of an option that takes what a setting of the pipeline may be."""
+def _of_setting(name: str) -> Callable[[], tuple[str, ...]]:
+    """What a setting of the pipeline may be."""
 
     def choices() -> tuple[str, ...]:
         from pipeline.settings import Settings
@@ -34,10 +36,10 @@ def _of_setting(name: str) -> Callable[[str | None], str | None]:
         options = get_type_hints(Settings)[name]
         return tuple(v for option in (options, *get_args(options)) for v in get_args(option) if isinstance(v, str))
 
-    return one_of(choices)
+    return choices
 
 
-def _of_output(name: str) -> Callable[[str | None], str | None]:
+def _of_output(name: str) -> Callable[[], tuple[str, ...]]:
     """The same of a setting of the outputs."""
 
     def choices() -> tuple[str, ...]:
@@ -45,7 +47,13 @@ def _of_output(name: str) -> Callable[[str | None], str | None]:
 
         return get_args(get_type_hints(OutputSettings)[name])
 
-    return one_of(choices)
+    return choices
+
+
+def _templates() -> tuple[str, ...]:
+    from pipeline.templates.names import list_templates
+
+    return tuple(list_templates())
 
 
 def _formats(value: str | None) -> str | None:
@@ -63,28 +71,39 @@ def _formats(value: str | None) -> str | None:
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
-    method: Annotated[str | None, typer.Option(help="contour or simplex.", callback=_of_setting("method"))] = None,
-    model: Annotated[str | None, typer.Option(help="A model's name or file.")] = None,
-    front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
-    detail: Annotated[
-        str | None, typer.Option(help="span, kernel, photo or fine.", callback=_of_setting("detail"))
+    method: Annotated[str | None, chosen("contour (the default) or simplex.", _of_setting("method"))] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
     ] = None,
-    surface: Annotated[str | None, typer.Option(help="head, bust or both.", callback=_of_output("surface"))] = None,
+    front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
+    detail: Annotated[str | None, chosen("span, kernel, photo or fine (the default).", _of_setting("detail"))] = None,
+    surface: Annotated[str | None, chosen("head, bust or both (the default).", _of_output("surface"))] = None,
     formats: Annotated[
         str | None,
-        typer.Option(help="Of the head: glb, ply, obj, usdz, stl, 3mf, with commas between.", callback=_formats),
+        typer.Option(
+            help="Of the head: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.", callback=_formats
+        ),
     ] = None,
     delight: Annotated[
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
     ] = False,
     obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
     atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
+    normal_map: Annotated[
+        bool, typer.Option("--normal-map", help="head.glb of few triangles, with a normal map of what they leave out.")
+    ] = False,
     neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
     morphs: Annotated[
         bool, typer.Option("--morphs", help="Write posed.glb too, with morph targets under Apple's names.")
     ] = False,
     template: Annotated[
-        str | None, typer.Option(help="Write head-NAME.obj too, in the vertex order of this template.", metavar="NAME")
+        str | None,
+        typer.Option(
+            help="Write head-NAME.obj too, in the vertex order of this template.",
+            metavar="NAME",
+            autocompletion=completing(_templates),
+        ),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
@@ -93,7 +112,8 @@ def reconstruct(
     """Reconstruct one capture without the service."""
     from server.cli.reconstruct_local import reconstruct_locally, settings_document
 
-    switches = {"obj": obj, "atlas": atlas, "delight": delight, "neutral": neutral, "morphs": morphs}
+    switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
+    switches |= {"neutral": neutral, "morphs": morphs}
     outputs: dict[str, object] = {name: True for name, asked in switches.items() if asked}
     outputs |= {"surface": surface} if surface else {}
     outputs |= {"template": template} if template else {}
@@ -103,7 +123,8 @@ def reconstruct(
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
     for warning in written["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
-    made = [out / name for name in ("head.ply", "bust.ply", f"head-{template}.obj") if (out / name).is_file()]
+    names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # as they should be looked at
+    made = [out / name for name in names if (out / name).is_file()]
     answer(written, json_out, [str(path) for path in made])
 
 

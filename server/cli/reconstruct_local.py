@@ -47,12 +47,14 @@ def reconstruct_locally(
     capture: Path, out: Path, *, model: str | None, settings: Mapping[str, object], report: Report
 ) -> "ReportDocument":
     """Reconstructs a capture folder or archive into ``out`` and returns report.json; cameras and masks that had to be
-    found are kept in ``out``, whatever comes after. What can be wrong with settings,
+    found are kept in ``out``, whatever comes after. What can be wrong with settings, model, template,
     capture and ``out`` is found before anything heavy is loaded."""
     from pipeline.settings import settings_from_document
+    from pipeline.templates.header import check_template
 
     share_one_heap()
     chosen = settings_from_document(settings)
+    check_template(chosen.outputs.template, model or "default")
     with _result_folder(out) as fresh, folder_of(capture) as folder:
         _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)
         document = json.loads((fresh / "report.json").read_text(encoding="utf-8"))

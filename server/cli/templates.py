@@ -77,17 +77,17 @@ def _told(figures: Mapping[str, float]) -> list[str]:
 @template_app.command("list", epilog="Example: eigenhead template list")
 def template_list(data: Data = None, json_out: Json = False) -> None:
     """List the templates at hand, and the models that carry them."""
+    from pipeline.templates.header import BadTemplate, read_header
     from pipeline.templates.names import list_templates
-    from pipeline.templates.template_file import BadTemplate, read_template
 
     found, lines = {}, []
     for name, path in list_templates().items():
         try:
-            template = read_template(path)
+            template = read_header(path)
         except BadTemplate as error:
             found[name], told = {"file": str(path), "fault": str(error)}, "damaged"
         else:
-            found[name] = {"file": str(path), "model": template.model_name, "vertices": len(template.carrier.rest)}
+            found[name] = {"file": str(path), "model": template.model_name, **template.figures}
             told = template.model_name
         lines.append(f"{name}  {told}  {path}")
     answer({"templates": found}, json_out, lines)

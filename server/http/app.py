@@ -12,8 +12,9 @@ from fastapi.middleware.cors import CORSMiddleware
 from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.http.linger import Linger
 from server.http.openapi import describe, operation_name
-from server.http.routes import calibrations, captures, jobs, operations, rig, sessions, uploads
+from server.http.routes import calibrations, captures, jobs, operations, rig, sessions, storage, uploads
 from server.metrics import Metrics
 from server.services.health import check_egl
 from server.services.retention import sweep
@@ -58,7 +59,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
         redoc_url=None,
         generate_unique_id_function=operation_name,
     )
-    routers = [module.router for module in (captures, calibrations, jobs, sessions, uploads, rig, operations)]
+    routers = [module.router for module in (captures, calibrations, jobs, sessions, uploads, rig, storage, operations)]
     for router in routers:
         app.include_router(router)
     problems.install(app, [route for router in routers for route in router.routes if isinstance(route, APIRoute)])
@@ -73,6 +74,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
             expose_headers=EXPOSED,
         )
     app.add_middleware(Watch, metrics=metrics)
+    app.add_middleware(Linger)  # outside Watch, which times the answer and not the client
     describe(app)
     return app
 

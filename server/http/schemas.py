@@ -46,6 +46,7 @@ class NewCapture(Received):
     session: Id | None = None
     label: Text = ""
     expression: Text = ""
+    tags: Tags = Field(default_factory=list)
     seed: int | None = Field(None, ge=0, lt=2**31, description="subject and noise of the simulated studio")
     board: bool = Field(False, description="of the calibration board: needs no calibration, cannot be reconstructed")
 
@@ -57,6 +58,7 @@ class NewImport(Received):
     session: Id | None = None
     label: Text = ""
     expression: Text = ""
+    tags: Tags = Field(default_factory=list)
 
 
 class SessionEdit(Received):

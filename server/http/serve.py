@@ -38,8 +38,12 @@ class WorkerProcess:
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
+    def expect_end(self) -> None:
+        """From now on a worker that ends is no fault: a signal to all of a group or a container ends it, too."""
         self._stop.set()
+
+    def close(self) -> None:
+        self.expect_end()
         process = self._process
         if process.stdin is not None:
             process.stdin.close()
@@ -110,6 +114,8 @@ def _serve(settings: ServiceSettings, sock: socket.socket, worker: bool, ready: 
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
             self.interrupted = self.interrupted or sig == signal.SIGINT
+            if beside is not None:
+                beside.expect_end()
             super().handle_exit(sig, frame)
 
     server = Server(config)

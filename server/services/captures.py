@@ -17,7 +17,7 @@ from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs, refuse_board
 from server.services.records import Found
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
-from server.services.tags import checked_tags
+from server.services.tags import checked_tags, typed_tags
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
@@ -36,17 +36,19 @@ class About:
     session: str | None = None
     label: str = ""
     expression: str = ""
+    tags: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, fields: Mapping[str, str | None]) -> "About":
-        """From a form. Raises InputError."""
+        """From a form, in which commas stand between tags. Raises InputError."""
         names = ("session", "label", "expression")
         faults = [
             f"{name}: longer than {TEXT_MOST} characters" for name in names if len(fields.get(name) or "") > TEXT_MOST
         ]
         if faults:
             raise InputError("form", faults)
-        return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "")
+        tags = typed_tags(fields.get("tags") or "")
+        return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "", tags)
 
 
 class Captures:
@@ -265,6 +267,7 @@ class Captures:
             verdict=None if content.board else verdict_of(faults, [camera.name for camera in content.cameras]),
             faults=faults,
             warnings=content.warnings,
+            tags=about.tags,
         )
         self._store.add_capture(folder, record)
         return record

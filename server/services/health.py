@@ -41,7 +41,7 @@ def _database(service: Service) -> Check:
 def _disk(service: Service) -> Check:
     free, spare = service.store.free_bytes(), service.settings.free_bytes
     detail = f"{free / 1e9:.1f} GB free; uploads and jobs leave {spare / 1e9:.1f} GB"
-    return Check(ok=free > spare, detail=detail if free > spare else detail + ": delete captures or jobs")
+    return Check(ok=free > spare, detail=detail if free > spare else f"{detail}: delete captures or jobs")
 
 
 def _workers(service: Service) -> Check:

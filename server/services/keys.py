@@ -7,7 +7,9 @@ hash would add nothing. Without keys the service answers only to its own machine
 import hashlib
 import hmac
 import secrets
+import shlex
 from dataclasses import dataclass
+from pathlib import Path
 
 import sqlalchemy as sa
 
@@ -23,10 +25,11 @@ LOCAL = "local"
 class KeylessAddress(EigenheadError):
     """Listening to the network without a key."""
 
-    def __init__(self, where: str) -> None:
+    def __init__(self, where: str, data: Path) -> None:
         super().__init__(
             f"refusing to listen on {where} without an API key: anybody there could fetch faces. "
-            "Make one with `eigenhead keys add NAME`, or listen on 127.0.0.1 without a public URL"
+            f"Make one with `eigenhead keys add NAME --data {shlex.quote(str(data))}`, or listen on 127.0.0.1 without "
+            "a public URL"
         )
 
 
@@ -96,7 +99,7 @@ class Keys:
 def check_address(settings: ServiceSettings, keys: Keys) -> None:
     """Raises KeylessAddress before the service listens where it must not."""
     if not settings.is_private and not keys.any():
-        raise KeylessAddress(settings.public_url or settings.host)
+        raise KeylessAddress(settings.public_url or settings.host, settings.data)
 
 
 def _digest(secret: str) -> str:

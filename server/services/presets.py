@@ -30,9 +30,9 @@ PRESETS = (
     Preset("head", "Head only", "The head in full detail, without hair and clothes.", {"outputs": {"surface": "head"}}),
     Preset(
         "texture",
-        "With texture",
-        "As Standard, and a texture image for renderers and games. Takes a minute longer.",
-        {"outputs": {"atlas": True}},
+        "For renderers",
+        "As Standard, and the textured head as OBJ and USDZ, too: for renderers, games and telephones.",
+        {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}},
     ),
     Preset(
         "simplex",

@@ -13,6 +13,7 @@ from server.services.keys import Keys
 from server.services.records import Calibration, Job, RigState
 from server.services.rigs import RigBackend, open_rig
 from server.services.sessions import Sessions
+from server.services.storage_use import StorageCount
 from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.services.webhooks import Webhooks
@@ -51,6 +52,7 @@ class Service:
     captures: Captures
     sessions: Sessions
     calibrations: Calibrations
+    storage: StorageCount
     metrics: Metrics
     known: dict[str, Check]  # findings that are made once
 
@@ -112,6 +114,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
         captures=Captures(store, jobs, rig, children, settings, library),
         sessions=Sessions(store, jobs, library),
         calibrations=Calibrations(store, jobs.client, settings.queue, jobs.events),
+        storage=StorageCount(store, jobs, settings),
         keys=Keys(engine),
         webhooks=Webhooks(engine, settings.webhook_origins),
         uploads=ResumableUploads(store, settings),

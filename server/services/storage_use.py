@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from server.services.jobs import STATUSES
-from server.services.service import Service
+from server.services.jobs import STATUSES, Jobs
+from server.settings import ServiceSettings
 from server.storage.job_index import JobQuery
+from server.storage.store import Store
 
 COUNT_AGAIN_S = 300.0  # between two looks through the data folder, which of a large one take long
 FAILED = (*STATUSES["failed"], *STATUSES["cancelled"])
@@ -52,25 +53,26 @@ class StorageUse:
 class StorageCount:
     """Looks through the data folder in a thread of its own, when asked and the last look is old."""
 
-    def __init__(self) -> None:
+    def __init__(self, store: Store, jobs: Jobs, settings: ServiceSettings) -> None:
+        self._store, self._jobs, self._settings = store, jobs, settings
         self._looking = threading.Lock()
         self._found: tuple[KindOfUse, ...] | None = None
         self._at: float | None = None
 
-    def of(self, service: Service) -> StorageUse:
+    def use(self) -> StorageUse:
         """Does not wait for a look that is under way."""
         old = self._at is None or time.time() - self._at > COUNT_AGAIN_S
         if old and self._looking.acquire(blocking=False):
-            threading.Thread(target=self._look, args=(service.store.data,), daemon=True).start()
-        disk = shutil.disk_usage(service.store.data)
+            threading.Thread(target=self._look, args=(self._store.data,), daemon=True).start()
+        disk = shutil.disk_usage(self._store.data)
         return StorageUse(
-            str(service.store.data.resolve()),
+            str(self._store.data.resolve()),
             disk.free,
             disk.total,
-            service.settings.free_bytes,
+            self._settings.free_bytes,
             self._found,
             self._at,
-            service.jobs.page(JobQuery("", FAILED), limit=1).total,
+            self._jobs.page(JobQuery("", FAILED), limit=1).total,
         )
 
     def forget(self) -> None:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pipeline.settings import settings_from_document
-from rig.errors import InputError
+from pipeline.settings import TEMPLATE_NAME, settings_from_document
+from rig.errors import EigenheadError, InputError
 from server.storage.records import JobWebhook
 
 
@@ -19,26 +19,45 @@ class Work:
     webhook: JobWebhook | None = None
 
     def check(self) -> None:
-        """Raises InputError naming an unknown model or template and every wrong setting, before a job fails by it hours
-        later."""
+        """Raises InputError naming an unknown model, every wrong setting and a template that the model cannot have,
+        before a job fails by it hours later."""
+        model, settings = self._model_faults(), self._settings_faults()
+        if model and settings:
+            raise InputError("request", [*(f"model: {f}" for f in model), *(f"settings: {f}" for f in settings)])
+        if model or settings:
+            raise InputError("model" if model else "settings", model or settings)
+
+    def _model_faults(self) -> list[str]:
         from pipeline.eigenheads.model_names import list_models
 
-        known, settings_fault = list_models(), None
+        known = ["default", *list_models()]
+        if self.model is None or self.model in known:
+            return []
+        return [f"{self.model!r:.80} is not at hand; there are: {', '.join(known)}"]
+
+    def _settings_faults(self) -> list[str]:
+        document, faults = self.settings or {}, []
         try:
-            _check_template(settings_from_document(self.settings or {}).outputs.template)
+            settings_from_document(document)
         except InputError as error:
-            settings_fault = error
-        if self.model is not None and self.model != "default" and self.model not in known:
-            fault = f"{self.model!r:.80} is not at hand; there are: {', '.join(['default', *known])}"
-            if settings_fault is None:
-                raise InputError("model", [fault])
-            raise InputError("request", [f"model: {fault}", *(f"settings: {f}" for f in settings_fault.faults)])
-        if settings_fault is not None:
-            raise settings_fault
+            faults += error.faults
+        outputs = document.get("outputs")
+        name = outputs.get("template") if isinstance(outputs, Mapping) else None
+        if isinstance(name, str) and TEMPLATE_NAME.fullmatch(name):
+            faults += _template_faults(name, self.model or "default")
+        return faults
 
 
-def _check_template(name: str | None) -> None:
-    from pipeline.templates.names import UnknownTemplate, list_templates
+def _template_faults(name: str, model: str) -> list[str]:
+    from pipeline.eigenheads.model_names import UnknownModel
+    from pipeline.templates.header import check_template
+    from pipeline.templates.names import template_path
 
-    if name is not None and name not in list_templates():
-        raise InputError("settings", [f"outputs.template: {UnknownTemplate(name)}"])
+    try:
+        template_path(name)
+        check_template(name, model)
+    except UnknownModel:
+        return []  # told beside it
+    except EigenheadError as error:
+        return [f"outputs.template: {error}"]
+    return []

@@ -3,6 +3,7 @@
 Times are seconds since 1970 on the *database's* clock, so that two hosts whose clocks differ agree on who is silent.
 """
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -120,7 +121,11 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
     """An engine on the service's database, with its tables made. Raises DatabaseUnavailable."""
     url = sa.make_url(settings.url)
     if url.get_backend_name() == "sqlite":
-        Path(str(url.database)).parent.mkdir(parents=True, exist_ok=True)
+        file = Path(str(url.database))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if os.geteuid() == 0 and not file.exists():  # root makes the first key; the service must write here, too
+            file.touch(0o600)
+            os.chown(file, file.parent.stat().st_uid, file.parent.stat().st_gid)
         engine = sa.create_engine(url, connect_args={"timeout": 30}, pool_size=10, max_overflow=10)
 
         @event.listens_for(engine, "connect")

@@ -20,12 +20,13 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import (
     BESIDE_PICTURES,
-    by_serial,
+    by_other_names,
     capture_root,
+    check_folders,
     listed_pictures,
     picture_folder,
     read_shot,
@@ -76,6 +77,8 @@ def _calibrate(root: Path, image_pixels: int, report: Report) -> tuple[ReportWar
     check_sizes(files, image_pixels)
     try:
         told = calibrate_photographs(root, root, front=None, report=report)
+    except InputError as error:
+        raise InputError("capture", [NO_RIG, *error.faults]) from error
     except CalibrationRefused as refusal:
         told = f"{NO_RIG}, and its photographs alone do not tell the cameras"
         raise InputError("capture", [told, *refusal.reasons]) from refusal
@@ -85,8 +88,8 @@ def _calibrate(root: Path, image_pixels: int, report: Report) -> tuple[ReportWar
 
 def _name_by_camera(root: Path) -> None:
     """Gives pictures the names by which the service asks for them, images/<camera>.<ext>, wherever the archive has them
-    and whatever it calls those that have their body's serial number. Raises InputError where that cannot be told."""
-    for files in filed_by_serial(root).values():
+    and those that are called otherwise and can be told. Raises InputError where that cannot be told."""
+    for files in filed_by_other_names(root).values():
         for name, path in files.items():
             path.rename(path.with_name(name + path.suffix.lower()))
     pictures, images = picture_folder(root), root / "images"
@@ -99,15 +102,15 @@ def _name_by_camera(root: Path) -> None:
             path.rename(images / path.name)
 
 
-def filed_by_serial(root: Path) -> dict[str, dict[str, Path]]:
-    """``by_serial`` of a capture folder; nothing where its cameras cannot be read, which ``check_capture`` tells.
+def filed_by_other_names(root: Path) -> dict[str, dict[str, Path]]:
+    """``by_other_names`` of a capture folder; nothing where its cameras cannot be read, which ``check_capture`` tells.
     Raises InputError."""
     rig_file, faults = find_rig_file(root), list[str]()
     try:
         rig = None if rig_file is None else read_rig_file(rig_file)
     except InputError:
         return {}
-    found = {} if rig is None else by_serial(root, rig, faults)
+    found = {} if rig is None else by_other_names(root, rig, faults)
     if faults:
         raise InputError("capture", faults)
     return found
@@ -165,6 +168,7 @@ def check_capture(root: Path, image_pixels: int, report: Report, *, measured: bo
         rig = read_rig_file(rig_file)
     except InputError as error:
         raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+    check_folders(root, rig)
     faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)] + stray_faults(root, rig)
     digests: dict[str, str] = {}
     empty: list[str] = []
@@ -185,7 +189,7 @@ def check_capture(root: Path, image_pixels: int, report: Report, *, measured: bo
         faults.append("every picture is its own clean plate: nobody was there, or the plates were copied; shoot again")
     if faults:
         raise InputError("capture", faults)
-    for path in _rig_files(rig_file):
+    for path in rig_file_parts(rig_file):
         digests[path.relative_to(root).as_posix()] = _sha256(path)
     return CaptureContent(
         cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
@@ -241,7 +245,7 @@ def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
         if width * height > image_pixels:
             faults.append(f"{name} is {width} x {height} pixels; at most {image_pixels:,} pixels are accepted")
         elif (width, height) != wanted:
-            faults.append(size_fault(name, (width, height), wanted))
+            faults.append(size_fault(name, (width, height), camera.intrinsics))
     return faults
 
 
@@ -250,13 +254,6 @@ def _images_of(root: Path, camera: str) -> list[Path]:
     files = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
     files = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
     return [path for path in files if path.stem == camera or path.parent == folders[3]]
-
-
-def _rig_files(rig_file: Path) -> list[Path]:
-    """A COLMAP model is several files of one suffix; the other formats are one file."""
-    if rig_file.suffix in (".bin", ".txt"):
-        return sorted(p for p in rig_file.parent.iterdir() if p.is_file() and p.suffix == rig_file.suffix)
-    return [rig_file]
 
 
 def _sha256(path: Path) -> str:

@@ -135,9 +135,8 @@ class _Form:
                 422, "file-repeated", "The form has several parts 'file'; send one archive.", ["file: repeated"]
             )
         elif len(self._data) + end - start > FIELD_BYTES:
-            raise Problem(
-                413, "field-too-large", f"The form field {self._name!r:.80} is longer than {FIELD_BYTES:,} bytes."
-            )
+            told = f"The form field {self._name!r:.80} is longer than {FIELD_BYTES:,} bytes"
+            raise Problem(413, "field-too-large", f"{told}; the archive is the part 'file'.")
         else:
             self._data += data[start:end]
 

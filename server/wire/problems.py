@@ -112,7 +112,7 @@ def problem_from(error: Exception) -> Problem:
         again = {} if error.retry_after_s is None else {"Retry-After": str(error.retry_after_s)}
         return Problem(STATUS_OF[type(error)], error.kind, error.detail, error.errors, again)
     if isinstance(error, RequestValidationError):
-        faults = [f"{'.'.join(str(part) for part in e['loc'])}: {e['msg']}" for e in error.errors()]
+        faults = [f"{'.'.join(str(part) for part in e['loc'])}: {_told(e)}" for e in error.errors()]
         return Problem(
             422, "invalid-request", "The request does not fit the call; see 'errors' and /openapi.json.", faults
         )
@@ -130,13 +130,20 @@ def problem_from(error: Exception) -> Problem:
     return Problem(500, "internal-error", "The service failed in a way that nobody foresaw; its log says more.")
 
 
+def _told(error: Mapping[str, Any]) -> str:
+    """A fault that pydantic found; of a body that is no JSON, a form perhaps, it says nothing to act on."""
+    whole_body = error["loc"] == ("body",) and error["type"] == "model_attributes_type"
+    return "is no JSON object; send one, as application/json" if whole_body else error["msg"]
+
+
 def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
     """Makes every error of ``app`` a problem document; ``routes`` are all that it has."""
 
     async def answer(request: Request, error: Exception) -> JSONResponse:
         problem = problem_from(error)
         if problem.status == 405:
-            problem.headers["Allow"] = ", ".join(_methods_of(routes, request.url.path))
+            problem.headers["Allow"] = allowed = ", ".join(_methods_of(routes, request.url.path))
+            problem.detail = f"{request.url.path} takes {allowed}, and not {request.method}; /openapi.json says more."
         return problem.response()
 
     for kind in (Exception, EigenheadError, HTTPException, RequestValidationError, OSError, DBAPIError):

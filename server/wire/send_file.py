@@ -44,11 +44,14 @@ def send_file(request: Request, file: StoredFile) -> Response:
     return FileResponse(path, headers=headers, media_type=media_type(path.name))
 
 
-def send_archive(request: Request, folder: Path, files: Mapping[str, FileEntry]) -> Response:
-    """The named files below ``folder`` as a .zip, stored and without times: the same files are the same bytes."""
+def send_archive(
+    request: Request, folder: Path, files: Mapping[str, FileEntry], name: str | None = "result.zip"
+) -> Response:
+    """The named files below ``folder`` as a .zip, stored and without times: the same files are the same bytes.
+    ``name``: what a browser saves it as; None leaves that to the page's link."""
     digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
     headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
-    headers["Content-Disposition"] = 'attachment; filename="result.zip"'
+    headers["Content-Disposition"] = "attachment" if name is None else f'attachment; filename="{name}"'
     if request.headers.get("if-none-match") == headers["ETag"]:
         return Response(status_code=304, headers=headers)
     if request.method == "HEAD":

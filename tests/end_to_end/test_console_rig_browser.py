@@ -58,7 +58,9 @@ def test_a_rig_is_calibrated_and_captures(pages: StudioPages, board: BoardPictur
         board.hold(studio, shot)
         page.locator("#shoot").click()
         for shown in (page, other.page):
-            expect(shown.get_by_text(f"{taken} shots", exact=True)).to_be_visible(timeout=LONG_MS)
+            expect(shown.get_by_text("1 shot" if taken == 1 else f"{taken} shots", exact=True)).to_be_visible(
+                timeout=LONG_MS
+            )
     expect(other.page.get_by_label("Squares across")).to_have_value("4")
     expect(other.page.get_by_label("Squares across")).to_be_disabled()
     live = "c => c.width / c.height > 1.5"  # the cameras' shape, no longer the empty canvas's

@@ -121,6 +121,14 @@ def test_pages_are_the_proxys_and_no_others(proxied: Proxied) -> None:
         assert client.get("/sign-in", headers={"Host": "evil.example"}).status_code == 403
 
 
+def test_a_refused_upload_is_told_why(proxied: Proxied) -> None:
+    with proxied.client() as client:
+        for _ in range(10):  # a reset is a race, which nginx lost in two of five
+            answer = client.post("/v1/reconstructions", files={"file": bytes(4 << 20)}, headers={"Authorization": "x"})
+            assert answer.status_code == 401, answer.text
+            assert answer.json()["type"].endswith("key-missing")
+
+
 def test_an_upload_its_events_and_its_result_pass_through(
     proxied: Proxied, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

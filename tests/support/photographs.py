@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -41,14 +42,22 @@ def shoot(
     rng = np.random.default_rng(4)
     gains = np.ones((len(rig), 3)) if gains is None else gains
     images, silhouettes = {}, {}
-    for camera, gain in zip(rig, gains, strict=True):
-        linear, mask = trace(camera, gloss)
+    for (linear, mask), camera, gain in zip(traced(width, height, gloss), rig, gains, strict=True):
         light = cv2.GaussianBlur(linear * gain, (0, 0), blur_px)
         codes = srgb_from_linear(light) + rng.normal(0, noise, light.shape)
         images[camera.name] = np.clip(np.rint(255 * codes), 0, 255).astype(np.uint8)
         silhouettes[camera.name] = silhouette_from_mask(mask)
     truth = np.rint(255 * srgb_from_linear(pattern(mesh.vertices)))
     return Shot(mesh, rig, Capture(images), silhouettes, truth)
+
+
+@lru_cache(maxsize=2)  # 60 MB; several tests ask for the same scene
+def traced(width: int, height: int, gloss: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """``trace`` of every camera, which nobody may write into."""
+    found = [trace(camera, gloss) for camera in fan(width, height)]
+    for array in (array for pair in found for array in pair):
+        array.setflags(write=False)
+    return found
 
 
 def trace(camera: Camera, gloss: float) -> tuple[np.ndarray, np.ndarray]:

@@ -148,7 +148,7 @@ def small_capture(folder: Path, seed: int = 0, cameras: int = 3, size: int = 24)
     """A capture folder of noise: what it shows does not matter here."""
     rng = np.random.default_rng(seed)
     poses = [RigidTransform(np.eye(3), np.array([40.0 * i, 0.0, 1000.0])) for i in range(cameras)]
-    intrinsics = Intrinsics(size, size, 30.0, 30.0, size / 2, size / 2)
+    intrinsics = Intrinsics(size, size, 1.25 * size, 1.25 * size, size / 2, size / 2)
     rig = Rig(tuple(Camera(f"cam{i:02}", intrinsics, pose) for i, pose in enumerate(poses)))
     images = {name: rng.integers(0, 256, (size, size, 3), dtype=np.uint8) for name in rig.names}
     plates = {name: (rng.integers(0, 256, (size, size, 3), dtype=np.uint8),) for name in rig.names}

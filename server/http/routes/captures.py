@@ -17,6 +17,7 @@ from server.http.schemas import CaptureEdit, CaptureOut, JobOut, NewCapture, New
 from server.services.bulk import each
 from server.services.captures import TEXT_MOST, About
 from server.services.keys import Caller
+from server.services.tags import checked_tags
 from server.services.work import Work
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
@@ -30,6 +31,7 @@ Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
 
 FIELDS = ("session", "label", "expression")
+TAGS = "with commas between"
 
 
 @router.post("/captures", status_code=201, responses=documented(400, 404, 413, 415, 507))
@@ -37,7 +39,7 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
     """Triggers the rig now; answers once every camera delivered (201) or the fault is known (503).
 
     ``board``: pictures of the calibration board, from the cameras that deliver, for ``POST /v1/calibrations``."""
-    about = About(wanted.session, wanted.label, wanted.expression)
+    about = About(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     return _created(service.captures.take(about, seed=wanted.seed, board=wanted.board), response)
 
 
@@ -45,7 +47,7 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
     "/captures/uploads",
     status_code=201,
     responses=documented(400, 404, 413, 415, 507),
-    openapi_extra=described_form(ARCHIVE, FIELDS),
+    openapi_extra=described_form(ARCHIVE, FIELDS, tags=TAGS),
 )
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
     """Takes a capture folder as an archive; 422 names every fault in it, and then nothing of it is kept."""
@@ -60,7 +62,7 @@ async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, r
     if not service.settings.import_origins:
         detail = "This service imports from nowhere: its operator names servers in EIGENHEAD_IMPORT_ORIGINS. Upload it."
         raise Forbidden("imports-off", detail)
-    about = About(wanted.session, wanted.label, wanted.expression)
+    about = About(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     with service.store.incoming() as folder:
         archive = await fetch_archive(service, wanted.url, folder)
         record = await service.threads.check(service.captures.accept, archive, folder, about)
@@ -190,7 +192,7 @@ def delete_capture(
     status_code=202,
     tags=["jobs"],
     responses=documented(400, 404, 409, 413, 415, 507),
-    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), settings="JSON object"),
+    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), tags=TAGS, settings="JSON object"),
 )
 async def reconstruct_upload(
     service: ServiceOf,

@@ -1,4 +1,4 @@
-"""Health, readiness, metrics, models, keys, webhooks; the page that shows the API."""
+"""Health, readiness, metrics, models, templates, keys, webhooks; the page that shows the API."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -22,9 +22,11 @@ from server.http.schemas import (
     WebhookList,
     WebhookOut,
 )
+from server.http.template_schemas import TemplateList, TemplateOut
 from server.metrics import MEDIA_TYPE
 from server.services.health import about, exposition, readiness
 from server.services.keys import Caller
+from server.services.templates import templates_at_hand
 from server.wire.problems import Problem, documented
 
 router = APIRouter()
@@ -82,6 +84,13 @@ def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
         for name, path in list_models().items()
     ]
     return ModelList.model_validate({"models": models})
+
+
+@router.get("/v1/templates", tags=["models"], responses=documented())
+def list_templates(service: ServiceOf, caller: Reader) -> TemplateList:
+    """The meshes in whose vertex order a job may write its head (``settings.outputs.template``)."""
+    templates = [TemplateOut.model_validate(template) for template in templates_at_hand()]
+    return TemplateList(templates=templates)
 
 
 @router.post("/v1/keys", status_code=201, tags=["access"], responses=documented(400, 413, 415, 507))

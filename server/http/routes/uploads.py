@@ -25,7 +25,7 @@ from server.wire.problems import Problem, documented
 router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 Taker = Annotated[Caller, Depends(require("capture"))]
 VERSION = "1.0.0"
-FIELDS = ("session", "label", "expression")
+FIELDS = ("session", "label", "expression", "tags")
 Resumable = Annotated[str | None, Header(alias="Tus-Resumable", description=VERSION)]
 COMMON = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
@@ -50,7 +50,8 @@ def tus_create(
     upload_length: Annotated[str | None, Header(alias="Upload-Length", description="bytes of the archive")] = None,
     upload_metadata: Annotated[str | None, Header(alias="Upload-Metadata", max_length=8000)] = None,
 ) -> Response:
-    """Announces an archive of ``Upload-Length`` bytes. ``Upload-Metadata`` may hold session, label and expression."""
+    """Announces an archive of ``Upload-Length`` bytes. ``Upload-Metadata`` may hold session, label, expression and
+    tags, with commas between."""
     _check_version(tus_resumable)
     if not upload_length or not (upload_length.isascii() and upload_length.isdigit()) or len(upload_length) > 18:
         raise Problem(400, "upload-length", "Upload-Length must say how many bytes the archive has.")

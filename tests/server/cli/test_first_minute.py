@@ -103,12 +103,32 @@ def test_help_names_every_fault(run: Run) -> None:
     assert all(kind in told.replace("- ", "-") for kind in KINDS)
 
 
-def test_it_names_its_version_and_completes_words(run: Run) -> None:
+def test_it_names_its_version(run: Run) -> None:
     assert run("--version").out == f"eigenhead {version('eigenhead')}\n"
-    words = {"_EIGENHEAD_COMPLETE": "complete_bash", "COMP_WORDS": "eigenhead mod", "COMP_CWORD": "1"}
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("eigenhead mod", ["model"]),
+        ("eigenhead reconstruct shots/anna --det", ["--detail"]),
+        ("eigenhead reconstruct shots/anna --detail ", ["span", "kernel", "photo", "fine"]),
+        ("eigenhead reconstruct shots/anna --surface b", ["bust", "both"]),
+        ("eigenhead reconstruct shots/anna --model mak", ["makehuman-138"]),
+        ("eigenhead convert cameras.json --to met", ["metashape"]),
+    ],
+)
+def test_a_shell_completes_commands_options_and_what_they_may_be(line: str, offered: list[str]) -> None:
+    words = {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split(" ")) - 1), "_EIGENHEAD_COMPLETE": "complete_bash"}
     command = [str(Path(sys.executable).with_name("eigenhead"))]
     completed = subprocess.run(command, env=os.environ | words, capture_output=True, text=True, timeout=60, check=False)
-    assert completed.stdout.split() == ["model"]
+    assert completed.stdout.split() == offered
+
+
+def test_what_a_model_is_made_of_is_told_in_words(run: Run) -> None:
+    told = run("model", "info").out
+    assert not any(sign in told for sign in "{}[]'\"")
+    assert "female: 41; male: 97; total: 138" in told
 
 
 def test_serve_says_in_one_line_that_its_rig_file_is_missing(run: Run, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Commands about templates."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -16,6 +17,7 @@ from rig.formats.ply import read_head_ply
 from rig.formats.polygon_obj import read_polygons
 from server.cli.main import app
 from tests.support.shared_data import shared
+from tests.support.template_headers import header_file
 
 
 def command(*words: str, data: Path) -> subprocess.CompletedProcess[str]:
@@ -40,6 +42,21 @@ def test_wrong_files_and_names_are_refused_before_anything_is_written(tmp_path: 
     assert json.loads(CliRunner().invoke(app, ["template", "list", "--json", *here]).stdout) == {"templates": {}}
 
 
+def test_a_template_that_the_job_cannot_have_is_told_before_the_work(tmp_path: Path) -> None:
+    """The capture is empty: what is wrong with it would be told by the first step of the work."""
+    data, capture = tmp_path / "data", tmp_path / "capture"
+    capture.mkdir()
+    header_file(data, "foreign", model_name="other", model_sha256="ee" * 32)
+    given = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), "--data", str(data), "--template"]
+    for name, told in (("nobody", "known are foreign"), ("foreign", "registered to the model 'other'")):
+        done = CliRunner().invoke(app, [*given, name])
+        assert isinstance(done.exception, EigenheadError)
+        assert told in str(done.exception)
+    assert not list((tmp_path / "out").glob("*"))
+    listed = json.loads(CliRunner().invoke(app, ["template", "list", "--json", "--data", str(data)]).stdout)
+    assert listed["templates"]["foreign"]["skin_share"] == 0.78
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_head_is_written_in_a_templates_order(tmp_path: Path) -> None:
@@ -60,5 +77,9 @@ def test_a_head_is_written_in_a_templates_order(tmp_path: Path) -> None:
     done = command(*given, "--template", "low", "--formats", "ply", "--out", str(tmp_path / "out"), data=data)
     assert done.returncode == 0, done.stderr
     head = read_head_ply(tmp_path / "out" / "head.ply")[0].vertices[level.rows[order]]
+    named = json.loads((tmp_path / "out" / "report.json").read_text())["template"]
+    assert (named["name"], named["source"]) == ("low", "low.obj")
+    assert named["sha256"] == hashlib.sha256((tmp_path / "low.obj").read_bytes()).hexdigest()
+    assert named["registration"] == pytest.approx(told["figures"])
     written = read_polygons(tmp_path / "out" / "head-low.obj")
     assert np.median(np.linalg.norm(written.vertices - head, axis=1)) < 0.15  # chords of 9 mm sag by 0.1 mm

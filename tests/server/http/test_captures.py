@@ -59,6 +59,16 @@ def test_a_bad_capture_gets_422_by_name_and_leaves_nothing(
     assert stored(service) == before
 
 
+def test_photographs_too_few_to_do_without_cameras_say_what_is_missing(http: httpx.Client, tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    for name in ("cameras.json", "images/cam01.png", "images/cam02.png"):
+        (folder / name).unlink()
+    shutil.rmtree(folder / "background")
+    errors = upload(http, packed(folder)).json()["errors"]
+    assert "holds no cameras.json" in errors[0]
+    assert errors[1].startswith("1 photograph; at least 3")
+
+
 def test_every_fault_is_listed(http: httpx.Client, tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "capture")
     (folder / "images" / "cam00.png").unlink()

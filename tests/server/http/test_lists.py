@@ -1,5 +1,7 @@
 """Lists over HTTP by pages, searched, filtered, sorted; many things at once."""
 
+import base64
+
 import httpx
 import pytest
 
@@ -111,6 +113,25 @@ def test_a_capture_takes_no_more_tags_than_it_can_have(http: httpx.Client, captu
     assert (answer["done"], [one["id"] for one in answer["refused"]]) == (captures[3:4], captures[4:5])
     assert "at most 20" in answer["refused"][0]["detail"]
     http.patch(f"/v1/captures/{captures[4]}", json={"tags": []})
+
+
+def test_tags_come_with_an_upload(http: httpx.Client, archive: bytes) -> None:
+    """As a form's field with commas between, also in one call with the job, and as an upload's metadata in parts."""
+    made = upload(http, archive, tags="Study 4, study 4, beard").json()
+    assert made["tags"] == ["Study 4", "beard"]
+    job = upload(http, archive, "/v1/reconstructions", tags="beard").json()
+    assert http.get(f"/v1/captures/{job['capture_id']}").json()["tags"] == ["beard"]
+    text = base64.b64encode(b"in parts, beard").decode()
+    head = {"Tus-Resumable": "1.0.0", "Upload-Length": str(len(archive)), "Upload-Metadata": f"tags {text}"}
+    where = http.post("/v1/uploads", headers=head).headers["location"]
+    kind = {"Content-Type": "application/offset+octet-stream"}
+    part = {"Tus-Resumable": "1.0.0", "Upload-Offset": "0"} | kind
+    done = http.patch(where, headers=part, content=archive)
+    assert http.get(done.headers["location"]).json()["tags"] == ["in parts", "beard"]
+    before = http.get("/v1/captures").json()["total"]
+    refused = upload(http, archive, tags="x" * 51 + ", a\nb")
+    assert (refused.status_code, len(refused.json()["errors"])) == (422, 2)
+    assert http.get("/v1/captures").json()["total"] == before
 
 
 def test_every_queued_job_has_a_place_of_its_own(http: httpx.Client, captures: list[str]) -> None:

@@ -1,13 +1,27 @@
-"""``eigenhead serve`` in a terminal: Ctrl-C reaches the whole process group, the worker and its child too."""
+"""``eigenhead serve`` and signals that reach the whole process group: the worker and its child, too."""
 
 import os
 import pty
+import signal
 import time
 from pathlib import Path
 
 import httpx
 
 from tests.support.services import await_state, running_service, uploaded_capture, worker_pids
+
+
+def test_a_signal_to_the_whole_group_ends_both_without_a_word_of_dying(tmp_path: Path) -> None:
+    """As `timeout`, a container's runtime or a supervisor sends it."""
+    with running_service(tmp_path / "data") as service:
+        assert service.process is not None
+        while "worker ready" not in service.log_end():
+            time.sleep(0.05)
+        os.killpg(service.process.pid, signal.SIGTERM)
+        service.process.wait(15)
+        assert worker_pids(service) == []
+        assert "worker stopped" in service.log_end()
+        assert "worker died" not in service.log_end()
 
 
 def test_ctrl_c_stops_service_and_worker_once_and_the_job_goes_on_later(tmp_path: Path) -> None:

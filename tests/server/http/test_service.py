@@ -10,6 +10,7 @@ from server.services import health
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from tests.support.services import RunningService, await_state, upload
+from tests.support.template_headers import header_file
 
 
 def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archive: bytes) -> None:
@@ -34,6 +35,9 @@ def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archiv
         assert response.headers["content-type"] == "application/problem+json"
         assert response.json()["type"].startswith("urn:eigenhead:problem:")
         assert response.json()["detail"]
+    assert "takes GET, POST, and not PUT" in http.put("/v1/jobs").json()["detail"]
+    form = http.post("/v1/captures", files={"file": b"x"})
+    assert form.json()["errors"] == ["body: is no JSON object; send one, as application/json"]
 
 
 def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: bytes) -> None:
@@ -64,6 +68,29 @@ def test_health_metrics_models(http: httpx.Client) -> None:
     assert {"egl", "disk", "database", "rig", "worker"} <= set(ready.json()["checks"])
     assert "eigenhead_requests_total" in http.get("/metrics").text
     assert any(model["default"] for model in http.get("/v1/models").json()["models"])
+
+
+def test_templates_are_listed_and_a_job_may_name_those_of_its_model(
+    service: RunningService, http: httpx.Client, archive: bytes
+) -> None:
+    assert http.get("/v1/templates").json() == {"templates": []}
+    mine = header_file(service.data, "mine")
+    other = header_file(service.data, "other", model_name="other", model_sha256="ee" * 32)
+    try:
+        first, second = http.get("/v1/templates").json()["templates"]
+        assert (first["id"], first["vertices"], first["registration"]["off_p95_mm"]) == ("mine", 5023, 0.094)
+        assert (second["model"], second["models"]) == ("other", [])
+        wanted = {"capture_id": upload(http, archive).json()["id"], "settings": {"outputs": {"template": "mine"}}}
+        assert http.post("/v1/jobs", json=wanted).status_code == 202
+        wanted["settings"] = {"outputs": {"template": "other", "formats": ["xyz"]}}
+        refused = http.post("/v1/jobs", json=wanted)
+        assert (refused.status_code, refused.headers["content-type"]) == (422, "application/problem+json")
+        told = " | ".join(refused.json()["errors"])
+        assert "'xyz' is none of" in told
+        assert "'other' was registered to the model 'other'" in told
+    finally:
+        mine.unlink()
+        other.unlink()
 
 
 def test_a_worker_that_loads_is_no_fault(tmp_path: Path) -> None:

@@ -100,7 +100,8 @@ def test_the_network_needs_a_key_and_the_refusal_names_the_place(keys: Keys, tmp
     with pytest.raises(KeylessAddress, match=r"^refusing to listen on 0\.0\.0\.0 without an API key"):
         check_address(ServiceSettings(data=tmp_path, host="0.0.0.0"), keys)
     public = ServiceSettings(data=tmp_path, public_url="https://heads.example")
-    with pytest.raises(KeylessAddress, match=r"listen on https://heads\.example without .*eigenhead keys add NAME"):
+    remedy = re.escape(f"`eigenhead keys add NAME --data {tmp_path}`")  # the data folder's that was asked to serve
+    with pytest.raises(KeylessAddress, match=rf"listen on https://heads\.example without .*{remedy}"):
         check_address(public, keys)
     keys.add("lab", ("read",))
     check_address(public, keys)

@@ -7,9 +7,13 @@ import pytest
 
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.capture_folder import write_capture
+from rig.formats.archive import ArchiveLimits, pack_folder
+from rig.formats.cameras_file import write_rig_file
+from rig.formats.cameras_json import read_rig
+from rig.formats.capture_folder import read_capture, write_capture
 from server.storage.records import CaptureContent
-from server.tasks.ingest import check_capture
+from server.tasks.child import Bench
+from server.tasks.ingest import check_capture, ingest_archive
 from tests.rig.acquisition.test_session import flat_rig
 from tests.server.http.test_hostile import SPOILT
 from tests.support.services import small_capture
@@ -57,6 +61,30 @@ def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
     measured = check_capture(tmp_path, PIXELS_MOST, lambda stage, share: None, measured=True)
     assert {(fault.code, fault.camera) for fault in measured.faults} <= {("empty", "cam03")}, "the shot has the others"
     assert all(view.keys() == {"subject"} for view in measured.checks.values())
+
+
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    [
+        ("colmap", "sparse/0"),
+        ("colmap-text", "."),
+        ("caliscope", "camera_array.toml"),
+        ("realitycapture", "images"),
+        ("nerfstudio", "transforms.json"),
+        ("opencv-yaml", "."),
+    ],
+)
+def test_an_upload_keeps_every_file_of_another_programs_cameras(tmp_path: Path, kind: str, place: str) -> None:
+    folder, kept = small_capture(tmp_path / "capture"), tmp_path / "kept"
+    rig = read_rig(folder / "cameras.json")
+    write_rig_file(rig, folder / place, kind)
+    (folder / "cameras.json").unlink()
+    pack_folder(folder, tmp_path / "capture.tar")
+    kept.mkdir()
+    archive = {"archive": str(tmp_path / "capture.tar"), "folder": str(kept), "limits": ArchiveLimits()}
+    ingest_archive(Bench(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST)
+    _, read = read_capture(kept)  # as a job reads it
+    assert sorted(read.names) == sorted(rig.names)
 
 
 def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:

@@ -1,0 +1,29 @@
+"""What lies in the data folder, and what retention takes of it."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends
+
+from server.http.auth import ServiceOf, require
+from server.http.storage_schemas import RetentionOut, StorageOut, UpcomingOut
+from server.services.keys import Caller
+from server.services.retention import upcoming
+from server.wire.problems import documented
+
+router = APIRouter(prefix="/v1", tags=["operations"])
+Reader = Annotated[Caller, Depends(require("read"))]
+
+
+@router.get("/storage", responses=documented())
+def get_storage(service: ServiceOf, caller: Reader) -> StorageOut:
+    """Bytes by kind, as of the last look through the data folder; a look that is older than five minutes starts the
+    next, for which nobody waits."""
+    return StorageOut.model_validate(service.storage.use())
+
+
+@router.get("/retention", responses=documented())
+def get_retention(service: ServiceOf, caller: Reader) -> RetentionOut:
+    """How long captures and finished jobs are kept, which the service's variables say (``EIGENHEAD_KEEP_...``), and
+    what goes next."""
+    settings = {name: getattr(service.settings, name) for name in RetentionOut.model_fields if name != "upcoming"}
+    return RetentionOut(**settings, upcoming=[UpcomingOut.model_validate(one) for one in upcoming(service)])

@@ -1,0 +1,41 @@
+"""Documents on the wire: what is kept, how large it is, and what goes next."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from server.http.schemas import Answer, Moment
+
+
+class KindOut(Answer):
+    kind: str
+    bytes: int
+    things: int = Field(description="captures, jobs, ...: what lies directly in the kind's folders")
+
+
+class StorageOut(Answer):
+    free: int = Field(description="bytes of the disk")
+    total: int = Field(description="bytes of the disk")
+    spare: int = Field(description="bytes that uploads and jobs leave free")
+    failed: int = Field(description="jobs that failed or were cancelled")
+    kinds: list[KindOut] | None = Field(description="null while the data folder is looked through for the first time")
+    at: float | None = Field(description="when it was looked through, seconds since 1970")
+
+
+class UpcomingOut(Answer):
+    kind: Literal["job", "capture"]
+    id: str
+    label: str
+    goes: Moment | None = Field(description="null where that hangs on the disk or on what comes")
+    why: str = Field(description="the setting that takes it")
+
+
+class RetentionOut(Answer):
+    keep_captures_days: float | None = Field(description="null: for ever")
+    keep_results_days: float | None = Field(description="null: for ever")
+    keep_jobs: int | None = Field(description="finished jobs; null: all")
+    make_room: bool = Field(description="whether the oldest results go when the disk is full")
+    free_bytes: int
+    cache_bytes: int
+    upload_hours: float
+    upcoming: list[UpcomingOut] = Field(description="what goes next if nothing comes, jobs first")

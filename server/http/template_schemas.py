@@ -1,0 +1,60 @@
+"""Documents on the wire: templates, in whose vertex order heads are written."""
+
+from pydantic import ConfigDict, Field
+
+from server.http.schemas import Answer
+
+
+class RegistrationOut(Answer):
+    """How a template lies on its model."""
+
+    skin_share: float = Field(ge=0, le=1, description="of its vertices, on the model's skin; the others follow it")
+    face_covered_share: float = Field(ge=0, le=1, description="of the model's face, that it shows")
+    unlike_median_mm: float = Field(description="between the mesh as it came and the nearest head of the model")
+    unlike_p95_mm: float
+    off_median_mm: float = Field(description="between the mesh drawn onto that head and the head")
+    off_p95_mm: float
+
+
+class TemplateOut(Answer):
+    """A mesh in whose vertex order a job writes its head: ``settings.outputs.template``."""
+
+    model_config = ConfigDict(
+        from_attributes=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "flame",
+                    "name": "flame",
+                    "source": "flame.obj",
+                    "sha256": "c4" * 32,
+                    "model": "makehuman-138",
+                    "models": ["default", "makehuman-138"],
+                    "vertices": 5023,
+                    "registration": {
+                        "skin_share": 0.78,
+                        "face_covered_share": 0.99,
+                        "unlike_median_mm": 0.31,
+                        "unlike_p95_mm": 1.22,
+                        "off_median_mm": 0.012,
+                        "off_p95_mm": 0.094,
+                    },
+                    "fault": None,
+                }
+            ]
+        },
+    )
+
+    id: str = Field(description="what a job calls it")
+    name: str
+    source: str | None = Field(description="file of the mesh")
+    sha256: str | None = Field(description="of that file")
+    model: str | None = Field(description="that it was registered to; a job with another one is refused")
+    models: list[str] = Field(description="names of that model at /v1/models; none where it is not at hand")
+    vertices: int | None
+    registration: RegistrationOut | None
+    fault: str | None = Field(description="why it cannot be used, and nothing else is known of it; null: it can")
+
+
+class TemplateList(Answer):
+    templates: list[TemplateOut]

@@ -1,0 +1,35 @@
+"""What is kept, how large it is and what goes next, over HTTP."""
+
+import time
+from pathlib import Path
+
+import httpx
+
+from tests.support.services import packed, running_service, small_capture, upload
+
+
+def test_storage_and_retention_are_told(tmp_path: Path) -> None:
+    with (
+        running_service(tmp_path / "data", worker=False, keep_captures_days="30", keep_jobs="1") as service,
+        httpx.Client(base_url=service.url) as http,
+    ):
+        capture = upload(http, packed(small_capture(tmp_path / "capture"))).json()
+        jobs = [http.post("/v1/jobs", json={"capture_id": capture["id"]}).json()["id"] for _ in range(2)]
+        http.post("/v1/jobs/bulk", json={"action": "cancel", "ids": jobs})
+        told = http.get("/v1/retention").json()
+        assert (told["keep_captures_days"], told["keep_results_days"], told["keep_jobs"]) == (30.0, None, 1)
+        assert [(one["kind"], one["why"]) for one in told["upcoming"]] == [
+            ("job", "keep_jobs"),
+            ("job", "keep_jobs"),
+            ("capture", "keep_captures_days"),
+        ]
+        assert told["upcoming"][2]["id"] == capture["id"]
+        assert (told["upcoming"][0]["goes"] is None, told["upcoming"][1]["goes"] is None) == (False, True)
+        deadline = time.monotonic() + 30.0
+        while (use := http.get("/v1/storage").json())["kinds"] is None and time.monotonic() < deadline:
+            time.sleep(0.05)  # the first look through the folder
+        held = {kind["kind"]: kind for kind in use["kinds"]}
+        files = [path for path in (service.data / "captures").rglob("*") if path.is_file()]
+        assert held["captures"] == {"kind": "captures", "bytes": sum(p.stat().st_size for p in files), "things": 1}
+        assert (use["failed"], use["free"] < use["total"]) == (2, True)
+        assert str(service.data) not in str(use), "where the folder lies is nobody's business"

@@ -1,0 +1,56 @@
+"""What a job is asked for, and what is refused of it."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.eigenheads.data_folder import DATA
+from pipeline.eigenheads.model_names import model_path
+from rig.errors import InputError
+from server.services.work import Work
+from tests.support.template_headers import header_file
+
+
+@pytest.fixture(autouse=True)
+def _data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A template of the default model, a damaged one, and another model."""
+    monkeypatch.setenv(DATA, str(tmp_path))
+    header_file(tmp_path, "flame")
+    header_file(tmp_path, "damaged").write_bytes(b"PK")
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "other.npz").write_bytes(model_path("default").read_bytes() + b"\n")
+
+
+def asked(model: str | None = None, **settings: object) -> tuple[str, tuple[str, ...]]:
+    with pytest.raises(InputError) as refused:
+        Work(model, settings).check()
+    return refused.value.subject, refused.value.faults
+
+
+def test_what_can_be_done_is_not_refused() -> None:
+    Work().check()
+    Work("makehuman-138", {"outputs": {"template": "flame"}}).check()
+    Work("other", {"outputs": {"template": None}}).check()
+
+
+def test_a_template_that_there_is_not_or_that_another_model_carries_is_refused() -> None:
+    subject, (told,) = asked(outputs={"template": "ict"})
+    assert (subject, "outputs.template: no template 'ict': known are damaged, flame" in told) == ("settings", True)
+    subject, (told,) = asked("other", outputs={"template": "flame"})
+    assert subject == "settings"
+    assert "registered to the model 'makehuman-138', and the job's is 'other'" in told
+    _, (told,) = asked(outputs={"template": "damaged"})
+    assert "Register it again" in told
+
+
+def test_every_fault_is_named_at_once() -> None:
+    subject, told = asked("nobody", metod="contour", outputs={"template": "ict", "formats": ["xyz"]})
+    assert subject == "request"
+    for part in ("model: 'nobody' is not at hand", "metod", "'xyz' is none of", "no template 'ict'"):
+        assert any(part in fault for fault in told), (part, told)
+    assert len(told) == 4
+    _, told = asked(outputs={"template": "../x"})
+    assert len(told) == 1
+    assert "is no name" in told[0]
+    _, told = asked(outputs={"template": 3})
+    assert len(told) == 1
