@@ -55,5 +55,5 @@ async def _sent_to(*, more: bool, body: bytes, linger_s: float) -> list[Message]
 
     scope: dict[str, Any] = {"type": "http", "http_version": "1.1"}
     scope["headers"] = [(b"connection", b"close"), (b"content-length", b"1000000")]
-    await Linger(app, linger_s=linger_s)(scope, receive, send)
+    await Linger(app, patience_s=0.05, linger_s=linger_s)(scope, receive, send)
     return sent
