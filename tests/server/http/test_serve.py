@@ -15,7 +15,9 @@ def test_a_signal_to_the_whole_group_ends_both_without_a_word_of_dying(tmp_path:
     """As `timeout`, a container's runtime or a supervisor sends it."""
     with running_service(tmp_path / "data") as service:
         assert service.process is not None
+        deadline = time.monotonic() + 60.0
         while "worker ready" not in service.log_end():
+            assert time.monotonic() < deadline, "no worker was ready"
             time.sleep(0.05)
         os.killpg(service.process.pid, signal.SIGTERM)
         service.process.wait(15)
