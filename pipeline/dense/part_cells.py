@@ -40,6 +40,7 @@ class HeadGuide:
     above_chin_mm: Float[np.ndarray, " v"]
     cheek: Float[np.ndarray, " v"]  # 1 on cheeks and nose, which no beard and no fringe reaches, else 0
     feature: Float[np.ndarray, " v"]  # 0 to 1: brows, eyes, lips and nostrils, whose colours are not those of skin
+    underside: Float[np.ndarray, " v"]  # 0 to 1: below jaw, chin and nose, in shadow
     up: Float[np.ndarray, " 3"]  # unit, world
     chin: Float[np.ndarray, " 3"]
     middle: Float[np.ndarray, " 3"]
@@ -61,6 +62,7 @@ class Cells:
     above_chin_mm: Float32[np.ndarray, "r c"]
     cheek: Float32[np.ndarray, "r c"]
     feature: Float32[np.ndarray, "r c"]
+    underside: Float32[np.ndarray, "r c"]
     outside_mm: Float32[np.ndarray, "r c"]  # from the head's outline, 0 within
 
 
@@ -79,10 +81,11 @@ def head_guide(
     distance = KDTree(border).query(vertices)[0] if len(border) else np.full(len(vertices), 1e3)
     into_face, height = np.where(face_region, distance, -distance), (vertices - chin) @ up
     downward = np.clip(-(mesh.normals() @ up - DOWNWARD[0]) / (DOWNWARD[0] - DOWNWARD[1]), 0.0, 1.0)
-    feature = np.maximum(_features(vertices, landmarks, up), downward * np.clip(into_face / 20.0 + 2.0, 0.0, 1.0))
+    feature, underside = _features(vertices, landmarks, up), downward * np.clip(into_face / 20.0 + 2.0, 0.0, 1.0)
     across = np.abs((vertices - eyes) @ left) / float(left @ left)
     low, high = float((landmarks["subnasale"] - chin) @ up), float((eyes - chin) @ up)
-    cheek = (into_face > CHEEK_INSIDE_MM) & (height > low + CHEEK_MARGIN_MM) & (height < high) & (feature < 0.1)
+    cheek = (into_face > CHEEK_INSIDE_MM) & (height > low + CHEEK_MARGIN_MM) & (height < high)
+    cheek &= np.maximum(feature, underside) < 0.1
     cheek &= across < 0.5  # no farther out than the eyes: sideburns
     return HeadGuide(
         mesh=mesh,
@@ -90,6 +93,7 @@ def head_guide(
         above_chin_mm=height,
         cheek=cheek.astype(float),
         feature=feature,
+        underside=underside,
         up=up,
         chin=chin,
         middle=vertices[(vertices - chin) @ up > 0].mean(axis=0),
@@ -164,13 +168,13 @@ def _means(values: np.ndarray, size: int) -> np.ndarray:
 
 def _seen(
     camera: Camera, size: int, head: HeadGuide, shape: tuple[int, int]
-) -> tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 4"]]:
+) -> tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 5"]]:
     """Depth of the head at every cell's centre, inf beside it, and the guide's values there."""
     pixels = (camera.project(head.mesh.vertices) - (size - 1) / 2) / size
     depths = camera_depths(camera, head.mesh.vertices)
     depth, face = rasterise(pixels, depths, head.mesh.faces, *shape)
-    values = np.stack([head.into_face_mm, head.above_chin_mm, head.cheek, head.feature], axis=1).astype(np.float32)
-    return depth, interpolate(face, pixels, depths, head.mesh.faces, values)
+    values = np.stack([head.into_face_mm, head.above_chin_mm, head.cheek, head.feature, head.underside], axis=1)
+    return depth, interpolate(face, pixels, depths, head.mesh.faces, values.astype(np.float32))
 
 
 def _gains(
@@ -205,7 +209,7 @@ def _cells(
     image: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
     light: Float32[np.ndarray, "r c 3"],
-    seen: tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 4"]],
+    seen: tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 5"]],
     head: HeadGuide,
 ) -> Cells:
     depth, values = seen
@@ -230,6 +234,7 @@ def _cells(
         above_chin_mm=height.astype(np.float32),
         cheek=np.where(on_head, values[..., 2], 0.0).astype(np.float32),
         feature=np.where(on_head, values[..., 3], 0.0).astype(np.float32),
+        underside=np.where(on_head, values[..., 4], 0.0).astype(np.float32),
         outside_mm=outside.astype(np.float32),
     )
 

@@ -34,11 +34,13 @@ LIGHT_RANGE, DETAIL_RANGE = (-4.7, 0.4), (-4.7, -0.9)
 CHROMA_BLUR, LIGHT_BLUR, DETAIL_BLUR = 0.9, 1.6, 1.2  # bins; light falls off within each part
 SHADE_SHARE, SHADE_BLUR = 0.4, 4.0  # of a part's looks: its colours in light that only others of them have; bins
 OUTLIER = 0.02  # share of what belongs to no part
-BEARD_PRIOR = (0.8, 0.17)  # of skin and hair on the lower face
+BARE_PRIOR, BEARD_PRIOR = (0.8, 0.17), (0.3, 0.67)  # of skin and hair on a lower face without a beard, and with one
+BEARD_SHARE = (0.2, 0.45)  # of the lower face that looks otherwise than the cheeks: no beard, a beard for certain
 CONFIDENT = 0.8  # only cells so probable teach how their part looks: others would pull all parts together
 LEAST_THERE = 1e-3  # share of a part's sure places that do not look like skin: a bald head has no hair
 SKIN_RATIO = 0.15  # looks that skin has so much less often than the whole subject are half not skin's
 OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a part of its own would fill evenly
+PLAIN = 0.1  # a cell that is less of a feature or underside than this is plain skin, or a beard
 FLOOR = 0.02  # of a part's looks that its histogram has not shown
 
 Report = Callable[[str, float], None]
@@ -91,11 +93,14 @@ def classify_parts(
     def gathered(maps: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([each[mask] for each, mask in zip(maps, inside, strict=True)])
 
-    place = gathered([place_prior(view) for view in cells])
     looks = gathered([bins(view) for view in cells])
-    start, beard = gathered([starts(view) for view in cells]), gathered([beard_zone(view) for view in cells])
+    start, lower = gathered([starts(view) for view in cells]), gathered([lower_face(view) for view in cells])
+    by_colour, by_both = unlike_cheeks(looks, start[:, SKIN])
+    bearded = beard_evidence(by_both, lower)
+    otherwise = by_colour + bearded * lower * (by_both - by_colour)
+    place = gathered([place_prior(view, bearded) for view in cells])
     report("parts", 0.4)
-    share = posterior(learn(looks, place, start, beard, settings), place)
+    share = posterior(learn(looks, place, start, lower, otherwise, settings), place)
     report("parts", 0.6)
     rows = np.split(share, np.cumsum([np.count_nonzero(mask) for mask in inside])[:-1])
 
@@ -141,8 +146,27 @@ def beard_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
     return view.on_head & low & (view.into_face_mm > -15.0)
 
 
-def place_prior(view: Cells) -> Float32[np.ndarray, "r c 4"]:
-    """Probability of each part, and of none, by place alone."""
+def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
+    """Above it, between cheeks and ears, where only a beard reaches."""
+    above = (view.above_chin_mm >= 50.0) & (view.above_chin_mm < 80.0)
+    return view.on_head & above & (view.into_face_mm > -15.0) & (view.cheek < 0.5)
+
+
+def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
+    """Where a beard grows and light falls on skin, too: the zone without lips and without the underside of jaw and
+    chin, which is dark with a beard and without."""
+    return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
+
+
+def beard_evidence(otherwise: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
+    """0 for a bare lower face, 1 for a beard, by the share of it that looks otherwise than cheeks and nose: of heads
+    without a beard it is below 0.12, of beards above 0.9."""
+    share = float(otherwise[lower].mean()) if lower.any() else 0.0
+    return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
+
+
+def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4"]:
+    """Probability of each part, and of none, by place alone, and by whether there is a beard (``beard_evidence``)."""
     face = _ramp(view.into_face_mm, -25.0, 15.0)
     upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
     skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
@@ -150,12 +174,17 @@ def place_prior(view: Cells) -> Float32[np.ndarray, "r c 4"]:
     hair_below = np.where(view.on_head, 0.10, 0.2)
     skin = upper * skin_above + (1.0 - upper) * skin_below
     hair = (1.0 - skin) * (upper * 0.93 + (1.0 - upper) * hair_below / (1.0 - skin_below))
-    beard = beard_zone(view)
-    skin, hair = np.where(beard, BEARD_PRIOR[SKIN], skin), np.where(beard, BEARD_PRIOR[HAIR], hair)
-    named = np.maximum(skin, 0.985 * view.feature)
+    zone = beard_zone(view)
+    skin, hair = np.where(zone, BARE_PRIOR[SKIN], skin), np.where(zone, BARE_PRIOR[HAIR], hair)
+    grown = bearded * (zone | sideburn_zone(view))
+    skin, hair = (own + grown * (there - own) for own, there in ((skin, BEARD_PRIOR[SKIN]), (hair, BEARD_PRIOR[HAIR])))
+    # A beard grows close about the lips, and hides the underside of the jaw.
+    feature = view.feature - grown * np.minimum(view.feature, 1.0 - view.feature)
+    known = np.maximum(feature, (1.0 - grown) * view.underside)
+    named = np.maximum(skin, 0.985 * known)
     hair, skin = hair * (1.0 - named) / (1.0 - skin), named
     part = np.stack([skin, hair, 1.0 - skin - hair], axis=-1)
-    other = OUTLIER * (1.0 - 0.98 * view.feature[:, :, None])  # lips look like no other skin
+    other = OUTLIER * (1.0 - 0.98 * known[:, :, None])  # lips look like no other skin
     return np.concatenate([(1.0 - other) * part, other], axis=-1).astype(np.float32)
 
 
@@ -164,11 +193,26 @@ def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float3
     return t * t * (3.0 - 2.0 * t)
 
 
+def unlike_cheeks(
+    looks: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """How far every cell does not look like those that are skin for certain, 0 to 1: by colour, and by colour and fine
+    structure, which tells a blond beard from skin (but shadows' borders from skin, too)."""
+    everything = np.ones(len(looks), np.float32)
+    colour, detail = (
+        (of(which, cheeks) / of(which, everything))[which]
+        for which, of in ((looks[:, 0], colour_looks), (looks[:, 1], detail_looks))
+    )
+    first, second = ((SKIN_RATIO / (SKIN_RATIO + ratio)) ** 2 for ratio in (colour, colour * detail))
+    return first, second
+
+
 def learn(
     looks: Int[np.ndarray, "n 2"],
     prior: Float32[np.ndarray, "n 4"],
     start: Float32[np.ndarray, "n 3"],
-    beard: Bool[np.ndarray, " n"],
+    lower: Bool[np.ndarray, " n"],
+    otherwise: Float[np.ndarray, " n"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "n 4"]:
     """Log likelihood of every cell's looks under skin, hair, clothes and the outlier, and of there being such a part.
@@ -176,13 +220,10 @@ def learn(
     Starts from the cells of each part that are sure by their place, less those of hair and clothes that look like skin.
     """
     colour, detail = looks.T
-    everything = colour_looks(colour, np.ones(len(colour), np.float32))
-    ratio = (colour_looks(colour, start[:, SKIN]) / everything)[colour]
-    otherwise = (SKIN_RATIO / (SKIN_RATIO + ratio)) ** 2
     share = start.copy()
-    share[:, HAIR] = np.maximum(share[:, HAIR], beard) * otherwise
+    share[:, HAIR] = np.maximum(share[:, HAIR], lower) * otherwise
     share[:, CLOTHES] *= otherwise
-    there = np.log(_there(otherwise, start, beard))
+    there = np.log(_there(otherwise, start, lower))
     logs = np.empty((len(colour), 4), np.float32)
     logs[:, 3] = settings.strength * -np.log(OUTLIER_BINS)
     for step in range(settings.steps):
@@ -196,11 +237,11 @@ def learn(
 
 
 def _there(
-    otherwise: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], beard: Bool[np.ndarray, " n"]
+    otherwise: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], lower: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, " 3"]:
     """Is there hair, are there clothes? The share of their sure places that look otherwise than skin; a beard is hair,
     too."""
-    shares = [float(otherwise[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, beard)]
+    shares = [float(otherwise[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
     return np.maximum([1.0, max(shares[HAIR], shares[3]), shares[CLOTHES]], LEAST_THERE)
 
 

@@ -96,6 +96,7 @@ class SurfaceObservations:
     seen_at: Float[np.ndarray, "n 3"]  # world, mm: where the vertex stood
     displacement: Float[np.ndarray, " n"]  # mm along the normal
     information: Float[np.ndarray, " n"]  # mm^-2
+    bound: Bool[np.ndarray, " n"]  # hair: the head lies there or anywhere inside
     by_camera: Float[np.ndarray, "n c"]  # c = 6 K
     camera_shift: Float[np.ndarray, "k 6"]  # when observed
     camera_matrix: Float[np.ndarray, "c c"]

@@ -191,6 +191,7 @@ def observe(
         seen_at=stood,
         displacement=place,
         information=information,
+        bound=hair[kept],
         by_camera=sensitivity.by_camera,
         camera_shift=state.camera_shift,
         camera_matrix=camera_matrix + metric,

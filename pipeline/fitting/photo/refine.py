@@ -78,7 +78,7 @@ def refine_with_photographs(
         seen = visibility.facing > 0
         hidden = under_hair(patches, hair or {}, problem.views.names, visibility.pixel, seen, centres)
         surface, lost = observe(problem, state, photographs, patches, visibility, hidden, basis, each, settings)
-        share = len(surface.vertex) / max(len(patches.centre), 1)
+        share = np.count_nonzero(~surface.bound) / max(len(patches.centre), 1)
         if share < settings.least_share:
             why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"
             return solved, Detail("kernel", why)
@@ -140,10 +140,11 @@ def unfollowed(
     tell: eyes that the model has open and the subject closed. That counts where it is, and not for the whole head.
     Nothing is said beyond the patches.
     """
-    off, _ = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)
+    skin = ~seen.bound
+    off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]
     full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)
     square = np.concatenate([np.minimum(np.abs(off), LOST_MM), np.full(len(lost), LOST_MM)]) ** 2
     square = MISFIT_LOCAL * square + (1.0 - MISFIT_LOCAL) * square[: len(off)].mean()
-    distance, near = KDTree(full[np.concatenate([seen.vertex, lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
+    distance, near = KDTree(full[np.concatenate([seen.vertex[skin], lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
     weight = np.exp(-0.5 * (distance / NEAR_MM) ** 2)
     return MISFIT_FACTOR * np.sqrt((weight * square[near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 0.1))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from pipeline.dense.part_cells import head_guide, make_cells
 from pipeline.dense.part_kernels import spread_parts
@@ -26,12 +27,19 @@ from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
+from rig.studio.scene.beard import grow_beard
 from rig.studio.scene.hair import HairStyle, grow
 from rig.studio.scene.layout import default_layout
+from rig.studio.scene.subject import Subject
 from tests.rig.studio.test_images import egg_head
 
 SETTINGS = PartSettings()
-TONES = {"skin": (200.0, 150.0, 125.0), "dark": (70.0, 50.0, 38.0), "blue": (60.0, 80.0, 150.0)}
+TONES = {
+    "skin": (200.0, 150.0, 125.0),
+    "dark": (70.0, 50.0, 38.0),
+    "brown": (110.0, 80.0, 58.0),
+    "blue": (60.0, 80.0, 150.0),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,14 +68,36 @@ def shoulders() -> Mesh:
     )
 
 
-def planted(rig: Rig, hair: str, clothes: str, gains: Mapping[str, float] | None = None) -> Planted:
-    """The egg with a shell of hair over its crown, lit from above; grain on the hair, noise on all."""
+def full_beard(head: Mesh) -> Mesh:
+    style = HairStyle(thickness_mm=13.0, curl_mm=3.0, strands=0)
+    grown = grow_beard(head, anatomy(head.vertices, egg_head().landmarks), style, np.random.default_rng(1))
+    return Mesh(grown.shell, grown.shell_faces)
+
+
+def swollen() -> Subject:
+    """The egg as outlines alone fit it: its chin is the beard's."""
+    bare = egg_head()
+    beard, head = full_beard(bare.mesh).vertices, bare.mesh.vertices
+    out = ((beard - head) * bare.mesh.normals()).sum(axis=1, keepdims=True)
+    shape = np.where(out > 1.0, beard, head)
+    _, row = KDTree(head).query(list(bare.landmarks.values()))
+    moved = dict(zip(bare.landmarks, np.array(list(bare.landmarks.values())) + (shape - head)[row], strict=True))
+    return replace(bare, mesh=replace(bare.mesh, vertices=shape), landmarks=moved)
+
+
+def planted(
+    rig: Rig, hair: str, clothes: str, gains: Mapping[str, float] | None = None, *, beard: bool = False
+) -> Planted:
+    """The egg with a shell of hair over its crown, or about its chin, lit from above; grain on the hair, noise on
+    all."""
     head = egg_head().mesh
     style = HairStyle(thickness_mm=9.0, over_ears=True, strands=0)
     shell = grow(head.vertices, anatomy(head.vertices, egg_head().landmarks), style, np.random.default_rng(1))
     pieces = [(head, "skin", 1), (shoulders(), clothes, 1 if clothes == "skin" else 3)]
     if hair != "skin":
         pieces.append((Mesh(shell.shell, shell.shell_faces), hair, 2))
+    if beard:
+        pieces.append((full_beard(head), "brown", 2))
     rng, images, silhouettes, truth = np.random.default_rng(2), {}, {}, {}
     for camera in rig:
         k = camera.intrinsics
@@ -92,9 +122,9 @@ def depth_map_z(camera, mesh: Mesh) -> np.ndarray:
     return camera.camera_from_world.apply(mesh.vertices)[:, 2]
 
 
-def shares(rig: Rig, made: Planted) -> dict[int, float]:
+def shares(rig: Rig, made: Planted, fitted: Subject | None = None) -> dict[int, float]:
     """Share of each true part's pixels that are given to it with more than a half."""
-    subject = egg_head()
+    subject = fitted or egg_head()
     assert subject.face_region is not None
     found = classify_parts(
         made.images, made.silhouettes, rig, subject.mesh, subject.face_region, subject.landmarks, SETTINGS,
@@ -116,6 +146,14 @@ def test_hair_clothes_and_skin_are_told_apart(rig):
 
 def test_a_bald_head_with_bare_shoulders_is_skin_all_over(rig):
     assert shares(rig, planted(rig, "skin", "skin"))[1] > 0.97
+
+
+@pytest.mark.parametrize("hair", ["skin", "brown"])
+def test_a_beard_is_hair_on_the_chin_and_below_it(rig, hair):
+    found = shares(rig, planted(rig, hair, "blue", beard=True), swollen())
+    assert found[1] > 0.93
+    assert found[2] > 0.93
+    assert found[3] > 0.95
 
 
 def test_hair_in_the_colour_of_the_clothes_is_hair_above_and_clothes_below(rig):

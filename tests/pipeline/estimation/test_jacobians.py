@@ -203,7 +203,7 @@ def surface_of_a_head() -> Case:
     seen = SurfaceObservations(
         vertex=rows, basis=model.basis("full", stage.modes, rows), mean=model.vertices(np.zeros(0))[rows],
         normal=normal / np.linalg.norm(normal, axis=1, keepdims=True), seen_at=model.vertices(np.zeros(0))[rows],
-        displacement=rng.standard_normal(len(rows)), information=np.ones(len(rows)),
+        displacement=rng.standard_normal(len(rows)), information=np.ones(len(rows)), bound=np.zeros(len(rows), bool),
         by_camera=rng.standard_normal((len(rows), cameras)), camera_shift=np.zeros_like(state.camera_shift),
         camera_matrix=np.eye(cameras), camera_gradient=np.zeros(cameras),
     )  # fmt: skip

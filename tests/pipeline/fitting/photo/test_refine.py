@@ -201,9 +201,9 @@ def test_surface_equations_are_the_derivative_of_the_cost(model: HeadModel) -> N
     seen = SurfaceObservations(
         vertex=rows, basis=model.basis("full", 6, rows), mean=full.operator[rows] @ model.mean.astype(float),
         normal=normal, seen_at=model.vertices(np.zeros(0))[rows], displacement=0.01 * rng.standard_normal(4),
-        information=np.array([4.0, 1.0, 9.0, 2.0]), by_camera=0.1 * rng.standard_normal((4, 12)),
-        camera_shift=0.01 * rng.standard_normal((cameras, 6)), camera_matrix=form @ form.T,
-        camera_gradient=rng.standard_normal(12),
+        information=np.array([4.0, 1.0, 9.0, 2.0]), bound=np.zeros(4, bool),
+        by_camera=0.1 * rng.standard_normal((4, 12)), camera_shift=0.01 * rng.standard_normal((cameras, 6)),
+        camera_matrix=form @ form.T, camera_gradient=rng.standard_normal(12),
     )  # fmt: skip
     state = State(0.01 * rng.standard_normal(6), Similarity.identity(), 0.01 * rng.standard_normal((cameras, 6)))
     stage = _stage(6)
@@ -220,6 +220,29 @@ def test_surface_equations_are_the_derivative_of_the_cost(model: HeadModel) -> N
         assert (ahead - behind) / 2e-4 == pytest.approx(2 * gradient[i], rel=0.03, abs=0.01)
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-4)
     assert np.linalg.eigvalsh(matrix).min() > -1e-4
+
+
+def test_a_bound_pulls_a_head_in_that_stands_out_of_it_and_lets_one_inside_alone(model: HeadModel) -> None:
+    rows, count = np.array([40, 300, 900]), 3
+    vertices = model.vertices(np.zeros(0))[rows]
+    seen = SurfaceObservations(
+        vertex=rows, basis=model.basis("full", 6, rows), mean=vertices, normal=np.tile([0.0, 0.0, 1.0], (count, 1)),
+        seen_at=vertices, displacement=np.array([-2.0, 3.0, 3.0]), information=np.full(count, 4.0),
+        bound=np.array([True, True, False]), by_camera=np.zeros((count, 6)), camera_shift=np.zeros((1, 6)),
+        camera_matrix=np.zeros((6, 6)), camera_gradient=np.zeros(6),
+    )  # fmt: skip
+    here = SurfaceTerm(seen, _stage(6)).at(State(np.zeros(6), Similarity.identity(), np.zeros((1, 6))))
+    np.testing.assert_allclose(here.residual, [2.0, 0.0, -3.0], atol=1e-5)  # 2 mm out, 3 mm inside, a place 3 mm off
+
+    each = replace(seen, bound=np.array([True, True, True]))
+    one = NormalEquations.empty(6 + 7 + 6)
+    SurfaceTerm(each, _stage(6)).at(here.state).add_to(one)
+    alone = NormalEquations.empty(6 + 7 + 6)
+    kept = replace(seen, information=np.array([4.0, 0.0, 0.0]))
+    SurfaceTerm(kept, _stage(6)).at(here.state).add_to(alone)
+    np.testing.assert_array_equal(one.matrix, alone.matrix)  # the two that are kept have no say
+    np.testing.assert_array_equal(one.gradient, alone.gradient)
+    assert np.abs(one.gradient).max() > 0.0
 
 
 def _stage(modes: int) -> Stage:
@@ -257,7 +280,8 @@ def test_a_place_that_no_photograph_finds_again_is_misfit_there_and_nowhere_else
     count, nothing = len(seen), np.zeros((len(seen), 6))
     observed = SurfaceObservations(
         seen, np.zeros((len(model.modes), count, 3), np.float32), vertices[seen], np.tile([0.0, 0.0, 1.0], (count, 1)),
-        vertices[seen], np.full(count, off_mm), np.ones(count), nothing, np.zeros((1, 6)), np.eye(6), np.zeros(6),
+        vertices[seen], np.full(count, off_mm), np.ones(count), np.zeros(count, bool), nothing,
+        np.zeros((1, 6)), np.eye(6), np.zeros(6),
     )  # fmt: skip
     state = State(np.zeros(len(model.modes)), Similarity.identity(), np.zeros((1, 6)))
     misfit, cage = unfollowed(model, observed, state, lost), model.mean
