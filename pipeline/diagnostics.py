@@ -23,6 +23,7 @@ WARNING_CODES = (
     "scale-assumed",
     "scale-implausible",
     "shape-implausible",
+    "size-unusual",
     "unknown-key",
     "view",
     "view-left-out",

@@ -126,7 +126,7 @@ def reconstruct(
     fitted_masks = {name: np.isfinite(depth) for name, depth in depths.items()}
     figures = camera_figures(model, fit, silhouettes, rig, fitted_masks, before)
     widths = {camera.name: camera.intrinsics.width for camera in rig}
-    implausible = plausibility_warnings(fit, figures, widths, model.posed)
+    implausible = plausibility_warnings(fit, model, figures, widths)
     made, least_sigma = fit, LEAST_SIGMA
     if finer is not None:
         made, least_sigma = face_made(fit, model, population, finer, settings)

@@ -8,18 +8,21 @@ coefficient 3.5 standard deviations, scale 1.024), a draw of another population 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc
 
 from pipeline.diagnostics import ReportWarning
+from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
 from pipeline.results.reconstruction import CameraFigures
 from rig.errors import EigenheadError
 
 COEFFICIENT_MOST = 4.6  # standard deviations of the largest; the same rig scaled by 0.88 gives 4.6, by 1.12 gives 6.8
 CHANCE_LEAST = 1e-9  # of a sum of squares this large; a posterior mean is shrunk, so that good heads stay far below
+SIZE_MOST = 2.9  # standard deviations of the heads' own size, which good heads exceed once in 268
 SCALE_OFF_MOST = 0.07  # of size; 0.053 of a head from another population, more of a rig whose unit is wrong
 OUTSIDE_MOST_PX_PER_WIDTH = 0.003  # 3 px of 1024; at most 0.6 in 66 cameras of six good captures
 OUTSIDE_TIMES_MEDIAN = 6.0  # and this many times what the other cameras have
@@ -33,19 +36,19 @@ class ImplausibleResult(EigenheadError):
 
 
 def plausibility_warnings(
-    fit: Fit, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int], posed: range = range(0)
+    fit: Fit, model: HeadModel, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
 ) -> list[ReportWarning]:
     """What speaks against a result.
 
     Args:
         fit: coefficients in standard deviations; scale against the model's own size.
+        model: with the modes that the fit has.
         cameras: contour residuals of every camera.
         widths_px: of the pictures, by camera.
-        posed: which of the coefficients are expressions, and no standard deviations.
     """
     return [
-        *_shape(np.delete(fit.coefficients, np.asarray(posed, int))),
-        *_scale(fit.world_from_head.scale),
+        *_shape(np.delete(fit.coefficients, [row for row in model.posed if row < len(fit.coefficients)])),
+        *(_scale(fit.world_from_head.scale) or _size(*size_of(fit, model))),
         *_contours(cameras, widths_px),
     ]
 
@@ -80,6 +83,37 @@ def _scale(scale: float) -> list[ReportWarning]:
         "check the board's square size and the unit of the translations"
     )
     return [ReportWarning("scale-implausible", told)]
+
+
+def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
+    """How large the face is against the mean one's (RMS distance from its middle), and by how many standard deviations
+    of the population: shape and scale together, whichever of them took it up."""
+    by_mode = size_by_mode(model)
+    z = fit.coefficients[: len(by_mode)]
+    size = float(np.log(fit.world_from_head.scale) + z @ by_mode[: len(z)])
+    return float(np.exp(size)), size / float(np.linalg.norm(by_mode))
+
+
+@lru_cache(maxsize=2)
+def size_by_mode(model: HeadModel) -> Float[np.ndarray, " m"]:
+    """Derivative of the face's log size by each coefficient; 0 for expressions."""
+    face = model.levels["cage"].face_region
+    mean = model.mean[face].astype(float)
+    mean -= mean.mean(axis=0)
+    found = np.einsum("mvc,vc->m", model.modes[:, face], mean) / float((mean**2).sum())
+    found[list(model.posed)] = 0.0
+    return found
+
+
+def _size(size: float, sigmas: float) -> list[ReportWarning]:
+    if abs(sigmas) <= SIZE_MOST:
+        return []
+    told = (
+        f"the face is {size:.2f} times as large as a mean one ({abs(sigmas):.1f} standard deviations; of adults one in "
+        "300 is that far off): where it is no child's, compare a measurement with a tape, and check the board's square "
+        "size and the unit of the translations"
+    )
+    return [ReportWarning("size-unusual", told)]
 
 
 def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]) -> list[ReportWarning]:
