@@ -5,6 +5,7 @@ import numpy as np
 from pipeline.compiled import njit
 
 DARKER = 0.5  # of a difference, where a view is darker: most are shading that turns with the surface, few are shadows
+MOST_VOTE = 0.7  # of a view about the median, by the mean weight: a close-up that a shadow lies in is one of many
 LEAST_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it
 
 
@@ -29,6 +30,9 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
                 n += 1
         if n == 0:
             continue
+        cap, votes = MOST_VOTE * total / n, 0.0
+        for i in range(n):
+            votes += min(weights[order[i], v], cap)
         for c in range(3):
             for i in range(n):  # sorted by insertion: NumPy's sorting took a second to compile
                 value, place = colours[order[i], v, c], i
@@ -38,8 +42,8 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
                 ranks[place] = order[i]
             middle[c], passed = colours[ranks[n - 1], v, c], 0.0
             for i in range(n):
-                passed += weights[ranks[i], v]
-                if passed >= 0.5 * total:
+                passed += min(weights[ranks[i], v], cap)
+                if passed >= 0.5 * votes:
                     middle[c] = colours[ranks[i], v, c]
                     break
         norm = 0.0

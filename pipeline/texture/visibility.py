@@ -17,13 +17,12 @@ from pipeline.imaging.masks import box_around
 from pipeline.imaging.projection import project_points
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
-from pipeline.texture.visibility_kernels import sample_colours, visibility_weights
+from pipeline.texture.visibility_kernels import POOR, sample_colours, visibility_weights
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
 
 LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
-
-
+CLIPS = tuple(LINEAR[[242, 254]])  # linear; noise and sharpening reach a little below the end of the scale
 UNSHARP_PX = 1.0  # sigma; 1.5 is 0.6 dB worse on a head of another renderer
 POWER_PX = 2.0  # sigma of the window in which detail is told from noise
 NOISE_MARGIN = 2.0  # by which the median power is multiplied: its own scatter in that window is a third
@@ -49,7 +48,16 @@ def see_points(
     """What ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
     weights = see_weights(camera, silhouette, depth, points, normals, settings)
     pixels = project_points(camera, points)
-    return Sight(weights, sample_colours(image, pixels, weights, LINEAR, settings.footprint_px))
+    colours = sample_colours(image, pixels, weights, LINEAR, settings.footprint_px)
+    return Sight(weights * unclipped(colours), colours)
+
+
+def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
+    """1 below the end of the scale, next to nothing at it: how much brighter a place is no camera says there, and one
+    that is exposed longer than the others makes it darker than it is. Where all are clipped it is white all the same.
+    """
+    past = (colours.max(axis=1) - CLIPS[0]) / (CLIPS[1] - CLIPS[0])
+    return np.clip(1.0 - past, POOR, 1.0).astype(np.float32)
 
 
 def see_weights(

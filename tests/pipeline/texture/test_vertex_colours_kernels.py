@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from pipeline.texture.vertex_colours_kernels import LEAST_SHARE, blend_views
+from pipeline.texture.vertex_colours_kernels import LEAST_SHARE, MOST_VOTE, blend_views
 
 OUTLIER = 0.15
 
 
 def expected_blend(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
-    """One vertex after the other: weighted median of each channel, then a mean that trusts what is off it less."""
+    """One vertex after the other: weighted median of each channel, no view voting for much more than the mean one, then
+    a mean that trusts what is off it less."""
     out, views = np.zeros((weights.shape[1], 3)), np.zeros(weights.shape[1], np.uint8)
     for v in range(weights.shape[1]):
         seen = weights[:, v] > 0
@@ -19,7 +20,8 @@ def expected_blend(weights: np.ndarray, colours: np.ndarray, outlier: float) -> 
         middle = np.zeros(3)
         for c in range(3):
             order = np.argsort(colour[:, c], kind="stable")
-            middle[c] = colour[order, c][np.argmax(np.cumsum(own[order]) >= 0.5 * own.sum())]
+            votes = np.minimum(own, MOST_VOTE * own.mean())
+            middle[c] = colour[order, c][np.argmax(np.cumsum(votes[order]) >= 0.5 * votes.sum())]
         off = (colour - middle) / (outlier * middle + 0.005)
         off = np.where(off > 0, off, 0.5 * off)
         share = own / (1 + (off**2).mean(axis=1))
@@ -57,6 +59,15 @@ def test_the_median_of_two_equal_views_is_the_darker() -> None:
     found, _ = blend_views(np.ones((2, 1), np.float32), colours, OUTLIER)
     share = 1 / (1 + (0.4 / 0.035) ** 2)
     np.testing.assert_allclose(found[0], (0.2 + 0.6 * share) / (1 + share), rtol=1e-5)
+
+
+def test_a_close_up_in_a_shadow_does_not_outvote_the_others() -> None:
+    """It weighs as much as five others together, which agree: its photographer stood in the light."""
+    weights = np.array([6.0, 1.0, 1.2, 0.8, 1.1, 0.9], np.float32)[:, None]
+    colours = np.full((6, 1, 3), 0.24, np.float32)
+    colours[0] = 0.15
+    found, _ = blend_views(weights, colours, OUTLIER)
+    assert found[0].min() > 0.2
 
 
 def test_one_shadow_among_equal_views_is_damped_in_colour() -> None:

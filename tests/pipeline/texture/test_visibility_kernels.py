@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
+from pipeline.texture.visibility import unclipped
 from pipeline.texture.visibility_kernels import (
     POOR,
     SLOPE_SLACK,
@@ -12,6 +13,7 @@ from pipeline.texture.visibility_kernels import (
     sample_colours,
     visibility_weights,
 )
+from rig.colour_space import linear_from_srgb
 
 LIMITS = (1.5, 3.0, 0.35, 4.0)  # margin px, hidden mm, least facing, sharpness
 PIXEL_ANGLE = 1 / 1500
@@ -133,3 +135,11 @@ def test_white_and_what_is_not_seen() -> None:
     image, table = np.full((8, 8, 3), 255, np.uint8), np.linspace(0, 1, 256, dtype=np.float32) ** 2
     found = sample_colours(image, np.full((2, 2), 3.5), np.array([1, 0], np.float32), table, 0.7)
     np.testing.assert_allclose(found, [[1, 1, 1], [0, 0, 0]], atol=1e-6)
+
+
+def test_what_is_clipped_gives_way_to_what_is_not_and_is_white_where_all_is() -> None:
+    colours = linear_from_srgb(np.array([[128, 128, 128], [255, 200, 190], [248, 230, 220]]) / 255.0)
+    found = unclipped(colours.astype(np.float32))
+    assert found[0] == 1.0
+    assert found[1] == pytest.approx(POOR)
+    assert POOR < found[2] < 1.0
