@@ -38,6 +38,18 @@ class JobLog:
         return event
 
 
+class _OnStandardError(structlog.PrintLogger):
+    """Work goes on where a line cannot be written, as the standard library's handlers let it: the disk that holds the
+    lines is full, or whoever read them has gone."""
+
+    def msg(self, message: str) -> None:
+        with suppress(OSError):
+            super().msg(message)
+
+    log = debug = info = warn = warning = msg
+    fatal = failure = err = error = critical = exception = msg
+
+
 def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None:
     """Configures this process's logging. ``jobs``: the folder of jobs, of which each gets its lines in a file too."""
     shared = [
@@ -51,7 +63,7 @@ def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None
     structlog.configure(
         processors=[*shared, *([] if jobs is None else [JobLog(jobs)]), structlog.processors.format_exc_info, renderer],
         wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),  # the one of this moment: it may be replaced
+        logger_factory=lambda *_: _OnStandardError(sys.stderr),  # the one of this moment: it may be replaced
         cache_logger_on_first_use=False,
     )
     of_libraries = logging.StreamHandler(sys.stderr)

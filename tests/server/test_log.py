@@ -5,6 +5,8 @@ import json
 import logging
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 import structlog
@@ -61,3 +63,15 @@ def test_a_standard_error_that_was_replaced_gets_the_lines(monkeypatch: pytest.M
     first.close()
     log.info("after")
     assert json.loads(second.getvalue())["event"] == "after"
+
+
+def test_work_goes_on_where_no_line_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a service's does on a full disk: a request whose line could not be written ended its connection."""
+    levels, said = ("info", "warning", "error", "critical", "exception"), []
+    with suppress(OSError), Path("/dev/full").open("w") as full:  # the end tries the lines once more
+        monkeypatch.setattr(sys, "stderr", full)
+        set_up(as_json=True)
+        for level in levels:
+            getattr(structlog.get_logger(), level)("said in vain")
+            said.append(level)
+    assert tuple(said) == levels
