@@ -11,7 +11,7 @@ export default spoken({
   components: { Outline, Pager, Verdict },
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ labels: kept("captures form tags") || "", chosen: asked.get("capture") || "", verdict: asked.get("verdict") || "", tag: asked.get("tag") || "", tagging: "", sort: asked.get("sort") || "", outlines: false, drawing: 0, large: null, removal: null, sure: false, over: false, uploads: [], busy: "", session: asked.get("session") || openSession(), form: kept("captures form"), erasing: false, draft: {}, writing: false, method: "", model: "", template: "" }),
+  data: () => ({ labels: kept("captures form tags") || "", chosen: asked.get("capture") || "", verdict: asked.get("verdict") || "", tag: asked.get("tag") || "", tagging: "", sort: asked.get("sort") || "", outlines: false, drawing: 0, large: null, removal: null, sure: false, over: false, uploads: [], busy: "", session: asked.get("session") || openSession(), form: kept("captures form"), erasing: false, renaming: {}, draft: {}, writing: false, method: "", model: "", template: "" }),
   computed: {
     sessions() { return this.state.sessions || []; },
     open() { return this.sessions.find((s) => s.id === this.session) || null; },
@@ -64,8 +64,8 @@ export default spoken({
               <label class="field">Consent<input v-model="form.consent" maxlength="500" placeholder="who signed what, when"></label>
               <div class="line"><button class="b main-action" :disabled="!!busy">Begin</button><button type="button" class="b quiet" @click="form = null">Cancel</button></div></form>
             <template v-else-if="open">
-              <label class="field">Subject<input :value="open.label" maxlength="500" id="rename" @change="act('edit_session', open.id, { label: $event.target.value })"></label>
-              <label class="field">Consent<input :value="open.consent" maxlength="500" placeholder="no note" @change="act('edit_session', open.id, { consent: $event.target.value })"></label>
+              <label class="field">Subject<input :value="renaming.label ?? open.label" maxlength="500" id="rename" @input="renaming.label = $event.target.value" @blur="renaming = {}" @change="act('edit_session', open.id, { label: $event.target.value })"></label>
+              <label class="field">Consent<input :value="renaming.consent ?? open.consent" maxlength="500" placeholder="no note" @input="renaming.consent = $event.target.value" @blur="renaming = {}" @change="act('edit_session', open.id, { consent: $event.target.value })"></label>
               <div v-if="erasing" class="stack" style="gap: .4rem" role="alertdialog" aria-label="Erase the session"><p class="warn">{{ say('Erase {name}: {count} capture, heads, jobs and caches? It cannot be taken back. | Erase {name}: {count} captures, heads, jobs and caches? It cannot be taken back.', { name: name(open), count: count(open.id) }) }}</p>
                 <div class="line"><button class="b danger" id="erase-for-good" :disabled="!!busy" @click="act('erase', open.id); erasing = false">Erase for good</button><button class="b quiet" @click="erasing = false">Keep</button></div></div>
               <div v-else class="line"><button class="b" id="reconstruct-all" :disabled="!!busy || !count(open.id)" @click="act('reconstruct_session', open.id, { method, model, template })">Reconstruct all</button><button class="b quiet push" id="erase" :disabled="!!busy" @click="erasing = true">Erase ...</button></div>
