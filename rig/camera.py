@@ -4,6 +4,7 @@
 order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -153,6 +154,38 @@ class Camera:
             bad = (points[:, 2] <= 0) | (radius > self.intrinsics.distortion.turning_radius())
         pixels[bad] = np.nan
         return pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraStack:
+    """Several cameras that look at the same point, as arrays: what ``Camera`` does to many points of one camera, this
+    does to one point in many cameras."""
+
+    rotations: Float[np.ndarray, "n 3 3"]
+    translations: Float[np.ndarray, "n 3"]  # mm
+    lenses: Float[np.ndarray, "n 9"]
+    turning_radii: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera]) -> "CameraStack":
+        return cls(
+            np.array([camera.camera_from_world.rotation for camera in cameras]),
+            np.array([camera.camera_from_world.translation for camera in cameras]),
+            np.array([camera.intrinsics.values() for camera in cameras]),
+            np.array([camera.intrinsics.distortion.turning_radius() for camera in cameras]),
+        )
+
+    def project_with_jacobian(
+        self, point_world: Float[np.ndarray, " 3"]
+    ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+        """The point's pixel in each camera, and its derivative by the point (px / mm); NaN as in ``Camera.project``."""
+        points = self.rotations @ point_world + self.translations
+        with np.errstate(divide="ignore", invalid="ignore"):
+            by_point, _ = lens_jacobians(points, self.lenses)
+            pixels = lens_image(points, self.lenses)
+            radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
+            pixels[(points[:, 2] <= 0) | (radius > self.turning_radii)] = np.nan
+        return pixels, by_point @ self.rotations
 
 
 def lens_image(points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtri
 
-from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangulate
+from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, rays_of, triangulate
 from rig.capture import Features
 from rig.rig import Rig
 
@@ -52,13 +52,15 @@ def _consistent(
     pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, noise_px: float
 ) -> tuple[TriangulatedPoint | None, str | None]:
     """The point from all views; or from all but one, and that one's name; or nothing."""
-    point = triangulate(pixels, rig, noise_px=noise_px)
+    rays = rays_of(pixels, rig)
+    point = triangulate(pixels, rig, noise_px=noise_px, rays_world=rays)
     if _agrees(point, noise_px):
         return point, None
     if len(pixels) == 2:
         return None, None
     without = {
-        name: triangulate({k: v for k, v in pixels.items() if k != name}, rig, noise_px=noise_px) for name in pixels
+        name: triangulate({k: v for k, v in pixels.items() if k != name}, rig, noise_px=noise_px, rays_world=rays)
+        for name in pixels
     }
     dropped = min(without, key=lambda name: without[name].misfit(noise_px))
     return (without[dropped], dropped) if _agrees(without[dropped], noise_px) else (None, None)

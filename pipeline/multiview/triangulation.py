@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.terms import Problem, Residuals
+from rig.camera import CameraStack
 from rig.errors import EigenheadError
 from rig.rig import Rig
 
@@ -41,46 +42,57 @@ class TriangulatedPoint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReprojectionTerm:
-    """``(projected - picked) / noise`` of a world point (mm) in the views of ``pixels``; NaN behind a camera."""
+    """``(projected - picked) / noise`` of a world point (mm), by view; NaN behind a camera."""
 
-    pixels: Mapping[str, Float[np.ndarray, " 2"]]
-    rig: Rig
+    pixels: Float[np.ndarray, "n 2"]
+    cameras: CameraStack
     noise_px: float
 
     def at(self, position_world: Float[np.ndarray, " 3"]) -> Residuals:
-        views = [self.rig[name].project_with_jacobian(position_world[None]) for name in self.pixels]
-        projected, slopes = (np.concatenate(part) for part in zip(*views, strict=True))
-        miss = projected - np.array([np.asarray(pixel, float) for pixel in self.pixels.values()])
-        return Residuals(miss / self.noise_px, lambda: slopes / self.noise_px)
+        projected, slopes = self.cameras.project_with_jacobian(position_world)
+        return Residuals((projected - self.pixels) / self.noise_px, lambda: slopes / self.noise_px)
 
 
-def triangulate(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, *, noise_px: float) -> TriangulatedPoint:
+def triangulate(
+    pixels: Mapping[str, Float[np.ndarray, " 2"]],
+    rig: Rig,
+    *,
+    noise_px: float,
+    rays_world: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
+) -> TriangulatedPoint:
     """The point that minimises the sum of squared reprojection errors over the cameras in ``pixels``.
 
     Args:
         pixels: the picked pixel by camera.
         noise_px: standard deviation of a picked coordinate; the covariance and the end of the search scale with it.
+        rays_world: what ``rays_of`` finds for the pixels, where the caller has it already; of other cameras, too.
 
     Raises NoPoint where fewer than two views, parallel rays or a point behind a camera leave nothing to determine.
     """
     if len(pixels) < 2:
         raise NoPoint(f"{len(pixels)} view of a point; two at least are needed")
-    problem = Problem((ReprojectionTerm(pixels, rig, noise_px),), 3, np.add)
-    start = _start(pixels, rig)
+    picked = np.array([np.asarray(pixel, float) for pixel in pixels.values()])
+    term = ReprojectionTerm(picked, CameraStack.of([rig[name] for name in pixels]), noise_px)
+    problem = Problem((term,), 3, np.add)
+    start = _start(rays_of(pixels, rig) if rays_world is None else {name: rays_world[name] for name in pixels}, rig)
     at_start = problem.at(start)
     if not np.isfinite(at_start.cost):
         raise NoPoint("the rays of a point meet behind a camera")
     found = minimise(problem, start, LIMITS, at_start=at_start)
-    miss_px = -noise_px * ReprojectionTerm(pixels, rig, noise_px).at(found.value).residual
+    miss_px = -noise_px * term.at(found.value).residual
     covariance = np.linalg.inv(problem.equations(found.at).matrix)
     return TriangulatedPoint(found.value, covariance, dict(zip(pixels, miss_px, strict=True)))
 
 
-def _start(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig) -> Float[np.ndarray, " 3"]:
+def rays_of(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig) -> dict[str, Float[np.ndarray, " 3"]]:
+    """The unit direction in the world of each view's ray; taking the lens off it costs most of a triangulation."""
+    return {name: rig[name].rays_world(np.asarray(pixel, float)[None])[0] for name, pixel in pixels.items()}
+
+
+def _start(rays_world: Mapping[str, Float[np.ndarray, " 3"]], rig: Rig) -> Float[np.ndarray, " 3"]:
     """The point with the least sum of squared distances to the rays."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
-    for name, pixel in pixels.items():
-        ray = rig[name].rays_world(np.asarray(pixel, float)[None])[0]
+    for name, ray in rays_world.items():
         off_ray = np.eye(3) - np.outer(ray, ray)
         normal += off_ray
         right += off_ray @ rig[name].centre_world

@@ -46,6 +46,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_drift import ShiftEquations, ShiftTerm
 from pipeline.multiview.triangulation import ReprojectionTerm
 from pipeline.settings import FittingSettings
+from rig.camera import CameraStack
 from rig.geometry import Similarity, rotation_from_vector
 from tests.support.board_sessions import session
 from tests.support.photo_scene import ellipsoid_model
@@ -71,7 +72,8 @@ def case(term: Any, value: Any, moved: Callable[[Any, np.ndarray], Any], steps: 
 def reprojection() -> Case:
     rig, point = fan(640, 480), np.array([20.0, -30.0, 40.0])
     pixels = {camera.name: camera.project(point[None])[0] + 3.0 for camera in rig}
-    return case(ReprojectionTerm(pixels, rig, 1.5), point, np.add, np.full(3, 1e-2))
+    term = ReprojectionTerm(np.array(list(pixels.values())), CameraStack.of([rig[name] for name in pixels]), 1.5)
+    return case(term, point, np.add, np.full(3, 1e-2))
 
 
 def image_shift() -> Case:
