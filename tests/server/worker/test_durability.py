@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import pytest
 import sqlalchemy as sa
+from psycopg.errors import LockNotAvailable
 
 from rig.formats.archive import pack_folder
 from server.settings import ServiceSettings
@@ -182,14 +183,18 @@ def stop_between_writes(process: "subprocess.Popen[bytes]", sqlite: Path | None)
 
 @contextmanager
 def open_transaction(settings: dict[str, Any], job: str) -> Iterator[None]:
-    """On PostgreSQL, a session of ours that locked the job's row and says no more."""
+    """On PostgreSQL, a session that locked the job's row and says no more: one of ours, or the stopped worker's own where
+    it was stopped with the lock. Not one after the other: each of them would be waited for."""
     if not settings:
         yield
         return
     engine = sa.create_engine(ServiceSettings(**settings).url)
     connection = engine.connect()
-    query = "SELECT status FROM dbos.workflow_status WHERE workflow_uuid = :job FOR NO KEY UPDATE"
-    assert connection.scalar(sa.text(query), {"job": job}) == "PENDING"
+    query = "SELECT status FROM dbos.workflow_status WHERE workflow_uuid = :job FOR NO KEY UPDATE NOWAIT"
+    try:
+        assert connection.scalar(sa.text(query), {"job": job}) == "PENDING"
+    except sa.exc.OperationalError as error:
+        assert isinstance(error.orig, LockNotAvailable)
     try:
         yield
     finally:
