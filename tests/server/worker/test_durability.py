@@ -183,8 +183,8 @@ def stop_between_writes(process: "subprocess.Popen[bytes]", sqlite: Path | None)
 
 @contextmanager
 def open_transaction(settings: dict[str, Any], job: str) -> Iterator[None]:
-    """On PostgreSQL, a session that locked the job's row and says no more: one of ours, or the stopped worker's own where
-    it was stopped with the lock. Not one after the other: each of them would be waited for."""
+    """On PostgreSQL, a session that locked the job's row and says no more: one of ours, or the stopped worker's own
+    where it was stopped with the lock. Not one after the other: each of them would be waited for."""
     if not settings:
         yield
         return
@@ -194,7 +194,8 @@ def open_transaction(settings: dict[str, Any], job: str) -> Iterator[None]:
     try:
         assert connection.scalar(sa.text(query), {"job": job}) == "PENDING"
     except sa.exc.OperationalError as error:
-        assert isinstance(error.orig, LockNotAvailable)
+        if not isinstance(error.orig, LockNotAvailable):
+            raise
     try:
         yield
     finally:
