@@ -17,6 +17,7 @@ import httpx
 import pytest
 import sqlalchemy as sa
 from psycopg.errors import LockNotAvailable
+from sqlalchemy.exc import OperationalError
 
 from rig.formats.archive import pack_folder
 from server.settings import ServiceSettings
@@ -193,7 +194,7 @@ def open_transaction(settings: dict[str, Any], job: str) -> Iterator[None]:
     query = "SELECT status FROM dbos.workflow_status WHERE workflow_uuid = :job FOR NO KEY UPDATE NOWAIT"
     try:
         assert connection.scalar(sa.text(query), {"job": job}) == "PENDING"
-    except sa.exc.OperationalError as error:
+    except OperationalError as error:
         if not isinstance(error.orig, LockNotAvailable):
             raise
     try:
