@@ -58,10 +58,10 @@ def interpolate(
                 continue
             a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
             ax, ay, bx, by, cx, cy = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
-            area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-            wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area / depths[a]
-            wb = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area / depths[b]
-            wc = ((ax - x) * (by - y) - (ay - y) * (bx - x)) / area / depths[c]
+            # twice the areas of the parts over depth: the triangle's own area cancels
+            wa = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / depths[a]
+            wb = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / depths[b]
+            wc = ((ax - x) * (by - y) - (ay - y) * (bx - x)) / depths[c]
             total = wa + wb + wc
             for k in range(values.shape[1]):
                 out[y, x, k] = (wa * values[a, k] + wb * values[b, k] + wc * values[c, k]) / total
