@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.eigenheads.expressions import Expressions, no_expressions, packed, unpacked
+from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
 
 FORMAT = "eigenhead-model/2"  # 2: with expressions
@@ -77,11 +78,9 @@ def save_model(path: Path, parts: ModelParts) -> None:
     }
     for name, (rows, faces) in parts.decimated.items():
         arrays[f"{name}_rows"], arrays[f"{name}_faces"] = np.asarray(rows, np.int32), np.asarray(faces, np.int32)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        np.savez_compressed(file, **arrays)
-    part.replace(path)
+    packed_arrays = BytesIO()
+    np.savez_compressed(packed_arrays, **arrays)
+    write_atomically(path, packed_arrays.getvalue())
 
 
 def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:

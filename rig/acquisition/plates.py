@@ -10,6 +10,7 @@ A session needs one plate of each camera in memory; captures get links to the fi
 import json
 import os
 import shutil
+import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -26,7 +27,8 @@ from rig.errors import InputError
 from rig.formats.images import IMAGE_SUFFIXES, read_image, write_image
 
 FORMAT = "eigenhead-plates/1"
-VERSIONS_MOST = 6
+VERSIONS_MOST = 6  # the one in use and refused ones included
+UNFINISHED_S = 3600.0  # no version takes so long to write
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 
 
@@ -85,6 +87,7 @@ def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refuse
     """Writes plates as a version beside those in use; its id. ``refused``: why they are not put to use."""
     moment = datetime.now(UTC)
     identity = moment.strftime("%Y%m%dT%H%M%S%fZ")
+    _remove_unfinished(folder)
     fresh = _versions(folder) / f"{identity}.new"
     targets = [
         (fresh / name / f"{i:03}.png", plate) for name, plates in images.items() for i, plate in enumerate(plates)
@@ -96,6 +99,7 @@ def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refuse
     document = {"format": FORMAT, "id": identity, "taken": taken, "noise": noise, "refused": [*refused]}
     write_atomically(fresh / "plates.json", json.dumps(document, indent=1).encode())
     fresh.rename(fresh.with_suffix(""))
+    _remove_old(folder)
     return identity
 
 
@@ -109,12 +113,24 @@ def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
     if folder.exists():
         folder.rename(_versions(folder) / _version_of(folder).id)
     wanted.rename(folder)
-    for old in plates_versions(folder)[VERSIONS_MOST:]:
-        if not old.in_use:
-            shutil.rmtree(_versions(folder) / old.id, ignore_errors=True)
+    _remove_old(folder)
     with suppress(OSError):  # the first ones leave nothing behind
         _versions(folder).rmdir()
     return read_plates(folder, names)
+
+
+def _remove_old(folder: Path) -> None:
+    """Versions beyond the newest ``VERSIONS_MOST``, but for the one in use."""
+    for old in plates_versions(folder)[VERSIONS_MOST:]:
+        if not old.in_use:
+            shutil.rmtree(_versions(folder) / old.id, ignore_errors=True)
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """What a process left that ended while it wrote a version."""
+    for left in _versions(folder).glob("*.new"):
+        if time.time() - left.stat().st_mtime > UNFINISHED_S:
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def plates_versions(folder: Path) -> list[PlatesVersion]:

@@ -148,6 +148,8 @@ class GenicamDriver:
         if camera.width is not None and camera.height is not None:
             region = ("set_region", 0, 0, camera.width, camera.height)
             settings.append(("width x height", f"{camera.width} x {camera.height}", [region]))
+        elif camera.width is not None or camera.height is not None:
+            unmet.append("width and height are set together: one of them is missing")
         if camera.exposure_ms is not None:
             self._switch_off("exposure_time_auto")
             settings.append(("exposure_ms", camera.exposure_ms, [("set_exposure_time", camera.exposure_ms * 1000)]))

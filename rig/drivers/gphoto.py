@@ -46,6 +46,7 @@ class GphotoDriver:
             with _bus:
                 self._device = self._open_port(self._port())
         except self._gp.GPhoto2Error as error:
+            _ports_by_serial.pop(_serial_of(self._camera), None)  # plugged in anew it has another port
             raise CameraNotFound(self._camera, str(error)) from error
 
     def configure(self) -> tuple[str, ...]:
@@ -108,13 +109,14 @@ class GphotoDriver:
         identity = self._camera.identity
         if identity.startswith("ptpip:"):
             return identity
-        if identity not in _ports_by_serial:
+        sought = _serial_of(self._camera)
+        if sought not in _ports_by_serial:
             cameras = self._gp.Camera.autodetect()
             for port in [cameras.get_value(index) for index in range(cameras.count())]:
                 serial = self._serial(port)
                 if serial is not None:
                     _ports_by_serial[serial.lstrip("0")] = port
-        port = _ports_by_serial.get(identity.lstrip("0"))
+        port = _ports_by_serial.get(sought)
         if port is None:
             found = ", ".join(sorted(_ports_by_serial)) or "none"
             raise CameraNotFound(self._camera, f"serial numbers found: {found}")
@@ -157,6 +159,11 @@ class GphotoDriver:
         except self._gp.GPhoto2Error:
             return False
         return True
+
+
+def _serial_of(camera: CameraConfig) -> str:
+    """As ports are kept by: cameras write leading zeros, labels on their bodies do not."""
+    return camera.identity.lstrip("0")
 
 
 def _nearest_choice(value: Any, choices: list[str]) -> str | None:

@@ -18,6 +18,7 @@ from rig.formats.rig_toml import CameraConfig
 _READ_LIMIT_S = 1.0  # of VideoCapture.grab, which takes no timeout of its own: it may overstay by that much
 _STALE_S = 1.0  # a kernel stamp further from now than this is of another clock
 _ADDRESSES = ("http://", "https://")
+_NEAR = 0.05
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
@@ -102,7 +103,7 @@ class VideoCaptureDriver:
         unmet = [
             f"{key} {wanted} was not taken (it is {capture.get(prop):g})"
             for key, wanted, prop, value in self._settings()
-            if not capture.set(prop, value) or abs(capture.get(prop) - value) > 0.05 * abs(value)
+            if not capture.set(prop, value) or not _is_taken(prop, value, capture.get(prop))
         ]
         return tuple(unmet)
 
@@ -174,6 +175,11 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
     if image is None:
         raise DriverError(camera.name, f"a frame of {len(data)} bytes is no picture that OpenCV can decode")
     return image
+
+
+def _is_taken(prop: int, wanted: float, found: float) -> bool:
+    """Numbers within a twentieth, since cameras have steps; a pixel format is a code, which nothing comes near to."""
+    return abs(found - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 
 def _reason(error: Exception, otherwise: str) -> str:

@@ -7,6 +7,7 @@ indices swap. deploy/rig.example.toml shows every key.
 
 import dataclasses
 import difflib
+import math
 import re
 import tomllib
 import types
@@ -18,6 +19,7 @@ from typing import Any, Literal
 
 from rig.errors import InputError
 from rig.formats.cameras_json import name_fault
+from rig.formats.capture_folder import PLATES_MOST
 
 FORMAT = "eigenhead-rig/1"
 DriverName = Literal["opencv", "gphoto", "genicam", "replay", "simulated"]
@@ -36,6 +38,14 @@ _CAMERA_BOUNDS = {
     "exposure_ms": (0.001, 60_000),
     "gain_db": (-60, 60),
     "white_balance_k": (1000, 20_000),
+}
+
+_SHOT_MOST = {
+    "timeout_s": 600,
+    "open_timeout_s": 600,
+    "warm_up_frames": 1000,
+    "plates": PLATES_MOST,
+    "plates_over_s": 600,
 }
 
 
@@ -181,6 +191,8 @@ def _rig_faults(config: RigConfig) -> list[str]:
     faults.extend(
         f"lights.outputs: {output} is no output; 0 to 3" for output in config.lights.outputs if output not in range(4)
     )
+    if not 0 <= config.lights.settle_s <= 60:
+        faults.append(f"lights.settle_s: {config.lights.settle_s} is not between 0 and 60")
     faults.extend(f"shot.{fault}" for fault in _shot_faults(config.shot))
     return faults
 
@@ -230,6 +242,8 @@ def _trigger_faults(trigger: TriggerConfig) -> list[str]:
         )
     if not 1 <= trigger.pulse_us <= 500_000:
         faults.append(f"pulse_us: {trigger.pulse_us} is not between 1 and 500000")
+    if not 300 <= trigger.baud <= 4_000_000:
+        faults.append(f"baud: {trigger.baud} is not between 300 and 4000000")
     if not 0.1 <= trigger.window_s <= 60:
         faults.append(f"window_s: {trigger.window_s} is not between 0.1 and 60")
     return faults
@@ -238,10 +252,13 @@ def _trigger_faults(trigger: TriggerConfig) -> list[str]:
 def _shot_faults(shot: ShotConfig) -> list[str]:
     least = {"warm_up_frames": 1, "plates": 1, "plates_over_s": 0}
     values = {field.name: getattr(shot, field.name) for field in dataclasses.fields(shot)}
-    return [
+    faults = [
         f"{name}: {value} is too small; {f'at least {least[name]}' if name in least else 'more than 0'}"
         for name, value in values.items()
         if (value < least[name] if name in least else value <= 0)
+    ]
+    return faults + [
+        f"{name}: {values[name]} is too large; at most {most}" for name, most in _SHOT_MOST.items() if values[name] > most
     ]
 
 
@@ -283,6 +300,8 @@ def _read_value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
         return float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
         faults.append(f"{where}: {value!r} is no {_WORDS.get(hint, hint)}")
+    elif isinstance(value, float) and not math.isfinite(value):
+        faults.append(f"{where}: {value} is no finite number")
     return value
 
 

@@ -13,6 +13,7 @@ from nicegui import app as pages
 from starlette.datastructures import Headers
 from starlette.types import Scope
 
+from rig.atomic_write import write_atomically
 from server.address import is_loopback
 from server.errors import Forbidden, Unknown
 from server.services.keys import LOCAL, SCOPES, Caller
@@ -53,10 +54,9 @@ def permit(caller: Caller | None, scope: str) -> Caller:
 def cookie_secret(data: Path) -> str:
     """Signs the session cookie; made once, so that a restart signs nobody out."""
     path = data / "console" / "secret"
-    if not path.is_file():
+    if not path.is_file() or not path.stat().st_size:  # an empty one is left where a full disk met the first start
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        path.touch(mode=0o600)
-        path.write_text(secrets.token_hex(32))
+        write_atomically(path, secrets.token_hex(32).encode(), mode=0o600)
     return path.read_text()
 
 

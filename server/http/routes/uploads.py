@@ -97,6 +97,8 @@ async def tus_patch(
         raise Problem(415, "unsupported-media-type", "Send application/offset+octet-stream.")
     record = await service.threads.disk(_own, service, caller, upload_id)
     with service.uploads.lock(record):
+        # read again: the request that held the lock before may have made the capture
+        record = await service.threads.disk(_own, service, caller, upload_id)
         return await _append(service, record, upload_offset, request.stream(), upload_checksum)
 
 

@@ -1,5 +1,6 @@
 """Clean plates on disk: versions that are kept, put to use, and let go."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,18 @@ def test_old_versions_are_let_go(tmp_path: Path) -> None:
     kept = plates_versions(tmp_path / "plates")
     assert len(kept) == VERSIONS_MOST
     assert value_in_use(tmp_path / "plates") == VERSIONS_MOST + 2
+
+
+def test_refused_versions_are_let_go_and_so_is_what_a_crash_left(tmp_path: Path) -> None:
+    folder, left = tmp_path / "plates", tmp_path / "plates.versions" / "20260101T000000000000Z.new"
+    write_plates(folder, pictures(10))
+    left.mkdir(parents=True)
+    os.utime(left, (0.0, 0.0))
+    for value in range(VERSIONS_MOST + 3):
+        keep_plates(folder, pictures(value), ("cam00: occupied: somebody",))
+    assert not left.exists()
+    assert len(list(left.parent.iterdir())) == VERSIONS_MOST
+    assert value_in_use(folder) == 10
 
 
 def test_plates_that_came_from_elsewhere_become_a_version(tmp_path: Path) -> None:

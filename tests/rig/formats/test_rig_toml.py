@@ -145,3 +145,18 @@ def test_files_that_are_no_rig(tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text("format = ")
     with pytest.raises(InputError, match="is no TOML"):
         read_rig_config(tmp_path / "rig.toml")
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"lights": {"settle_s": -1.0}}, "lights.settle_s: -1.0 is not between 0 and 60"),
+        ({"shot": {"timeout_s": float("nan")}}, "shot.timeout_s: nan is no finite number"),
+        ({"shot": {"open_timeout_s": float("inf")}}, "shot.open_timeout_s: inf is no finite number"),
+        ({"shot": {"timeout_s": 1e6}}, "shot.timeout_s: 1000000.0 is too large; at most 600"),
+        ({"shot": {"plates": 1_000_000_000}}, "shot.plates: 1000000000 is too large; at most 32"),
+        ({"trigger": {"port": "/dev/serial/by-id/box", "baud": 0}}, "trigger: baud: 0 is not between 300 and 4000000"),
+    ],
+)
+def test_values_that_would_break_a_shot_are_refused(changes: dict[str, Any], fault: str) -> None:
+    assert fault in faults_of(document(**changes))

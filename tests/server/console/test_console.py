@@ -101,6 +101,14 @@ def test_the_cookie_secret_stays_and_is_the_owners_alone(tmp_path: Path) -> None
     assert (tmp_path / "console" / "secret").stat().st_mode & 0o077 == 0
 
 
+def test_a_cookie_secret_that_a_full_disk_left_empty_is_made_again(tmp_path: Path) -> None:
+    path = tmp_path / "console" / "secret"
+    path.parent.mkdir()
+    path.touch()
+    assert len(cookie_secret(tmp_path)) == 64
+    assert path.stat().st_mode & 0o077 == 0
+
+
 def test_a_removal_waits_and_can_be_taken_back() -> None:
     removals, removed = Removals(wait_s=0.15), []
     for name in ("a", "b"):
