@@ -5,6 +5,7 @@
 #   deploy/setup.sh --quick   what `make demo` needs: each command compiles the loops of its own job before it begins
 #   deploy/setup.sh --docs    also what `make docs` and the documents' tests need (dependency group docs)
 #   deploy/setup.sh --tests   that, and the Debian packages without which some tests skip
+#   deploy/setup.sh --extra NAME   an optional part, gphoto for instance, from then on too
 #
 # Needs bash and python3 (3.11 or newer), nothing else. As root it installs missing Debian packages; without root it
 # names the one command to run. Says what it did; does nothing, in milliseconds, where nothing is to do.
@@ -22,18 +23,26 @@ say() { echo "setup: $*" >&2; }
 fail() { say "$*"; exit 1; }
 
 more="" quick=""
-for argument in "$@"; do
-  case "$argument" in
+mapfile -t extras < <(cat .venv/.extras 2>/dev/null || true)
+while [ $# -gt 0 ]; do
+  case "$1" in
     --quick) quick=quick ;;
     --docs) more=${more:-docs} ;;
     --tests) more=tests ;;
-    *) fail "unknown option $argument; it knows --quick, --docs and --tests" ;;
+    --extra)
+      [ $# -gt 1 ] || fail "--extra needs a name; pyproject.toml lists them"
+      extras+=("$2")
+      shift
+      ;;
+    *) fail "unknown option $1; it knows --quick, --docs, --tests and --extra NAME" ;;
   esac
+  shift
 done
+mapfile -t extras < <(printf '%s\n' "${extras[@]}" | sed '/^$/d' | sort -u)
 
 # A stamp holds what the environment was made from; one for each option, as they ask for more.
 stamp=".venv/.ready${more:+-$more}"
-wanted="$(cat uv.lock pyproject.toml deploy/setup.sh deploy/wheel_imports.py | sha256sum) $PWD"
+wanted="$(cat uv.lock pyproject.toml deploy/setup.sh deploy/wheel_imports.py | sha256sum) $PWD${extras[*]:+ ${extras[*]}}"
 for made in "$stamp" ${quick:+.venv/.ready-quick}; do
   if [ -x .venv/bin/python ] && [ "$(cat "$made" 2>/dev/null)" = "$wanted" ]; then
     exit 0
@@ -90,7 +99,8 @@ sys.exit(not any(map(os.path.exists, (os.environ.get("SSL_CERT_FILE", ""), "/etc
 fi
 
 say "environment: $("$uv" --version | cut -d' ' -f1-2) sync of uv.lock into .venv"
-"$uv" sync --locked --quiet ${more:+--group docs}
+"$uv" sync --locked --quiet ${more:+--group docs} "${extras[@]/#/--extra=}"
+printf '%s\n' "${extras[@]}" >.venv/.extras
 
 # The only sure sign of a working EGL is a context.
 egl_works() { .venv/bin/python -c 'import moderngl; moderngl.create_context(standalone=True, backend="egl").release()' 2>/dev/null; }

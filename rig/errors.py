@@ -21,3 +21,8 @@ class InputError(EigenheadError):
         self.subject = subject
         self.faults = tuple(faults)
         super().__init__(f"{subject}: " + "; ".join(self.faults))
+
+
+def how_to_install(extra: str) -> str:
+    """What to type for an optional part of the project, in a checkout and beside a wheel."""
+    return f"run `deploy/setup.sh --extra {extra}`, or install eigenhead[{extra}] where a wheel was installed"

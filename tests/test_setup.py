@@ -92,17 +92,24 @@ def test_no_network_is_said(fetch_uv: ModuleType, tmp_path: Path, monkeypatch: p
         fetch_uv.main(tmp_path)
 
 
-def setup(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def setup(folder: Path, *arguments: str, path: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """``path`` comes before the machine's own programs."""
     command = ["bash", "deploy/setup.sh", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+    environment = os.environ | ({} if path is None else {"PATH": f"{path}:{os.environ['PATH']}"})
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, check=False, env=environment)
+
+
+def checkout(folder: Path) -> None:
+    """What setup.sh looks at, and an environment."""
+    for name in ("uv.lock", "pyproject.toml"):
+        shutil.copy(ROOT / name, folder)
+    shutil.copytree(ROOT / "deploy", folder / "deploy", ignore=shutil.ignore_patterns("firmware"))
+    (folder / ".venv" / "bin").mkdir(parents=True)
+    (folder / ".venv" / "bin" / "python").symlink_to(sys.executable)
 
 
 def test_setup_is_quick_and_silent_where_nothing_is_to_do(tmp_path: Path) -> None:
-    for name in ("uv.lock", "pyproject.toml"):
-        shutil.copy(ROOT / name, tmp_path)
-    shutil.copytree(ROOT / "deploy", tmp_path / "deploy", ignore=shutil.ignore_patterns("firmware"))
-    (tmp_path / ".venv" / "bin").mkdir(parents=True)
-    (tmp_path / ".venv" / "bin" / "python").symlink_to(sys.executable)
+    checkout(tmp_path)
     stamp = (
         'echo "$(cat uv.lock pyproject.toml deploy/setup.sh deploy/wheel_imports.py | sha256sum) $PWD" > .venv/.ready'
     )
@@ -111,6 +118,18 @@ def test_setup_is_quick_and_silent_where_nothing_is_to_do(tmp_path: Path) -> Non
     outcome = setup(tmp_path)
     assert time.perf_counter() - begun < 1.0
     assert (outcome.returncode, outcome.stdout, outcome.stderr) == (0, "", "")
+
+
+def test_an_optional_part_is_asked_for_again_by_every_later_setup(tmp_path: Path) -> None:
+    checkout(tmp_path)
+    (tmp_path / ".venv" / ".extras").write_text("heic\n")
+    uv = tmp_path / "bin" / "uv"
+    uv.parent.mkdir()
+    uv.write_text('#!/bin/sh\n[ "$1" = --version ] && echo uv 9.9.9 && exit 0\necho "$@" >asked\nexit 1\n')
+    uv.chmod(0o755)
+    assert setup(tmp_path, "--extra", "usd", path=uv.parent).returncode == 1
+    assert (tmp_path / "asked").read_text().split()[-2:] == ["--extra=heic", "--extra=usd"]
+    assert (tmp_path / ".venv" / ".extras").read_text() == "heic\n", "what could not be had is not remembered"
 
 
 def test_setup_refuses_an_unknown_option() -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout, ImageRgb
 from rig.drivers.opencv import decode_jpeg
+from rig.errors import how_to_install
 from rig.formats.rig_toml import CameraConfig
 
 # Two cameras that open at once would both walk the USB bus and claim each other's interface.
@@ -25,7 +26,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     try:
         return GphotoDriver(camera, importlib.import_module("gphoto2"))
     except ImportError as error:
-        raise DriverMissing(camera, "python-gphoto2: pip install 'eigenhead[gphoto]'") from error
+        raise DriverMissing(camera, f"python-gphoto2: {how_to_install('gphoto')}") from error
 
 
 class GphotoDriver:

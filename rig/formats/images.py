@@ -18,7 +18,7 @@ from PIL import Image, UnidentifiedImageError
 
 from rig.atomic_write import write_atomically
 from rig.capture import ImageRgb
-from rig.errors import InputError
+from rig.errors import InputError, how_to_install
 from rig.formats.work_size import at_share, halvings
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")  # JPEG covers the MPO that many phones write into a .jpg
@@ -162,7 +162,7 @@ def heif_header(data: bytes) -> Any:
     try:
         import pi_heif
     except ModuleNotFoundError:
-        raise InputError("picture", ["is HEIC, which needs the extra heic: pip install 'eigenhead[heic]'"]) from None
+        raise InputError("picture", [f"is HEIC, which needs an optional part: {how_to_install('heic')}"]) from None
     return pi_heif.open_heif(BytesIO(data))
 
 

@@ -258,7 +258,9 @@ def _shot_faults(shot: ShotConfig) -> list[str]:
         if (value < least[name] if name in least else value <= 0)
     ]
     return faults + [
-        f"{name}: {values[name]} is too large; at most {most}" for name, most in _SHOT_MOST.items() if values[name] > most
+        f"{name}: {values[name]} is too large; at most {most}"
+        for name, most in _SHOT_MOST.items()
+        if values[name] > most
     ]
 
 

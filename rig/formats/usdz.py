@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from rig.errors import EigenheadError
+from rig.errors import EigenheadError, how_to_install
 from rig.formats.glb import ROUGHNESS
 from rig.mesh import Mesh
 
@@ -24,7 +24,7 @@ class NoUsd(EigenheadError):
     """The extra is not installed."""
 
     def __init__(self) -> None:
-        super().__init__("head.usdz needs usd-core: install eigenhead[usd], or leave usdz out of the formats")
+        super().__init__(f"head.usdz needs usd-core: {how_to_install('usd')}; or leave usdz out of the formats")
 
 
 def check_usd() -> None:

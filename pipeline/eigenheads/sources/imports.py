@@ -28,6 +28,7 @@ from pipeline.eigenheads.pca import Components, orthogonalised
 from pipeline.eigenheads.sources.foreign import CannotImport, Foreign, read_obj
 from pipeline.eigenheads.subdivision import boundary_loops, close_loop, vertex_areas
 from pipeline.eigenheads.training.training import Training, above_neck, face_region, finish
+from rig.errors import how_to_install
 from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
 
@@ -166,7 +167,7 @@ def read_statismo(path: Path) -> Foreign:
     try:
         import h5py
     except ImportError:
-        raise CannotImport(path, "HDF5 needs h5py: install eigenhead[imports]") from None
+        raise CannotImport(path, f"HDF5 needs h5py: {how_to_install('imports')}") from None
     try:
         with h5py.File(path) as file:
             top = "shape/" if "shape/model" in file else ""
