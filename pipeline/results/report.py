@@ -99,8 +99,8 @@ class TemplateReport(TypedDict):
 
 
 class SimilarityReport(TypedDict):
-    """x_world = scale (rotation x_head + translation), mm: the paper's form (section 4.2), where the scale holds for the
-    translation, too."""
+    """x_world = scale (rotation x_head + translation), mm: the paper's form (section 4.2), in which the scale holds for
+    the translation, too."""
 
     scale: float
     rotation: list[list[float]]

@@ -1,6 +1,8 @@
 """Multipart bodies as they come over the wire, in pieces of any size: what is taken, and what is refused by name."""
 
 import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,10 +12,17 @@ from fastapi import Request
 
 from rig.errors import EigenheadError
 from server.errors import DiskFull, TooLarge
+from server.services.service import Service
 from server.services.threads import Threads
 from server.settings import ServiceSettings
 from server.storage.store import Store
-from server.wire.multipart import FIELD_BYTES, check_length, described_form, receive_multipart
+from server.wire.multipart import (
+    FIELD_BYTES,
+    check_length,
+    described_form,
+    receive_calibration_pictures,
+    receive_multipart,
+)
 from server.wire.problems import Problem
 
 DATA = bytes(range(256)) * 40
@@ -59,26 +68,75 @@ def test_a_large_file_is_written_on_the_way(tmp_path: Path) -> None:
     assert received(tmp_path, body(part("file", large)), piece=100_000)[0] == large
 
 
+SEND_ONE = "Send multipart/form-data with the archive as the part 'file'."
+BREAKS_OFF = "The multipart body breaks off before its end; send it again."
+
+
 @pytest.mark.parametrize(
-    ("data", "content_type", "status", "kind"),
+    ("data", "content_type", "status", "kind", "detail", "errors"),
     [
-        (b"{}", "application/json", 415, "unsupported-media-type"),
-        (body(part("file", DATA)), "multipart/form-data", 415, "unsupported-media-type"),
-        (body(part("file", DATA)), "multipart/form-data; boundary=" + "x" * 300, 400, "malformed-body"),
-        (b"no boundary here", TYPE, 400, "malformed-body"),
-        (part("file", DATA), TYPE, 400, "malformed-body"),
-        (body(part("file", DATA))[:500], TYPE, 400, "malformed-body"),
-        (body(part("label", b"Anna")), TYPE, 422, "file-missing"),
-        (body(part("file", DATA), part("file", DATA)), TYPE, 422, "file-repeated"),
-        (body(part("file", DATA), part("label", b"x" * (FIELD_BYTES + 1))), TYPE, 413, "field-too-large"),
+        (b"{}", "application/json", 415, "unsupported-media-type", SEND_ONE, ()),
+        (body(part("file", DATA)), "multipart/form-data", 415, "unsupported-media-type", SEND_ONE, ()),
+        (
+            body(part("file", DATA)),
+            "multipart/form-data; boundary=" + "x" * 300,
+            400,
+            "malformed-body",
+            "The multipart boundary is no good (",
+            (),
+        ),
+        (b"no boundary here", TYPE, 400, "malformed-body", "The body is no multipart/form-data (", ()),
+        (part("file", DATA), TYPE, 400, "malformed-body", BREAKS_OFF, ()),
+        (body(part("file", DATA))[:500], TYPE, 400, "malformed-body", BREAKS_OFF, ()),
+        (
+            body(part("label", b"Anna")),
+            TYPE,
+            422,
+            "file-missing",
+            "The form has no part 'file' that holds the archive.",
+            ("file: missing",),
+        ),
+        (
+            body(part("file", DATA), part("file", DATA)),
+            TYPE,
+            422,
+            "file-repeated",
+            "The form has several parts 'file'; send one archive.",
+            ("file: repeated",),
+        ),
+        (
+            body(part("file", DATA), part("label", b"x" * (FIELD_BYTES + 1))),
+            TYPE,
+            413,
+            "field-too-large",
+            "The form field 'label' is longer than 65,536 bytes; the archive is the part 'file'.",
+            (),
+        ),
     ],
 )
 def test_what_is_no_such_body_is_refused(
-    tmp_path: Path, data: bytes, content_type: str, status: int, kind: str
+    tmp_path: Path, data: bytes, content_type: str, status: int, kind: str, detail: str, errors: tuple[str, ...]
 ) -> None:
     with pytest.raises(Problem) as refused:
         received(tmp_path, data, content_type)
-    assert (refused.value.status, refused.value.kind) == (status, kind)
+    assert (refused.value.status, refused.value.kind, tuple(refused.value.errors)) == (status, kind, errors)
+    assert str(refused.value.detail).startswith(detail)
+
+
+def test_names_and_values_that_are_no_utf_8_are_taken_with_a_mark(tmp_path: Path) -> None:
+    named = b'--edge\r\nContent-Disposition: form-data; name="l\xffabel"\r\n\r\n\xfeAnna\r\n'
+    assert received(tmp_path, body(named, part("file", DATA)))[1] == {"l\ufffdabel": "\ufffdAnna"}
+
+
+def test_a_part_without_a_name_is_no_file(tmp_path: Path) -> None:
+    nameless = b"--edge\r\nContent-Disposition: form-data\r\n\r\nx\r\n--edge\r\nContent-Type: text/plain\r\n\r\ny\r\n"
+    assert received(tmp_path, body(nameless, part("file", DATA))) == (DATA, {"": "y"})
+
+
+def test_headers_beside_the_disposition_name_nothing(tmp_path: Path) -> None:
+    other = b'--edge\r\nX-First: a; name="b"\r\nContent-Disposition: form-data; name="label"\r\n'
+    sent = body(other + b'X-Last: c; name="d"\r\n\r\nAnna\r\n', part("file", DATA))
+    assert received(tmp_path, sent, piece=3)[1] == {"label": "Anna"}
 
 
 def test_a_field_may_be_as_long_as_the_limit(tmp_path: Path) -> None:
@@ -125,3 +183,48 @@ def test_a_form_is_described(tmp_path: Path) -> None:
             "settings": {"type": "string", "description": "JSON object"},
         },
     }
+
+
+def pictures_of(folder: Path, *fields: bytes) -> tuple[str, bytes, str]:
+    """What becomes of an archive of calibration pictures: who takes it, its bytes, its label."""
+    data = body(*fields, part("file", DATA))
+
+    def taken_as(what: str) -> Callable[[Path, Path, str], tuple[str, bytes, str]]:
+        return lambda archive, into, label: (what, archive.read_bytes(), label)
+
+    async def stream() -> Any:
+        yield data
+
+    @contextmanager
+    def incoming() -> Iterator[Path]:
+        yield folder
+
+    service = SimpleNamespace(
+        threads=Threads(),
+        settings=ServiceSettings(data=folder),
+        store=SimpleNamespace(incoming=incoming, reserve=lambda bytes_needed, free: None),
+        accept_board_pictures=taken_as("board"),
+        accept_photographs=taken_as("scene"),
+    )
+    request = SimpleNamespace(headers={"content-type": TYPE, "content-length": str(len(data))}, stream=stream)
+    told = asyncio.run(receive_calibration_pictures(cast(Service, service), cast(Request, request)))
+    return cast(tuple[str, bytes, str], told)
+
+
+@pytest.mark.parametrize(
+    ("source", "taken_as"), [(None, "board"), (b"", "board"), (b"board", "board"), (b"scene", "scene")]
+)
+def test_calibration_pictures_go_to_whom_they_are_from(tmp_path: Path, source: bytes | None, taken_as: str) -> None:
+    fields = [] if source is None else [part("from", source)]
+    assert pictures_of(tmp_path, *fields) == (taken_as, DATA, "")
+
+
+def test_a_label_of_a_calibration_is_cut(tmp_path: Path) -> None:
+    assert pictures_of(tmp_path, part("label", b"y" * 501))[2] == "y" * 500
+
+
+def test_calibration_pictures_from_elsewhere_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(Problem, match=r"from is neither 'board' nor 'scene'\.") as refused:
+        pictures_of(tmp_path, part("from", b"moon"))
+    assert (refused.value.status, refused.value.kind) == (422, "invalid-request")
+    assert tuple(refused.value.errors) == ("from: 'moon'",)
