@@ -17,6 +17,8 @@ from pipeline.settings import SegmentationSettings
 CHANNEL_SUM = np.ones(3, np.float32)  # a product with it sums the channels ten times faster than .sum(axis=2)
 LEVEL_BINS = 8  # bins of brightness in the noise curve
 TUKEY = 4.685  # residuals (in standard deviations) beyond which a pixel says nothing of the background
+BLACK = 4.0  # levels, root mean square: a backdrop below it is noise, which tells no gain
+UNKNOWN = 1e6  # levels squared: draws a black channel's gain to 1
 STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after the third
 
 
@@ -99,8 +101,9 @@ def _gain_field(
     size = (max(8, image.shape[1] // 4), max(8, image.shape[0] // 4))  # a smooth field needs no more
     num = cv2.resize(weighted * image, size, interpolation=cv2.INTER_AREA)
     den = cv2.resize(weighted * plate, size, interpolation=cv2.INTER_AREA)
-    whole = num.sum((0, 1)) / np.maximum(den.sum((0, 1)), 1e-6) if weight.any() else np.ones(3)
-    ridge = 0.02 * den.mean((0, 1)) + 1e-3
+    known = den.mean((0, 1)) > BLACK**2 * weight.mean()  # in a channel that is black, noise divides noise
+    whole = np.where(known, num.sum((0, 1)) / np.maximum(den.sum((0, 1)), 1e-6), 1.0)
+    ridge = np.where(known, 0.02 * den.mean((0, 1)) + 1e-3, UNKNOWN)
     num, den = (cv2.GaussianBlur(a, (0, 0), max(1.0, sigma / 4), borderType=cv2.BORDER_REPLICATE) for a in (num, den))
     field = (num + ridge * whole) / (den + ridge)
     return cv2.resize(field, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR).astype(np.float32)

@@ -106,7 +106,7 @@ def solve_alpha(
             ):  # what no mixture of the two explains, in any shade of the plate, is another colour of the subject
                 a = min(1.0, max(0.0, value))
                 left = dd - 2 * a * (df - db) + a * a * square
-                along = min(0.0, max(-0.4 * (1 - a), (db - a * (fb - bb)) / bb))
+                along = min(0.0, max(-0.4 * (1 - a), (db - a * (fb - bb)) / max(bb, 1e-12)))  # 0: black
                 left += along * along * bb - 2 * along * (db - a * (fb - bb))
                 value += max(0.0, 1.0 - value) / (1.0 + np.exp(OTHER - 0.5 * left))
             alpha[y, x] = value
