@@ -83,7 +83,7 @@ def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, 
     def one(job: tuple[str, str, Path]) -> tuple[tuple[int, int], str]:
         camera, shot, path = job
         where = f"{path.parent.name}/{path.name}"
-        pixels, _, fault = decode_image_file(path, where, grey=True)
+        pixels, _, fault = decode_image_file(path, where, "grey")
         if pixels is None:
             return (0, 0), fault
         target = folder / camera / f"{shot}.png"

@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
 from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, size_fault
-from rig.formats.images import IMAGE_SUFFIXES, decode_image_file
+from rig.formats.images import decode_image_file, is_picture
 from rig.rig import Rig
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
@@ -74,7 +74,7 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
     for path in _pictures(inside):
         if path.stem not in rig:
             continue
-        pixels, _, fault = decode_image_file(path, f"masks/{path.name}", grey=True)
+        pixels, _, fault = decode_image_file(path, f"masks/{path.name}", "mask")
         k = rig[path.stem].intrinsics
         if pixels is None:
             faults.append(fault)
@@ -88,4 +88,4 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
 
 
 def _pictures(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return sorted(path for path in folder.iterdir() if is_picture(path))

@@ -109,7 +109,7 @@ def find_tags(photographs: Photographs, known: TagSize) -> Tags:
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
     for camera, own in photographs.files.items():
         for shot, path in own.items():
-            pixels, _, _ = decode_image_file(path, path.name, grey=True)
+            pixels, _, _ = decode_image_file(path, path.name, "grey")
             assert pixels is not None  # matching has read it
             corners, ids, _ = detector.detectMarkers(pixels)
             numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]

@@ -30,7 +30,7 @@ from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import IMAGE_SUFFIXES, decode_image_file, picture_size, write_image
+from rig.formats.images import decode_image_file, is_picture, picture_size, write_image
 from rig.formats.serials import pictures_by_serial
 from rig.formats.unread_keys import unread_keys
 from rig.formats.work_size import at_share, work_features, work_rig, work_share
@@ -221,14 +221,14 @@ def _decode(
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"
-    pixels, digest, fault = decode_image_file(path, where, grey=whole, share=1.0 if whole else share)
+    pixels, digest, fault = decode_image_file(path, where, "mask" if whole else "colour", share=1.0 if whole else share)
     if pixels is None:
         return None, digest, fault
     size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
     if size != wanted:
         return None, "", size_fault(where, size, camera.intrinsics)
     if whole:  # whatever is not zero is the subject, so that it is told before pixels are averaged
-        pixels = at_share((pixels > 0).astype(np.uint8) * np.uint8(255), size, share)
+        pixels = at_share(pixels, size, share)
     if camera.recorded is not None:
         matrix = work_rig(rig.subset([name]), pixels_most)[name].intrinsics.matrix()
         pixels = camera.recorded.undistort(pixels, matrix, smooth=not whole)
@@ -267,7 +267,7 @@ def stray_faults(folder: Path, rig: Rig) -> list[str]:
 
 
 def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
-    found = [path for path in listed_pictures(folder) if path.stem == stem and path.is_file()]
+    found = [path for path in listed_pictures(folder) if path.stem == stem]
     if len(found) > 1:
         faults.append(f"{folder.name}/ holds {' and '.join(path.name for path in found)}: which one is meant?")
     return found[0] if found else None
@@ -283,4 +283,4 @@ def listed_pictures(folder: Path) -> list[Path]:
     """The pictures in a folder; none where there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return sorted(path for path in folder.iterdir() if is_picture(path))

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -27,7 +27,9 @@ HEIC_SUFFIXES = (".heic", ".heif")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *RAW_SUFFIXES, *HEIC_SUFFIXES)
 
 
+PictureKind = Literal["colour", "grey", "mask"]
 JPEG = b"\xff\xd8\xff"
+PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 GREY_FLAGS = (
     cv2.IMREAD_GRAYSCALE,
     cv2.IMREAD_REDUCED_GRAYSCALE_2,
@@ -51,6 +53,11 @@ PNG_OPTIONS = [
 ]
 
 
+def is_picture(path: Path) -> bool:
+    """Whether it is a file (no folder, pipe or link to nothing) that is named as a picture, and not a hidden one."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
 def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], quality: int = 95) -> None:
     """Writes RGB or grey pixels as the format of the suffix."""
     image = np.ascontiguousarray(image)
@@ -63,7 +70,7 @@ def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray
 
 def read_image(path: Path) -> ImageRgb:
     """An RGB image. Raises InputError."""
-    pixels, _, fault = decode_image_file(path, path.name, grey=False)
+    pixels, _, fault = decode_image_file(path, path.name, "colour")
     if pixels is None:
         raise InputError(path.name, [fault])
     return pixels
@@ -83,9 +90,12 @@ def open_picture(path: Path) -> Image.Image:
         return Image.open(path, formats=IMAGE_FORMATS)
 
 
-def decode_image_file(path: Path, where: str, *, grey: bool, share: float = 1.0) -> tuple[np.ndarray | None, str, str]:
-    """Pixels (RGB, or one channel) at ``share`` of their number across, the sha256 of the file, and the fault (then no
-    pixels) as a sentence."""
+def decode_image_file(
+    path: Path, where: str, kind: PictureKind, *, share: float = 1.0
+) -> tuple[np.ndarray | None, str, str]:
+    """Pixels at ``share`` of their number across, the sha256 of the file, and the fault (then no pixels) as a sentence.
+
+    Pixels are RGB (``colour``), one channel (``grey``), or of a ``mask`` 255 where the subject is and else 0."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     try:
         with _faults_of(where):
@@ -93,13 +103,13 @@ def decode_image_file(path: Path, where: str, *, grey: bool, share: float = 1.0)
         if width * height > PIXELS_MOST:
             raise InputError(where, [f"is {width} x {height} pixels; at most {PIXELS_MOST:,} are read"])
         with _faults_of(where, "its pixels cannot be decoded"):
-            pixels = _decoded(data, suffix, grey=grey, halved=halvings(share, (width, height)))
+            pixels = _decoded(data, suffix, kind, halved=halvings(share, (width, height)))
             pixels = at_share(pixels, (width, height), share)
     except InputError as error:
         return None, "", f"{where} {error.faults[0]}"
-    if suffix == ".png" and b"IEND" not in data[-16:]:
+    if data.startswith(PNG) and PNG_END not in data:  # OpenCV fills up what is cut off
         return None, "", f"{where} is damaged: its pixels cannot be decoded"
-    if profile and not grey:
+    if profile and kind == "colour":
         pixels = _in_srgb(pixels, profile)
     return pixels, hashlib.sha256(data).hexdigest(), ""
 
@@ -128,7 +138,7 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
         return header.size, header.info.get("icc_profile") or b""
 
 
-def _decoded(data: bytes, suffix: str, *, grey: bool, halved: int) -> np.ndarray:
+def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int) -> np.ndarray:
     """``halved``: how often a JPEG is, which costs its decoder less than none at all; others come as they are."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
@@ -137,13 +147,28 @@ def _decoded(data: bytes, suffix: str, *, grey: bool, halved: int) -> np.ndarray
     elif suffix in HEIC_SUFFIXES:
         pixels = np.asarray(heif_header(data).to_pillow().convert("RGB"))
     else:
-        halved = halved if data.startswith(JPEG) else 0
-        flags = (GREY_FLAGS if grey else COLOUR_FLAGS)[halved] | cv2.IMREAD_IGNORE_ORIENTATION
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        halved = halved if data.startswith(JPEG) and kind != "mask" else 0
+        flags = cv2.IMREAD_UNCHANGED if kind == "mask" else (GREY_FLAGS if kind == "grey" else COLOUR_FLAGS)[halved]
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if pixels is None:
             raise ValueError("not decoded")
-        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if halved and not grey else pixels
-    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if grey else np.ascontiguousarray(pixels)
+        if kind == "mask":
+            return _subject(pixels)
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if halved and kind == "colour" else pixels
+    if kind == "mask":
+        return _subject(pixels)
+    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if kind == "grey" else np.ascontiguousarray(pixels)
+
+
+def _subject(pixels: np.ndarray) -> UInt8[np.ndarray, "h w"]:
+    """255 where a mask shows the subject: where it is opaque by half, in a cut-out, else where any channel is not 0."""
+    channels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    alpha = channels[:, :, 3] if channels.shape[2] == 4 else None
+    if alpha is not None and alpha.min() < alpha.max():
+        inside = alpha > np.iinfo(alpha.dtype).max // 2
+    else:
+        inside = (channels[:, :, :3] != 0).any(axis=2)
+    return inside.astype(np.uint8) * np.uint8(255)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from pathlib import Path
 from PIL import Image
 
 from rig.formats.cameras_json import SERIAL_MOST
-from rig.formats.images import HEIC_SUFFIXES, IMAGE_FORMATS, IMAGE_SUFFIXES, RAW_SUFFIXES, heif_header
+from rig.formats.images import HEIC_SUFFIXES, IMAGE_FORMATS, RAW_SUFFIXES, heif_header, is_picture
 from rig.rig import Rig
 
 BODY_SERIAL, DNG_SERIAL, EXIF_IFD = 0xA431, 0xC62F, 0x8769
@@ -68,7 +68,7 @@ def pictures_by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, P
 
     Nothing is looked at where every camera has a picture of its name; appends a fault for each picture that cannot be
     told, and for two of one body."""
-    here = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    here = sorted(path for path in folder.iterdir() if is_picture(path))
     inside = {path.name for path in folder.iterdir() if path.is_dir()}
     lacking = [camera for camera in rig if camera.name not in {path.stem for path in here} | inside]
     strays = [path for path in here if path.stem not in rig]

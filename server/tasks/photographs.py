@@ -26,7 +26,7 @@ from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file
 from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.capture_folder import capture_root, picture_folder, read_capture, read_shot
-from rig.formats.images import IMAGE_SUFFIXES, picture_size, write_image
+from rig.formats.images import is_picture, picture_size, write_image
 from rig.formats.work_size import WORK_PIXELS, work_rig
 from rig.rig import Rig
 
@@ -49,7 +49,7 @@ def photographs_alone(folder: Path) -> bool:
     if find_rig_file(root) is not None:
         return False
     pictures = picture_folder(root)
-    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in pictures.rglob("*") if path.is_file())
+    return any(is_picture(path) for path in pictures.rglob("*"))
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Report) -> Prepared:
@@ -152,8 +152,8 @@ def _made_of(root: Path, front: str | None) -> dict[str, str]:
     """The sha256 of all that a calibration follows from."""
     from importlib.metadata import version
 
-    files = [path for path in sorted(picture_folder(root).rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES]
-    files += sorted((root / "masks").glob("*"))
+    files = [path for path in sorted(picture_folder(root).rglob("*")) if is_picture(path)]
+    files += [path for path in sorted((root / "masks").glob("*")) if is_picture(path)]
     files += [root / SCALE] if (root / SCALE).is_file() else []
     digests = {path.relative_to(root).as_posix(): _sha256(path) for path in files}
     return {**digests, "front": front or "", "version": version("eigenhead"), "pycolmap": version("pycolmap")}

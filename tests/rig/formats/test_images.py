@@ -1,5 +1,6 @@
 """Pictures as cameras make them: RAW, HEIC, 16 bits and foreign colours all come as 8-bit sRGB, rows as recorded."""
 
+import os
 import struct
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from rig.errors import InputError
-from rig.formats.images import decode_image_file, open_picture, picture_size, read_image
+from rig.formats.images import decode_image_file, is_picture, open_picture, picture_size, read_image
 
 HEIC = Path(__file__).with_name("three_bands.heic")  # 64 x 48: red, green and blue bands from left to right
 
@@ -75,7 +76,7 @@ def test_a_heic_is_read(tmp_path: Path) -> None:
     pixels = read_image(HEIC).astype(int)
     bands = [pixels[:, at : at + 10].mean(axis=(0, 1)) for at in (5, 27, 49)]
     assert [int(band.argmax()) for band in bands] == [0, 1, 2]
-    grey, digest, fault = decode_image_file(HEIC, "a.heic", grey=True)
+    grey, digest, fault = decode_image_file(HEIC, "a.heic", "grey")
     assert grey is not None
     assert grey.shape == (48, 64)
     assert (len(digest), fault) == (64, "")
@@ -106,12 +107,69 @@ def test_another_profile_s_colours_become_srgb(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_image(tmp_path / "wide.png")[0, 0], (50, 100, 200), atol=3)
 
 
+def test_a_file_is_read_by_its_content_whatever_its_ending(tmp_path: Path) -> None:
+    picture = Image.fromarray(np.full((40, 50, 3), (200, 100, 50), np.uint8))
+    for content in ("JPEG", "WEBP", "TIFF"):
+        picture.save(tmp_path / "a.png", format=content, quality=100)
+        np.testing.assert_allclose(read_image(tmp_path / "a.png")[20, 20], (200, 100, 50), atol=3)
+    picture.save(tmp_path / "more.png")
+    whole = (tmp_path / "more.png").read_bytes()
+    (tmp_path / "more.png").write_bytes(whole + b"written behind the end by a camera's maker")
+    np.testing.assert_array_equal(read_image(tmp_path / "more.png")[20, 20], (200, 100, 50))
+    (tmp_path / "cut.jpg").write_bytes(whole[:-20])  # a PNG by another name, cut off
+    with pytest.raises(InputError, match="is damaged"):
+        read_image(tmp_path / "cut.jpg")
+
+
+def half(value: object, other: object = 0, kind: type = np.uint8) -> np.ndarray:
+    """A mask whose left half is ``value``."""
+    return np.array([[value] * 4 + [other] * 4] * 6, kind)
+
+
+def painted() -> Image.Image:
+    """The same with a palette whose second colour is dark."""
+    picture = Image.fromarray(half(1))
+    picture.putpalette([0, 0, 0, 40, 0, 0])
+    return picture
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        pytest.param(Image.fromarray(half(1)), id="labels"),
+        pytest.param(Image.fromarray(half(1, kind=np.uint16)), id="labels of 16 bits"),
+        pytest.param(Image.fromarray(half((0, 0, 4), (0, 0, 0))), id="a dark colour"),
+        pytest.param(Image.fromarray(half((0, 0, 0, 255), (0, 0, 0, 0))), id="a cut-out, black"),
+        pytest.param(Image.fromarray(half((90, 80, 70, 200), (90, 80, 70, 100))), id="a cut-out with a soft edge"),
+        pytest.param(Image.fromarray(half((255, 255, 255, 255), (0, 0, 0, 255))), id="opaque all over"),
+        pytest.param(painted(), id="a palette"),
+        pytest.param(Image.fromarray(half(255)).convert("1"), id="one bit"),
+        pytest.param(Image.fromarray(half(255)).convert("LA"), id="grey and opaque"),
+    ],
+)
+def test_whatever_is_not_zero_or_not_cut_out_is_the_subject(picture: Image.Image, tmp_path: Path) -> None:
+    picture.save(tmp_path / "cam00.png")
+    found, _, fault = decode_image_file(tmp_path / "cam00.png", "masks/cam00.png", "mask")
+    assert not fault
+    np.testing.assert_array_equal(found, half(255))
+
+
+def test_folders_pipes_and_links_to_nothing_are_no_pictures(tmp_path: Path) -> None:
+    (tmp_path / "folder.png").mkdir()
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "link.png").symlink_to(tmp_path / "nowhere.png")
+    (tmp_path / ".hidden.png").touch()
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "cam00.PNG").touch()
+    assert [path.name for path in tmp_path.iterdir() if is_picture(path)] == ["cam00.PNG"]
+
+
 @pytest.mark.filterwarnings("ignore:Corrupt EXIF")  # what Pillow says of the broken TIFF
 @pytest.mark.parametrize("name", ["a.dng", "a.cr3", "a.heic", "a.png", "a.tif"])
 @pytest.mark.parametrize("content", [b"", b"nothing of the kind", b"II*\0\xff\xff\xff\x7f"])
 def test_damage_is_a_fault(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
-    pixels, _, fault = decode_image_file(tmp_path / name, f"images/{name}", grey=False)
+    pixels, _, fault = decode_image_file(tmp_path / name, f"images/{name}", "colour")
     assert pixels is None
     assert fault.startswith(f"images/{name} is damaged")
     with pytest.raises(InputError, match="is damaged"):
@@ -121,6 +179,6 @@ def test_damage_is_a_fault(name: str, content: bytes, tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "whole"), [("a.heic", HEIC.read_bytes()), ("a.dng", dng(np.zeros((64, 64))))])
 def test_half_a_file_is_a_fault(name: str, whole: bytes, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(whole[: len(whole) // 2])
-    pixels, _, fault = decode_image_file(tmp_path / name, name, grey=False)
+    pixels, _, fault = decode_image_file(tmp_path / name, name, "colour")
     assert pixels is None
     assert "is damaged" in fault
