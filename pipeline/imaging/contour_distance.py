@@ -16,12 +16,15 @@ BAND_PX = 12
 
 
 def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> Float32[np.ndarray, "h w"]:
-    """Signed distance (px) to the contour ``field == level``; negative where the field is above. +-inf without one."""
+    """Signed distance (px) to the contour ``field == level``; negative where the field is above.
+
+    Without one it is farther than any pixel (+-(h + w)), and finite: slopes are taken of it."""
     above = field > level
     near = box_around(above, BAND_PX + 1)
     segments = segments_of_level(field[near], level)
     if not len(segments):
-        return np.where(above, -np.inf, np.inf).astype(np.float32)
+        far = np.float32(sum(field.shape))
+        return np.where(above, -far, far)
     whole = chamfer(above.view(np.uint8))
     refine_distance(whole[near], field[near], level, segments, BAND_PX)
     return whole

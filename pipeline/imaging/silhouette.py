@@ -47,10 +47,11 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]
     Far from the contour it is the Euclidean distance transform, which measures to the nearest pixel *centre* of the
     other kind: the contour lies half a pixel before. Within two pixels that staircase would leave 0.3 px of noise;
     there the mask is blurred by a Gaussian, which turns a straight edge at distance d into ``Phi(-d / s)``, and d is
-    read back.
+    read back. Without a contour it is farther than any pixel (+-(h + w)).
     """
     inside, outside = _distance_transforms(mask)
-    distance = np.where(mask, 0.5 - inside, outside - 0.5)
+    far = float(sum(mask.shape))
+    distance = np.clip(np.where(mask, 0.5 - inside, outside - 0.5), -far, far)
     band = np.abs(distance) < 3.0
     blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), CONTOUR_BLUR_PX, borderType=cv2.BORDER_REPLICATE)[band]
     spread = float(np.hypot(CONTOUR_BLUR_PX, 12**-0.5))  # a pixel integrates over its own square

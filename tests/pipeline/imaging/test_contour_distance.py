@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.imaging.contour_distance import BAND_PX, distance_to_level
+from pipeline.imaging.silhouette import signed_distance
 
 
 def grid(size: int = 160) -> tuple[np.ndarray, np.ndarray]:
@@ -33,10 +34,11 @@ def test_a_slanted_edge_has_no_bias() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_without_a_contour_everything_is_infinitely_far(value: float) -> None:
-    found = distance_to_level(np.full((40, 50), value, np.float32))
-    assert np.isinf(found).all()
-    assert ((found < 0) == (value > 0.5)).all()
+def test_without_a_contour_everything_is_farther_than_any_pixel_and_has_slopes(value: float) -> None:
+    far = -90.0 if value else 90.0
+    field = np.full((40, 50), value, np.float32)
+    np.testing.assert_array_equal(distance_to_level(field), far)
+    np.testing.assert_array_equal(signed_distance(field > 0.5), far)
 
 
 def test_the_sign_is_the_level_even_where_corners_touch() -> None:
