@@ -291,6 +291,7 @@ def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
 
 
 def document_from_settings(settings: Settings) -> dict[str, object]:
+    """Settings as nested dictionaries, the form that ``settings_from_document`` reads."""
     return dataclasses.asdict(settings)
 
 

@@ -58,6 +58,7 @@ class BundleState:
 
 
 def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[str], board: Board) -> Observations:
+    """What every view found, end to end: corners (px) and their places on the board (mm), by camera and shot."""
     corners = board.corners()
     counts = [len(view.found.ids) for view in views]
     return Observations(
@@ -70,11 +71,13 @@ def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[
 
 
 def intrinsics_of(values: Float[np.ndarray, " 9"], size: tuple[int, int]) -> Intrinsics:
+    """From ``fx fy cx cy k1 k2 p1 p2 k3``, the order of a bundle's unknowns; ``size`` is width and height, px."""
     fx, fy, cx, cy, *lens = (float(value) for value in values)
     return Intrinsics(*size, fx, fy, cx, cy, Distortion(*lens))
 
 
 def camera_of(state: BundleState, index: int, name: str, size: tuple[int, int]) -> Camera:
+    """The camera at ``index`` as the adjustment has it, camera_from_world in mm."""
     return Camera(name, intrinsics_of(state.intrinsics[index], size), state.camera_pose(index))
 
 

@@ -170,6 +170,7 @@ def _sector_based_exhaustive(grey: np.ndarray, board: Board) -> np.ndarray | Non
 
 
 def classic_corners(grey: np.ndarray, board: Board) -> np.ndarray | None:
+    """Corners (px, row by row) by OpenCV's adaptive threshold; None where the whole board is not found."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     ok, corners = cv2.findChessboardCorners(grey, board.grid, flags=flags)
     return _refine(grey, corners.reshape(-1, 2), 0.35, board) if ok else None

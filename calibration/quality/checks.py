@@ -200,4 +200,5 @@ def measure_aspect(
 
 
 def failed(checks: Sequence[Check]) -> list[Check]:
+    """The checks that do not hold; what could not be judged is not among them."""
     return [check for check in checks if check.passed is False]

@@ -77,6 +77,7 @@ def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detec
 
 
 def view_rms(state: BundleState, seen: Observations) -> Float[np.ndarray, " v"]:
+    """Root mean square reprojection error of each view, px."""
     squares = (residuals(state, seen) ** 2).sum(axis=1)
     counts = np.bincount(seen.view_of, minlength=len(seen.camera))
     return np.sqrt(np.bincount(seen.view_of, squares, minlength=len(seen.camera)) / np.maximum(counts, 1))

@@ -9,6 +9,7 @@ from rig.atomic_write import write_atomically
 
 
 def write_scene_report(calibration: SceneCalibration, path: Path) -> None:
+    """Writes the calibration's report as one HTML page."""
     write_atomically(path, scene_page(calibration).encode())
 
 

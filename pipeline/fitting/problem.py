@@ -166,6 +166,7 @@ def make_problem(
 
 @lru_cache(maxsize=4)  # models are few, jobs are many
 def level_basis(model: HeadModel, name: str) -> LevelBasis:
+    """Mean and modes (mm, head frame) where a level's vertices come from them: a coarse level has its own."""
     level = model.levels[name]
     if level.count < len(model.mean):
         own = model.basis(name, len(model.modes)).transpose(1, 2, 0)
@@ -202,6 +203,7 @@ def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Floa
 def pack_features(
     model: HeadModel, names: tuple[str, ...], features: Mapping[str, Mapping[str, np.ndarray]]
 ) -> Observed | None:
+    """Feature points (px) of the model's landmarks as arrays; None where no camera has one."""
     found = [
         (model.landmarks[landmark], names.index(camera), pixel)
         for landmark, views in sorted(features.items())
@@ -234,6 +236,7 @@ def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) 
 
 
 def start_state(problem: ContourProblem, world_from_head: Similarity) -> State:
+    """The mean head at a pose, every camera where it was calibrated."""
     return State(np.zeros(0), world_from_head, np.zeros((len(problem.views.names), PER_CAMERA)))
 
 

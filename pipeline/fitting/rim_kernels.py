@@ -51,6 +51,7 @@ class Pictures(NamedTuple):
 
 @njit(cache=True, fastmath=True)
 def projected_with_slopes(points, view, cameras):
+    """Pixels (n, 2) of points (n, 3; mm, world), each in its own view, and their slopes (n, 2, 3), px a mm."""
     pixels, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
     for n in range(len(points)):
         camera = cameras[view[n]]

@@ -22,6 +22,7 @@ def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]
 
 
 def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
+    """The mask grown by a disc of ``steps`` pixels."""
     return cv2.dilate(mask.view(np.uint8), _disc(steps)).view(bool)
 
 

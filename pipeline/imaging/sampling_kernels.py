@@ -12,6 +12,7 @@ INSIDE = 1.001  # px before an image's far edge where places beyond are held: al
 
 @njit(cache=True, nogil=True, inline="always")
 def bilinear(a, b, c, d, right, down):
+    """Between four neighbours (top left, top right, bottom left, bottom right), 0 to 1 to the right and down."""
     top = a + right * (b - a)
     return top + down * (c + right * (d - c) - top)
 

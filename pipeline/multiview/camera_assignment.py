@@ -114,6 +114,7 @@ def _ring_text(ring: tuple[str, ...], what: str) -> str:
 
 
 def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
+    """The cameras whose mask is more than a few pixels of anything."""
     return rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )

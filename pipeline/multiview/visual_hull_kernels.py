@@ -11,6 +11,7 @@ COARSE = 4  # fine cells along the side of a coarse one
 
 @njit(cache=True)
 def mark_occupied(known: np.ndarray, active: np.ndarray) -> None:
+    """Marks the fine corners of every coarse cell that is active; ``known`` is changed."""
     for i, j, k in np.argwhere(active):
         known[
             i * COARSE : (i + 1) * COARSE + 1, j * COARSE : (j + 1) * COARSE + 1, k * COARSE : (k + 1) * COARSE + 1

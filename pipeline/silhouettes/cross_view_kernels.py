@@ -20,6 +20,8 @@ def least_dissent(
     distances: np.ndarray,
     scales: np.ndarray,
 ) -> np.ndarray:
+    """How many cameras see background at the place on each ray (between ``span``, mm) where fewest do; -1 where too
+    few look."""
     out = np.full(len(rays), -1, np.int8)
     step = (span[1] - span[0]) / STEPS
     for n in range(len(rays)):

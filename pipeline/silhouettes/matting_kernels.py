@@ -19,11 +19,13 @@ def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
 
 @njit(cache=True, nogil=True, inline="always")
 def interpolated_colour(a: np.ndarray, y: int, x: int, c: int, fy: float, fx: float) -> float:
+    """One channel of an image between four of its pixels."""
     return bilinear(a[y, x, c], a[y, x + 1, c], a[y + 1, x, c], a[y + 1, x + 1, c], fx, fy)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def decoded_level(table: np.ndarray, code: float) -> float:
+    """Linear light of a code between 0 and 255, between the table's entries."""
     code = min(max(code, 0.0), 255.0)
     low = int(code)
     return table[low] + (code - low) * (table[low + 1] - table[low])

@@ -95,6 +95,7 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
+    """What the views' qualities say, as warnings of the report."""
     found = []
     for name, silhouette in silhouettes.items():
         code = "view" if silhouette.quality.usable else "view-left-out"

@@ -29,6 +29,8 @@ def cells_spanned(vertices, face, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
+    """Triangles by the cell of the cylinder (angle, height) that they reach into: where each cell's start, and
+    their rows."""
     counts = np.zeros(rows * CELLS_ROUND + 1, np.int64)
     for f in range(len(faces)):
         a, b, c, d = cells_spanned(vertices, faces[f], low, rows)
@@ -50,6 +52,7 @@ def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def cast_rays(vertices, faces, low, rows, start, members, angles, heights, wanted):  # pragma: no cover - compiled
+    """The radius (mm) and the triangle that each ray from the axis meets first; NaN and -1 where none."""
     radii, triangles = np.full(len(angles), np.nan), np.full(len(angles), -1, np.int64)
     width = 2 * np.pi / CELLS_ROUND
     for k in range(len(angles)):
