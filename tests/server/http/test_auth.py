@@ -5,6 +5,7 @@ import hashlib
 import hmac
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -65,6 +66,14 @@ def test_each_scope_does_what_it_may_and_no_more(
                 assert refused.status_code == 401
                 assert refused.json()["type"].endswith("key-missing" if key is None else "key-invalid")
             assert client.get("/healthz").status_code == 200
+
+
+def test_a_json_body_is_not_awaited_from_nobody(guarded: tuple[RunningService, dict[str, str]]) -> None:
+    service, _ = guarded
+    head = f"POST /v1/sessions HTTP/1.1\r\nHost: 127.0.0.1:{service.port}\r\nContent-Type: application/json\r\n"
+    with socket.create_connection(("127.0.0.1", service.port), timeout=10) as client:
+        client.sendall(head.encode() + b"Content-Length: 200000000\r\n\r\n")
+        assert client.recv(1 << 16).split()[1] == b"401"
 
 
 def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(
