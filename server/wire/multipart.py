@@ -20,6 +20,7 @@ from server.services.uploads import too_large
 from server.settings import ServiceSettings
 from server.storage.records import CaptureRecord, JsonObject
 from server.storage.store import Store
+from server.wire.patience import SILENT_S, patiently
 from server.wire.problems import Problem
 
 BLOCK_BYTES = 1 << 20
@@ -51,7 +52,8 @@ async def receive_multipart(
 ) -> tuple[Path, dict[str, str]]:
     """Writes the part ``file`` into ``folder``; returns its path and the other fields.
 
-    Raises problems: 415 for another content type, 400 for a body that breaks off, 422 without a ``file``, 413.
+    Raises problems: 415 for another content type, 400 for a body that breaks off, 408 for one that no longer comes,
+    422 without a ``file``, 413.
     """
     kind, options = parse_options_header(request.headers.get("content-type"))
     boundary = options.get(b"boundary")
@@ -66,7 +68,7 @@ async def receive_multipart(
     received = 0
     target = await threads.disk(path.open, "xb")
     try:
-        async for chunk in request.stream():
+        async for chunk in patiently(request.stream(), SILENT_S):
             received += len(chunk)
             if received > settings.body_bytes:
                 raise too_large(settings)

@@ -46,7 +46,7 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
 @router.post(
     "/captures/uploads",
     status_code=201,
-    responses=documented(400, 404, 413, 415, 507),
+    responses=documented(400, 404, 408, 413, 415, 507),
     openapi_extra=described_form(ARCHIVE, FIELDS, tags=TAGS),
 )
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
@@ -191,7 +191,7 @@ def delete_capture(
     "/reconstructions",
     status_code=202,
     tags=["jobs"],
-    responses=documented(400, 404, 409, 413, 415, 507),
+    responses=documented(400, 404, 408, 409, 413, 415, 507),
     openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), tags=TAGS, settings="JSON object"),
 )
 async def reconstruct_upload(

@@ -68,6 +68,19 @@ def test_a_large_file_is_written_on_the_way(tmp_path: Path) -> None:
     assert received(tmp_path, body(part("file", large)), piece=100_000)[0] == large
 
 
+def test_a_client_that_vanished_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.wire.multipart.SILENT_S", 0.05)
+
+    async def stream() -> Any:
+        yield part("file", DATA)
+        await asyncio.sleep(60)
+
+    request = cast(Request, SimpleNamespace(headers={"content-type": TYPE}, stream=stream))
+    with pytest.raises(Problem, match=r"Nothing more came for 0\.05 s") as refused:
+        asyncio.run(receive_multipart(request, tmp_path, ServiceSettings(data=tmp_path), Threads()))
+    assert (refused.value.status, refused.value.kind) == (408, "body-silent")
+
+
 SEND_ONE = "Send multipart/form-data with the archive as the part 'file'."
 BREAKS_OFF = "The multipart body breaks off before its end; send it again."
 
