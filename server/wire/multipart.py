@@ -25,6 +25,7 @@ from server.wire.problems import Problem
 
 BLOCK_BYTES = 1 << 20
 FIELD_BYTES = 1 << 16  # of a form field that is no file
+FIELDS_MOST = 100  # parts of a form: with FIELD_BYTES, what one request may hold in memory
 ARCHIVE = ".zip, .tar or .tar.gz"
 
 
@@ -48,12 +49,12 @@ def check_length(request: Request, store: Store, settings: ServiceSettings) -> N
 
 
 async def receive_multipart(
-    request: Request, folder: Path, settings: ServiceSettings, threads: Threads
+    request: Request, folder: Path, store: Store, settings: ServiceSettings, threads: Threads
 ) -> tuple[Path, dict[str, str]]:
     """Writes the part ``file`` into ``folder``; returns its path and the other fields.
 
-    Raises problems: 415 for another content type, 400 for a body that breaks off, 408 for one that no longer comes,
-    422 without a ``file``, 413.
+    Raises DiskFull before a block that the disk has no room for, TooLarge, and problems: 415 for another content type,
+    400 for a body that breaks off, 408 for one that no longer comes, 422 without a ``file``, 413.
     """
     kind, options = parse_options_header(request.headers.get("content-type"))
     boundary = options.get(b"boundary")
@@ -67,6 +68,11 @@ async def receive_multipart(
     path = folder / "upload"
     received = 0
     target = await threads.disk(path.open, "xb")
+
+    def write(block: bytes) -> None:  # a body that comes in chunks announced no length that could be judged before
+        store.reserve(len(block), settings.free_bytes)
+        target.write(block)
+
     try:
         async for chunk in patiently(request.stream(), SILENT_S):
             received += len(chunk)
@@ -77,8 +83,8 @@ async def receive_multipart(
             except FormParserError as error:
                 raise Problem(400, "malformed-body", f"The body is no multipart/form-data ({error}).") from error
             if len(form.pending) >= BLOCK_BYTES:
-                await threads.disk(target.write, form.take())
-        await threads.disk(target.write, form.take())
+                await threads.disk(write, form.take())
+        await threads.disk(write, form.take())
     finally:
         await threads.disk(target.close)
     if not form.ended:
@@ -94,7 +100,7 @@ class _Form:
     def __init__(self) -> None:
         self.pending = bytearray()
         self.fields: dict[str, str] = {}
-        self.files = 0
+        self.files, self._parts = 0, 0
         self.ended = False
         self._header, self._value = b"", b""
         self._name, self._data = "", bytearray()
@@ -115,6 +121,9 @@ class _Form:
         return data
 
     def _part_begin(self) -> None:
+        self._parts += 1
+        if self._parts > FIELDS_MOST:
+            raise Problem(413, "fields-too-many", f"The form has more than {FIELDS_MOST} parts; send one archive.")
         self._name, self._data = "", bytearray()
 
     def _add_header(self, data: bytes) -> None:
@@ -154,7 +163,7 @@ async def receive_capture(service: Service, request: Request) -> tuple[CaptureRe
     """Receives a multipart archive and makes a capture of it; returns its record and the form's fields."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
-        archive, fields = await receive_multipart(request, folder, service.settings, service.threads)
+        archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
         record = await service.threads.check(service.captures.accept, archive, folder, About.of(fields))
     return record, fields
 
@@ -164,7 +173,7 @@ async def receive_calibration_pictures(service: Service, request: Request) -> Ca
     queues a calibration."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
-        archive, fields = await receive_multipart(request, folder, service.settings, service.threads)
+        archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
         label = (fields.get("label") or "")[:500]
         accept = {"board": service.accept_board_pictures, "scene": service.accept_photographs}
         source = fields.get("from") or "board"

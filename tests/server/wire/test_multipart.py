@@ -17,7 +17,9 @@ from server.services.threads import Threads
 from server.settings import ServiceSettings
 from server.storage.store import Store
 from server.wire.multipart import (
+    BLOCK_BYTES,
     FIELD_BYTES,
+    FIELDS_MOST,
     check_length,
     described_form,
     receive_calibration_pictures,
@@ -49,9 +51,8 @@ def received(
 
     async def receive() -> tuple[Path, dict[str, str]]:
         request = cast(Request, SimpleNamespace(headers={"content-type": content_type}, stream=stream))
-        return await receive_multipart(
-            request, folder, ServiceSettings.model_validate({"data": folder, **settings}), Threads()
-        )
+        given = ServiceSettings.model_validate({"data": folder, "free_bytes": 0, **settings})
+        return await receive_multipart(request, folder, Store(folder), given, Threads())
 
     path, fields = asyncio.run(receive())
     return path.read_bytes(), fields
@@ -77,7 +78,7 @@ def test_a_client_that_vanished_is_given_up(tmp_path: Path, monkeypatch: pytest.
 
     request = cast(Request, SimpleNamespace(headers={"content-type": TYPE}, stream=stream))
     with pytest.raises(Problem, match=r"Nothing more came for 0\.05 s") as refused:
-        asyncio.run(receive_multipart(request, tmp_path, ServiceSettings(data=tmp_path), Threads()))
+        asyncio.run(receive_multipart(request, tmp_path, Store(tmp_path), ServiceSettings(data=tmp_path), Threads()))
     assert (refused.value.status, refused.value.kind) == (408, "body-silent")
 
 
@@ -134,6 +135,27 @@ def test_what_is_no_such_body_is_refused(
         received(tmp_path, data, content_type)
     assert (refused.value.status, refused.value.kind, tuple(refused.value.errors)) == (status, kind, errors)
     assert str(refused.value.detail).startswith(detail)
+
+
+def test_a_form_may_have_a_hundred_parts_and_no_more(tmp_path: Path) -> None:
+    """Of one name, too: what is counted is what comes."""
+    fields = [part("label", b"x") for _ in range(FIELDS_MOST - 1)]
+    assert received(tmp_path, body(*fields, part("file", DATA)))[0] == DATA
+    (tmp_path / "upload").unlink()
+    with pytest.raises(Problem, match="more than 100 parts") as refused:
+        received(tmp_path, body(*fields, part("file", DATA), part("label", b"x")))
+    assert (refused.value.status, refused.value.kind) == (413, "fields-too-many")
+
+
+def test_a_body_that_announced_nothing_leaves_the_spare_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of five blocks of room two are to be spared."""
+    room = 5 * BLOCK_BYTES
+    written = tmp_path / "upload"
+    monkeypatch.setattr(Store, "free_bytes", lambda self: room - written.stat().st_size)
+    blocks = body(part("file", bytes(9 * BLOCK_BYTES)))
+    with pytest.raises(DiskFull):
+        received(tmp_path, blocks, piece=BLOCK_BYTES // 4, free_bytes=2 * BLOCK_BYTES)
+    assert 2 * BLOCK_BYTES < written.stat().st_size <= 3 * BLOCK_BYTES
 
 
 def test_names_and_values_that_are_no_utf_8_are_taken_with_a_mark(tmp_path: Path) -> None:
