@@ -89,6 +89,15 @@ def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(
         assert admin.delete(f"/v1/keys/{keys['admin'].split('_')[1]}").status_code == 409
 
 
+@pytest.mark.parametrize("url", ["http://[", "http://", "https://a..b/"])
+def test_a_webhook_at_no_address_is_refused(guarded: tuple[RunningService, dict[str, str]], url: str) -> None:
+    service, keys = guarded
+    with client_of(service, keys["admin"]) as admin:
+        refused = admin.post("/v1/webhooks", json={"url": url})
+        assert (refused.status_code, refused.json()["type"]) == (422, "urn:eigenhead:problem:url-refused")
+        assert admin.get("/v1/webhooks").json() == {"webhooks": []}
+
+
 def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]], tmp_path: Path) -> None:
     service, keys = guarded
     pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
