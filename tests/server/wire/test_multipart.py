@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 from fastapi import Request
 
-from rig.errors import EigenheadError
+from rig.errors import EigenheadError, InputError
 from server.errors import DiskFull, TooLarge
 from server.services.service import Service
 from server.services.threads import Threads
@@ -20,6 +20,7 @@ from server.wire.multipart import (
     BLOCK_BYTES,
     FIELD_BYTES,
     FIELDS_MOST,
+    check_fields,
     check_length,
     described_form,
     receive_calibration_pictures,
@@ -256,6 +257,22 @@ def test_calibration_pictures_go_to_whom_they_are_from(tmp_path: Path, source: b
 
 def test_a_label_of_a_calibration_is_cut(tmp_path: Path) -> None:
     assert pictures_of(tmp_path, part("label", b"y" * 501))[2] == "y" * 500
+
+
+def test_each_field_that_a_form_does_not_have_is_named() -> None:
+    check_fields(["label", "settings"], ("label", "settings"))
+    with pytest.raises(InputError) as refused:
+        check_fields(["settigns", "label", "webhook", ""], ("label", "settings"))
+    assert list(refused.value.faults) == [
+        "unknown field 'settigns'; did you mean 'settings'?",
+        "unknown field 'webhook'; there are file, label, settings",
+        "unknown field ''; there are file, label, settings",
+    ]
+
+
+def test_a_field_that_a_calibration_does_not_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="did you mean 'label'"):
+        pictures_of(tmp_path, part("lable", b"Monday"))
 
 
 def test_calibration_pictures_from_elsewhere_are_refused(tmp_path: Path) -> None:
