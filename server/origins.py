@@ -7,6 +7,7 @@ moment later changes nothing. Whoever follows a redirection judges where it lead
 """
 
 import ipaddress
+import re
 import socket
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from server.errors import Unusable
 
 ANY_PUBLIC = "https://*"
 PORTS = {"http": 80, "https": 443}
+HOST = re.compile(r"[a-z0-9._-]+|[0-9a-f:.]+", re.IGNORECASE)  # a name, or an address of IPv6
 NAT64 = ipaddress.ip_network("64:ff9b::/96")  # RFC 6052: IPv4 in its last 32 bits
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
@@ -33,12 +35,7 @@ class Target:
 
 def target(url: str, origins: Collection[str]) -> Target:
     """Where a request for ``url`` goes, if it may. Blocks on the name service. Raises Unusable ("url-refused")."""
-    try:
-        wanted = httpx.URL(url)
-    except (httpx.InvalidURL, ValueError, TypeError) as error:
-        raise _refused("is no URL") from error
-    if wanted.scheme not in PORTS or not wanted.host:
-        raise _refused("is no https:// or http:// address")
+    wanted = parsed(url)
     if wanted.userinfo:
         raise _refused("has a user name in it; leave it out")
     named = origin_of(wanted) in {origin_of(httpx.URL(origin)) for origin in origins if origin != ANY_PUBLIC}
@@ -53,6 +50,21 @@ def target(url: str, origins: Collection[str]) -> Target:
         {"Host": wanted.netloc.decode("ascii")},
         {"sni_hostname": host} if wanted.scheme == "https" else {},
     )
+
+
+def parsed(url: str) -> httpx.URL:
+    """A web address whose host can be looked up; nothing is. Raises Unusable ("url-refused")."""
+    try:
+        wanted = httpx.URL(url)
+        shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked
+        host.encode("idna")  # as getaddrinfo will
+    except (httpx.InvalidURL, ValueError, TypeError) as error:  # UnicodeError, of what IDNA refuses, is a ValueError
+        raise _refused("is no URL") from error
+    if wanted.scheme not in PORTS or not shown:
+        raise _refused("is no https:// or http:// address")
+    if not HOST.fullmatch(host):
+        raise _refused(f"names no host that there can be: {host!r:.80}")
+    return wanted
 
 
 def origin_of(url: httpx.URL) -> str:

@@ -12,6 +12,7 @@ from fastapi.middleware.cors import CORSMiddleware
 from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.http.json_bodies import JsonBodies
 from server.http.linger import Linger
 from server.http.openapi import describe, operation_name
 from server.http.routes import calibrations, captures, jobs, operations, rig, sessions, storage, uploads
@@ -62,7 +63,9 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
     routers = [module.router for module in (captures, calibrations, jobs, sessions, uploads, rig, storage, operations)]
     for router in routers:
         app.include_router(router)
-    problems.install(app, [route for router in routers for route in router.routes if isinstance(route, APIRoute)])
+    routes = [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
+    problems.install(app, routes)
+    app.add_middleware(JsonBodies, routes=routes)
     if mount_pages is not None:
         mount_pages(app, settings)
     if settings.cors_origins:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import Depends, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from server.address import is_loopback
@@ -23,7 +24,8 @@ ServiceOf = Annotated[Service, Depends(service_of)]
 
 
 def require(scope: str) -> Callable[..., Caller]:
-    """A dependency: the caller, if it may do ``scope``; else a 401 or 403 problem. Runs before a body is read."""
+    """A dependency: the caller, if it may do ``scope``; else a 401 or 403 problem. Runs before an upload is read;
+    JSON bodies, which FastAPI reads before dependencies, wait for ``check_caller`` (server.http.json_bodies)."""
 
     def authenticate(
         request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
@@ -34,6 +36,11 @@ def require(scope: str) -> Callable[..., Caller]:
         return caller
 
     return authenticate
+
+
+async def check_caller(request: Request) -> None:
+    """Raises the 401 or 403 problem of a request from nobody known; what the caller may do is not asked."""
+    await run_in_threadpool(_caller, request, await bearer(request))
 
 
 def _caller(request: Request, credentials: HTTPAuthorizationCredentials | None) -> Caller:

@@ -1,8 +1,11 @@
 """Documents on the wire."""
 
+import base64
+import binascii
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema
+from pydantic_core import PydanticCustomError
 
 from server.http.openapi import SETTINGS
 from server.services.service import Check
@@ -90,11 +93,21 @@ class NewFeatures(Received):
     points: dict[str, dict[str, list[float]]]
 
 
+def _decodes(secret: str) -> str:
+    try:
+        base64.b64decode(secret.removeprefix("whsec_"), validate=True)
+    except binascii.Error as error:
+        told = "is no base64 after whsec_: it has a number of characters that no bytes have, or lacks its = at the end"
+        raise PydanticCustomError("secret", told) from error
+    return secret
+
+
+Secret = Annotated[str, Field(pattern="^whsec_[A-Za-z0-9+/]{32,}={0,2}$"), AfterValidator(_decodes)]
+
+
 class JobWebhook(Received):
     url: str = Field(pattern="^https?://", max_length=2000, description="at a server that the operator allowed")
-    secret: str | None = Field(
-        None, pattern="^whsec_[A-Za-z0-9+/]{32,}={0,2}$", description="signs the messages (standardwebhooks.com)"
-    )
+    secret: Secret | None = Field(None, description="signs the messages (standardwebhooks.com)")
 
 
 class NewJob(Received):

@@ -4,7 +4,7 @@ import fcntl
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from rig.atomic_write import write_atomically
@@ -62,11 +62,14 @@ class ResumableUploads:
         write_atomically(path, json.dumps(UPLOAD.document(record)).encode())
 
     @contextmanager
-    def lock(self, record: UploadRecord) -> Iterator[None]:
-        """One writer at a time, in this process or another. Raises Conflict."""
-        with (self.data(record).parent / "upload.json").open("rb") as stream:
+    def lock(self, identity: str) -> Iterator[None]:
+        """One at a time writes to an upload or removes it, in this process or another. Raises Conflict, NotFound."""
+        with ExitStack() as stack:
             try:
+                stream = stack.enter_context((self._store.folder("uploads", identity) / "upload.json").open("rb"))
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except (FileNotFoundError, NotADirectoryError) as error:  # removed since it was looked at
+                raise NotFound("upload", identity) from error
             except BlockingIOError as error:
                 detail = "Another request is writing to this upload; ask with HEAD and go on from there."
                 raise Conflict("upload-busy", detail) from error
@@ -76,13 +79,13 @@ class ResumableUploads:
         self._store.remove(self._store.folder("uploads", identity))
 
     def sweep(self) -> int:
-        """Removes what expired."""
+        """Removes what expired, but not under who writes to it."""
         removed = 0
         for identity in self._store.ids("uploads"):
             try:
                 self.get(identity)
             except NotFound:
-                if (self._store.folder("uploads", identity) / "upload.json").is_file():
+                with suppress(Conflict, NotFound), self.lock(identity):
                     self.remove(identity)
                     removed += 1
         return removed

@@ -20,7 +20,7 @@ import sqlalchemy as sa
 from dbos import EnqueueOptions
 
 from server.errors import NotFound
-from server.origins import target
+from server.origins import parsed, target
 from server.services.jobs import APPLICATION_VERSION, DELIVERY
 from server.services.records import NewWebhook, Webhook
 from server.storage.database import now_sql, webhooks
@@ -39,7 +39,8 @@ class Webhooks:
         self._engine, self._origins = engine, origins
 
     def add(self, url: str) -> NewWebhook:
-        """The new webhook with its secret, which is shown this once."""
+        """The new webhook with its secret, which is shown this once. Raises Unusable for what is no web address."""
+        parsed(url)
         secret = "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode()
         made = NewWebhook(secrets.token_hex(14), url, secret)
         with self._engine.begin() as connection:

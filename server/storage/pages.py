@@ -71,11 +71,12 @@ def place_of(cursor: str) -> Place:
     """What a cursor names. Raises InputError."""
     try:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+        text = f"{value}{identity}".encode()  # half of a surrogate pair is JSON and nothing that a database takes
     except (ValueError, RecursionError, TypeError) as error:
         raise no_cursor() from error
     if not (_is_whole(total) and total >= 0 and (isinstance(value, str) or _is_whole(value))):
         raise no_cursor()
-    if not isinstance(identity, str) or "\0" in f"{value}{identity}":
+    if not isinstance(identity, str) or b"\0" in text:
         raise no_cursor()
     return Place(value, identity, total)
 

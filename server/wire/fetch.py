@@ -11,10 +11,10 @@ from server.origins import target
 from server.services.service import Service
 from server.services.uploads import too_large
 from server.wire.multipart import BLOCK_BYTES
+from server.wire.patience import SILENT_S
 
 REDIRECTS_MOST = 5
 CONNECT_S = 10.0
-SILENT_S = 30.0  # between two pieces of the answer
 
 
 async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
@@ -30,7 +30,7 @@ async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
                 return await _follow(service, client, url, folder / "upload")
     except TimeoutError as error:
         raise _failed(f"did not give the archive within {service.settings.import_s:g} s") from error
-    except httpx.HTTPError as error:
+    except (httpx.HTTPError, UnicodeError) as error:  # UnicodeError: redirected to a host that IDNA refuses
         raise _failed(f"broke off ({type(error).__name__}: {error})") from error
 
 

@@ -4,7 +4,8 @@ The body is parsed here, not by the framework, so that a key and free space are 
 file is held in memory or in a temporary folder elsewhere, and every write happens in a thread.
 """
 
-from collections.abc import Iterable
+import difflib
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from fastapi import Request
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from rig.errors import InputError
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
@@ -20,10 +22,13 @@ from server.services.uploads import too_large
 from server.settings import ServiceSettings
 from server.storage.records import CaptureRecord, JsonObject
 from server.storage.store import Store
+from server.wire.patience import SILENT_S, patiently
 from server.wire.problems import Problem
 
 BLOCK_BYTES = 1 << 20
 FIELD_BYTES = 1 << 16  # of a form field that is no file
+FIELDS_MOST = 100  # parts of a form: with FIELD_BYTES, what one request may hold in memory
+ABOUT = ("session", "label", "expression", "tags")  # the fields of a capture's form
 ARCHIVE = ".zip, .tar or .tar.gz"
 
 
@@ -47,11 +52,12 @@ def check_length(request: Request, store: Store, settings: ServiceSettings) -> N
 
 
 async def receive_multipart(
-    request: Request, folder: Path, settings: ServiceSettings, threads: Threads
+    request: Request, folder: Path, store: Store, settings: ServiceSettings, threads: Threads
 ) -> tuple[Path, dict[str, str]]:
     """Writes the part ``file`` into ``folder``; returns its path and the other fields.
 
-    Raises problems: 415 for another content type, 400 for a body that breaks off, 422 without a ``file``, 413.
+    Raises DiskFull before a block that the disk has no room for, TooLarge, and problems: 415 for another content type,
+    400 for a body that breaks off, 408 for one that no longer comes, 422 without a ``file``, 413.
     """
     kind, options = parse_options_header(request.headers.get("content-type"))
     boundary = options.get(b"boundary")
@@ -64,9 +70,14 @@ async def receive_multipart(
         raise Problem(400, "malformed-body", f"The multipart boundary is no good ({error}).") from error
     path = folder / "upload"
     received = 0
-    target = await threads.disk(path.open, "xb")
+    target: Any = await threads.disk(path.open, "xb")
+
+    def write(block: bytes) -> None:  # a body that comes in chunks announced no length that could be judged before
+        store.reserve(len(block), settings.free_bytes)
+        target.write(block)
+
     try:
-        async for chunk in request.stream():
+        async for chunk in patiently(request.stream(), SILENT_S):
             received += len(chunk)
             if received > settings.body_bytes:
                 raise too_large(settings)
@@ -75,8 +86,8 @@ async def receive_multipart(
             except FormParserError as error:
                 raise Problem(400, "malformed-body", f"The body is no multipart/form-data ({error}).") from error
             if len(form.pending) >= BLOCK_BYTES:
-                await threads.disk(target.write, form.take())
-        await threads.disk(target.write, form.take())
+                await threads.disk(write, form.take())
+        await threads.disk(write, form.take())
     finally:
         await threads.disk(target.close)
     if not form.ended:
@@ -92,7 +103,7 @@ class _Form:
     def __init__(self) -> None:
         self.pending = bytearray()
         self.fields: dict[str, str] = {}
-        self.files = 0
+        self.files, self._parts = 0, 0
         self.ended = False
         self._header, self._value = b"", b""
         self._name, self._data = "", bytearray()
@@ -113,6 +124,9 @@ class _Form:
         return data
 
     def _part_begin(self) -> None:
+        self._parts += 1
+        if self._parts > FIELDS_MOST:
+            raise Problem(413, "fields-too-many", f"The form has more than {FIELDS_MOST} parts; send one archive.")
         self._name, self._data = "", bytearray()
 
     def _add_header(self, data: bytes) -> None:
@@ -148,11 +162,28 @@ class _Form:
         self.ended = True
 
 
-async def receive_capture(service: Service, request: Request) -> tuple[CaptureRecord, dict[str, str]]:
-    """Receives a multipart archive and makes a capture of it; returns its record and the form's fields."""
+def check_fields(names: Iterable[str], known: Collection[str]) -> None:
+    """Raises InputError naming each field that the form does not have: who mistyped ``settings`` would get the
+    defaults."""
+    faults = []
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            told = f"did you mean {near[0]!r}?" if near else f"there are file, {', '.join(known)}"
+            faults.append(f"unknown field {name!r:.80}; {told}")
+    if faults:
+        raise InputError("form", faults)
+
+
+async def receive_capture(
+    service: Service, request: Request, known: Collection[str] = ABOUT
+) -> tuple[CaptureRecord, dict[str, str]]:
+    """Receives a multipart archive and makes a capture of it; returns its record and the form's fields, of which there
+    are ``known`` ones only."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
-        archive, fields = await receive_multipart(request, folder, service.settings, service.threads)
+        archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
+        check_fields(fields, known)
         record = await service.threads.check(service.captures.accept, archive, folder, About.of(fields))
     return record, fields
 
@@ -162,7 +193,8 @@ async def receive_calibration_pictures(service: Service, request: Request) -> Ca
     queues a calibration."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
-        archive, fields = await receive_multipart(request, folder, service.settings, service.threads)
+        archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
+        check_fields(fields, ("label", "from"))
         label = (fields.get("label") or "")[:500]
         accept = {"board": service.accept_board_pictures, "scene": service.accept_photographs}
         source = fields.get("from") or "board"

@@ -12,6 +12,7 @@ from server.http.auth import ServiceOf, require
 from server.http.calibration_schemas import CalibrationList, CalibrationOut, NewCalibration
 from server.services.keys import Caller
 from server.wire.multipart import check_length, described_form, receive_calibration_pictures
+from server.wire.patience import SILENT_S, patiently
 from server.wire.problems import Problem, Responses, documented
 from server.wire.send_file import send_file
 
@@ -28,7 +29,7 @@ BODY = described_form(
 BODY["requestBody"]["content"]["application/json"] = {"schema": NewCalibration.model_json_schema()}
 
 
-@router.post("", status_code=202, responses=documented(400, 404, 413, 415, 507), openapi_extra=BODY)
+@router.post("", status_code=202, responses=documented(400, 404, 408, 413, 415, 507), openapi_extra=BODY)
 async def make_calibration(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CalibrationOut:
     """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took (JSON): of the board,
     or, ``"from": "scene"``, of anything."""
@@ -91,7 +92,7 @@ def remove_calibration(service: ServiceOf, caller: Taker, calibration_id: str) -
 
 async def _small_body(request: Request) -> bytes:
     body = bytearray()
-    async for chunk in request.stream():
+    async for chunk in patiently(request.stream(), SILENT_S):
         body += chunk
         if len(body) > JSON_BYTES:
             raise Problem(413, "body-too-large", f"A JSON body may have {JSON_BYTES:,} bytes.")

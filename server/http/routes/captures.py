@@ -22,7 +22,7 @@ from server.services.work import Work
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.wire.fetch import fetch_archive
-from server.wire.multipart import ARCHIVE, described_form, receive_capture
+from server.wire.multipart import ABOUT, ARCHIVE, described_form, receive_capture
 from server.wire.problems import Responses, documented
 from server.wire.send_file import send_file
 
@@ -31,6 +31,7 @@ Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
 
 FIELDS = ("session", "label", "expression")
+OF_JOB = ("model", "name", "settings")
 TAGS = "with commas between"
 
 
@@ -46,7 +47,7 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
 @router.post(
     "/captures/uploads",
     status_code=201,
-    responses=documented(400, 404, 413, 415, 507),
+    responses=documented(400, 404, 408, 413, 415, 507),
     openapi_extra=described_form(ARCHIVE, FIELDS, tags=TAGS),
 )
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
@@ -191,7 +192,7 @@ def delete_capture(
     "/reconstructions",
     status_code=202,
     tags=["jobs"],
-    responses=documented(400, 404, 409, 413, 415, 507),
+    responses=documented(400, 404, 408, 409, 413, 415, 507),
     openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), tags=TAGS, settings="JSON object"),
 )
 async def reconstruct_upload(
@@ -201,7 +202,7 @@ async def reconstruct_upload(
     response: Response,
 ) -> JobOut:
     """Upload and job in one call."""
-    record, fields = await receive_capture(service, request)
+    record, fields = await receive_capture(service, request, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
         wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")), name)

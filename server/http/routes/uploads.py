@@ -75,7 +75,7 @@ def tus_head(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: R
 @router.patch(
     "/{upload_id}",
     status_code=204,
-    responses=documented(400, 404, 409, 412, 413, 415, 507) | {460: {"description": "Checksum Mismatch"}},
+    responses=documented(400, 404, 408, 409, 412, 413, 415, 507) | {460: {"description": "Checksum Mismatch"}},
     openapi_extra={
         "requestBody": {
             "content": {"application/offset+octet-stream": {"schema": {"type": "string", "format": "binary"}}}
@@ -96,7 +96,7 @@ async def tus_patch(
     if request.headers.get("content-type") != "application/offset+octet-stream":
         raise Problem(415, "unsupported-media-type", "Send application/offset+octet-stream.")
     record = await service.threads.disk(_own, service, caller, upload_id)
-    with service.uploads.lock(record):
+    with service.uploads.lock(record.id):
         # read again: the request that held the lock before may have made the capture
         record = await service.threads.disk(_own, service, caller, upload_id)
         return await _append(service, record, upload_offset, request.stream(), upload_checksum)
@@ -116,12 +116,13 @@ async def _append(
     return Response(status_code=204, headers=COMMON | headers | _expires(record) | _location(record))
 
 
-@router.delete("/{upload_id}", status_code=204, responses=documented(404, 412))
+@router.delete("/{upload_id}", status_code=204, responses=documented(404, 409, 412))
 def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
-    """Gives an upload up; a capture that was made from it stays."""
+    """Gives an upload up; a capture that was made from it stays. 409 while bytes of it come in."""
     _check_version(tus_resumable)
-    _own(service, caller, upload_id)
-    service.uploads.remove(upload_id)
+    record = _own(service, caller, upload_id)
+    with service.uploads.lock(record.id):
+        service.uploads.remove(record.id)
     return Response(status_code=204, headers=COMMON)
 
 

@@ -5,6 +5,7 @@ import hashlib
 import hmac
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -67,6 +68,14 @@ def test_each_scope_does_what_it_may_and_no_more(
             assert client.get("/healthz").status_code == 200
 
 
+def test_a_json_body_is_not_awaited_from_nobody(guarded: tuple[RunningService, dict[str, str]]) -> None:
+    service, _ = guarded
+    head = f"POST /v1/sessions HTTP/1.1\r\nHost: 127.0.0.1:{service.port}\r\nContent-Type: application/json\r\n"
+    with socket.create_connection(("127.0.0.1", service.port), timeout=10) as client:
+        client.sendall(head.encode() + b"Content-Length: 200000000\r\n\r\n")
+        assert client.recv(1 << 16).split()[1] == b"401"
+
+
 def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(
     guarded: tuple[RunningService, dict[str, str]],
 ) -> None:
@@ -78,6 +87,15 @@ def test_a_key_cannot_remove_itself_and_a_removed_one_is_refused(
             assert admin.delete(f"/v1/keys/{made['id']}").status_code == 204
             assert client.get("/v1/jobs").status_code == 401
         assert admin.delete(f"/v1/keys/{keys['admin'].split('_')[1]}").status_code == 409
+
+
+@pytest.mark.parametrize("url", ["http://[", "http://", "https://a..b/"])
+def test_a_webhook_at_no_address_is_refused(guarded: tuple[RunningService, dict[str, str]], url: str) -> None:
+    service, keys = guarded
+    with client_of(service, keys["admin"]) as admin:
+        refused = admin.post("/v1/webhooks", json={"url": url})
+        assert (refused.status_code, refused.json()["type"]) == (422, "urn:eigenhead:problem:url-refused")
+        assert admin.get("/v1/webhooks").json() == {"webhooks": []}
 
 
 def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]], tmp_path: Path) -> None:

@@ -21,6 +21,24 @@ def test_upload_and_job_in_one_call(http: httpx.Client, archive: bytes) -> None:
 
 
 @pytest.mark.parametrize(
+    ("path", "field", "word"),
+    [
+        ("/v1/reconstructions", "settigns", "did you mean 'settings'?"),
+        ("/v1/reconstructions", "webhook", "there are file, session, label"),
+        ("/v1/captures/uploads", "settings", "there are file, session, label"),
+    ],
+)
+def test_a_form_field_that_nobody_knows_is_named(
+    service: RunningService, http: httpx.Client, archive: bytes, path: str, field: str, word: str
+) -> None:
+    before = stored(service)
+    refused = upload(http, archive, path, **{field: "{}"})
+    assert (refused.status_code, refused.json()["type"]) == (422, "urn:eigenhead:problem:invalid-form")
+    assert [word in fault and repr(field) in fault for fault in refused.json()["errors"]] == [True]
+    assert stored(service) == before
+
+
+@pytest.mark.parametrize(
     ("fault", "word"),
     [
         ("damaged", "damaged or cut off"),

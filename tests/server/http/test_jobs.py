@@ -50,6 +50,9 @@ def test_an_upload_becomes_a_capture_and_a_job_a_result(http: httpx.Client, arch
     packed = http.get(f"/v1/jobs/{job['id']}/result/all.zip")
     assert packed.headers["content-type"] == "application/zip"
     assert packed.content == http.get(f"/v1/jobs/{job['id']}/result/all.zip").content
+    head = http.head(f"/v1/jobs/{job['id']}/result/all.zip")
+    assert (head.status_code, head.headers["etag"], head.content) == (200, packed.headers["etag"], b"")
+    assert "content-length" not in head.headers, "nobody knows it before the archive is made"
     with zipfile.ZipFile(io.BytesIO(packed.content)) as zipped:
         assert zipped.testzip() is None
         assert {name: len(zipped.read(name)) for name in zipped.namelist()} == {

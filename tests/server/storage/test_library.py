@@ -96,7 +96,13 @@ def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library
     assert found("berta") == (identity(2),)
 
 
-@pytest.mark.parametrize("cursor", ["", "!", "bnVsbA", "WzEsMl0", "W251bGwsICJhIiwgMV0", "WyJhIiwgIlx1MDAwMCIsIDFd"])
+@pytest.mark.parametrize(
+    "cursor",
+    [
+        *("", "!", "bnVsbA", "WzEsMl0", "W251bGwsICJhIiwgMV0", "WyJhIiwgIlx1MDAwMCIsIDFd"),
+        *("WyIyMDI2IiwiXHVkODAwIiwxXQ", "WyJcdWQ4MDAiLCIyMDI2IiwxXQ"),  # half of a surrogate pair
+    ],
+)
 def test_a_cursor_of_nothing_is_refused_by_name(library: Library, cursor: str) -> None:
     with pytest.raises(InputError) as error:
         library.captures(CaptureQuery(), 3, cursor)

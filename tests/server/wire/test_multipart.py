@@ -10,14 +10,17 @@ from typing import Any, cast
 import pytest
 from fastapi import Request
 
-from rig.errors import EigenheadError
+from rig.errors import EigenheadError, InputError
 from server.errors import DiskFull, TooLarge
 from server.services.service import Service
 from server.services.threads import Threads
 from server.settings import ServiceSettings
 from server.storage.store import Store
 from server.wire.multipart import (
+    BLOCK_BYTES,
     FIELD_BYTES,
+    FIELDS_MOST,
+    check_fields,
     check_length,
     described_form,
     receive_calibration_pictures,
@@ -49,9 +52,8 @@ def received(
 
     async def receive() -> tuple[Path, dict[str, str]]:
         request = cast(Request, SimpleNamespace(headers={"content-type": content_type}, stream=stream))
-        return await receive_multipart(
-            request, folder, ServiceSettings.model_validate({"data": folder, **settings}), Threads()
-        )
+        given = ServiceSettings.model_validate({"data": folder, "free_bytes": 0, **settings})
+        return await receive_multipart(request, folder, Store(folder), given, Threads())
 
     path, fields = asyncio.run(receive())
     return path.read_bytes(), fields
@@ -66,6 +68,19 @@ def test_file_and_fields_arrive_whole_in_pieces_of_any_size(tmp_path: Path, piec
 def test_a_large_file_is_written_on_the_way(tmp_path: Path) -> None:
     large = DATA * 300  # 3 MB: several blocks
     assert received(tmp_path, body(part("file", large)), piece=100_000)[0] == large
+
+
+def test_a_client_that_vanished_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.wire.multipart.SILENT_S", 0.05)
+
+    async def stream() -> Any:
+        yield part("file", DATA)
+        await asyncio.sleep(60)
+
+    request = cast(Request, SimpleNamespace(headers={"content-type": TYPE}, stream=stream))
+    with pytest.raises(Problem, match=r"Nothing more came for 0\.05 s") as refused:
+        asyncio.run(receive_multipart(request, tmp_path, Store(tmp_path), ServiceSettings(data=tmp_path), Threads()))
+    assert (refused.value.status, refused.value.kind) == (408, "body-silent")
 
 
 SEND_ONE = "Send multipart/form-data with the archive as the part 'file'."
@@ -121,6 +136,27 @@ def test_what_is_no_such_body_is_refused(
         received(tmp_path, data, content_type)
     assert (refused.value.status, refused.value.kind, tuple(refused.value.errors)) == (status, kind, errors)
     assert str(refused.value.detail).startswith(detail)
+
+
+def test_a_form_may_have_a_hundred_parts_and_no_more(tmp_path: Path) -> None:
+    """Of one name, too: what is counted is what comes."""
+    fields = [part("label", b"x") for _ in range(FIELDS_MOST - 1)]
+    assert received(tmp_path, body(*fields, part("file", DATA)))[0] == DATA
+    (tmp_path / "upload").unlink()
+    with pytest.raises(Problem, match="more than 100 parts") as refused:
+        received(tmp_path, body(*fields, part("file", DATA), part("label", b"x")))
+    assert (refused.value.status, refused.value.kind) == (413, "fields-too-many")
+
+
+def test_a_body_that_announced_nothing_leaves_the_spare_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of five blocks of room two are to be spared."""
+    room = 5 * BLOCK_BYTES
+    written = tmp_path / "upload"
+    monkeypatch.setattr(Store, "free_bytes", lambda self: room - written.stat().st_size)
+    blocks = body(part("file", bytes(9 * BLOCK_BYTES)))
+    with pytest.raises(DiskFull):
+        received(tmp_path, blocks, piece=BLOCK_BYTES // 4, free_bytes=2 * BLOCK_BYTES)
+    assert 2 * BLOCK_BYTES < written.stat().st_size <= 3 * BLOCK_BYTES
 
 
 def test_names_and_values_that_are_no_utf_8_are_taken_with_a_mark(tmp_path: Path) -> None:
@@ -221,6 +257,22 @@ def test_calibration_pictures_go_to_whom_they_are_from(tmp_path: Path, source: b
 
 def test_a_label_of_a_calibration_is_cut(tmp_path: Path) -> None:
     assert pictures_of(tmp_path, part("label", b"y" * 501))[2] == "y" * 500
+
+
+def test_each_field_that_a_form_does_not_have_is_named() -> None:
+    check_fields(["label", "settings"], ("label", "settings"))
+    with pytest.raises(InputError) as refused:
+        check_fields(["settigns", "label", "webhook", ""], ("label", "settings"))
+    assert list(refused.value.faults) == [
+        "unknown field 'settigns'; did you mean 'settings'?",
+        "unknown field 'webhook'; there are file, label, settings",
+        "unknown field ''; there are file, label, settings",
+    ]
+
+
+def test_a_field_that_a_calibration_does_not_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="did you mean 'label'"):
+        pictures_of(tmp_path, part("lable", b"Monday"))
 
 
 def test_calibration_pictures_from_elsewhere_are_refused(tmp_path: Path) -> None:

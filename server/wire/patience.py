@@ -1,0 +1,28 @@
+"""Bodies as they come, with an end to the waiting: a client that vanished without a word sends nothing more, and would
+hold its connection, and what is locked for it, for ever."""
+
+from collections.abc import AsyncIterator
+
+import anyio
+
+from server.wire.problems import Problem
+
+SILENT_S = 30.0  # between two pieces: above the pauses of a network that changes, below what who sends again waits for
+
+
+async def patiently(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:
+    """The pieces of ``stream``. Raises a 408 problem if the next one does not come within ``silent_s``; how long the
+    whole takes does not matter."""
+    while (piece := await _next(stream, silent_s)) is not None:
+        yield piece
+
+
+async def _next(stream: AsyncIterator[bytes], silent_s: float) -> bytes | None:
+    try:
+        with anyio.fail_after(silent_s):
+            return await anext(stream, None)
+    except TimeoutError as error:
+        detail = (
+            f"Nothing more came for {silent_s:g} s; send the rest again, by a resumable upload only what is missing."
+        )
+        raise Problem(408, "body-silent", detail, headers={"Connection": "close"}) from error

@@ -1,0 +1,145 @@
+"""JSON bodies before FastAPI reads them: whose they are, and how much of them is taken."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from fastapi import FastAPI, Request
+from fastapi.routing import APIRoute
+from pydantic import BaseModel
+from starlette.types import Message
+
+from server.http.json_bodies import JsonBodies
+from server.services.keys import Keys
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+
+MOST = 1000
+PIECE = 100
+
+
+class Note(BaseModel):
+    text: str
+
+
+@dataclass
+class Door:
+    """An app of a route with a JSON body, one that streams and a mounted page, and a key to it."""
+
+    app: FastAPI
+    key: str
+
+    def ask(
+        self, path: str, body: bytes, *, key: str | None = None, announced: int | None = None
+    ) -> tuple[int, bytes, int]:
+        """The status and body of the answer, and how many bytes were read for it. The client never goes away."""
+        return asyncio.run(self._ask(path, body, key, announced))
+
+    async def _ask(self, path: str, body: bytes, key: str | None, announced: int | None) -> tuple[int, bytes, int]:
+        pieces = [body[start : start + PIECE] for start in range(0, len(body), PIECE)] or [b""]
+        sent: list[Message] = []
+        read = 0
+
+        async def receive() -> Message:
+            nonlocal read
+            if not pieces:
+                await asyncio.sleep(60)
+            piece = pieces.pop(0)
+            read += len(piece)
+            return {"type": "http.request", "body": piece, "more_body": bool(pieces)}
+
+        async def send(message: Message) -> None:
+            sent.append(message)
+
+        headers = [(b"host", b"127.0.0.1"), (b"content-type", b"application/json")]
+        headers += [] if key is None else [(b"authorization", f"Bearer {key}".encode())]
+        headers += [] if announced is None else [(b"content-length", str(announced).encode())]
+        scope: dict[str, Any] = {"type": "http", "http_version": "1.1", "method": "POST", "path": path}
+        scope |= {"raw_path": path.encode(), "root_path": "", "query_string": b"", "headers": headers}
+        scope |= {"scheme": "http", "server": ("127.0.0.1", 80), "client": ("127.0.0.1", 1)}
+        await self.app(scope, receive, send)
+        return sent[0]["status"], b"".join(message.get("body", b"") for message in sent[1:]), read
+
+
+@pytest.fixture
+def door(tmp_path: Path) -> Iterator[Door]:
+    settings = ServiceSettings(data=tmp_path)
+    engine = open_database(settings)
+    keys = Keys(engine)
+    app = FastAPI()
+
+    @app.post("/notes")
+    async def note(wanted: Note) -> int:
+        return len(wanted.text)
+
+    @app.post("/streams")
+    async def stream(request: Request) -> int:
+        return len(await request.body())
+
+    pages = FastAPI()
+    pages.add_api_route("/notes", note, methods=["POST"])
+    app.mount("/pages", pages)
+    app.state.service = SimpleNamespace(keys=keys, settings=settings)
+    app.add_middleware(JsonBodies, routes=[r for r in app.routes if isinstance(r, APIRoute)], most=MOST)
+    yield Door(app, keys.add("console", ("read",)))
+    engine.dispose()
+
+
+def note_of(length: int) -> bytes:
+    """A JSON body of ``length`` bytes."""
+    return json.dumps({"text": "x" * (length - 12)}).encode()
+
+
+@pytest.mark.parametrize(("key", "kind"), [(None, "key-missing"), ("eh_000000000000_wrong", "key-invalid")])
+def test_nobody_is_refused_before_a_byte_is_read(door: Door, key: str | None, kind: str) -> None:
+    status, body, read = door.ask("/notes", bytes(100 * MOST), key=key)
+    assert (status, json.loads(body)["type"].rpartition(":")[2], read) == (401, kind, 0)
+
+
+@pytest.mark.parametrize(("announced", "read_most"), [(MOST + 1, 0), (None, MOST + PIECE), (10, MOST + PIECE)])
+def test_no_more_is_read_than_a_json_body_may_have(door: Door, announced: int | None, read_most: int) -> None:
+    status, body, read = door.ask("/notes", note_of(100 * MOST), key=door.key, announced=announced)
+    assert (status, json.loads(body)["type"]) == (413, "urn:eigenhead:problem:body-too-large")
+    assert read <= read_most
+
+
+@pytest.mark.parametrize("length", [20, PIECE, MOST - 1, MOST])
+@pytest.mark.parametrize("announces", [True, False])
+def test_a_body_up_to_the_limit_arrives_whole(door: Door, length: int, announces: bool) -> None:
+    sent = note_of(length)
+    answer = door.ask("/notes", sent, key=door.key, announced=len(sent) if announces else None)
+    assert answer == (200, str(length - 12).encode(), length)
+
+
+@pytest.mark.parametrize(("path", "told"), [("/streams", b"5000"), ("/pages/notes", b"4988")])
+def test_what_streams_and_pages_have_their_own_rules(door: Door, path: str, told: bytes) -> None:
+    assert door.ask(path, note_of(5 * MOST)) == (200, told, 5 * MOST)
+
+
+def test_who_goes_away_on_the_way_is_no_fault(door: Door) -> None:
+    """The app hears of it as it would have without."""
+    messages: list[Message] = [
+        {"type": "http.request", "body": b'{"te', "more_body": True},
+        {"type": "http.disconnect"},
+    ]
+    heard: list[Message] = []
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        heard.extend([await receive(), await receive()])
+
+    async def receive() -> Message:
+        return messages.pop(0)
+
+    async def send(message: Message) -> None:
+        raise AssertionError(message)
+
+    routes = [route for route in door.app.routes if isinstance(route, APIRoute)]
+    headers = [(b"host", b"127.0.0.1"), (b"authorization", f"Bearer {door.key}".encode())]
+    scope = {"type": "http", "method": "POST", "path": "/notes", "headers": headers, "app": door.app}
+    asyncio.run(JsonBodies(app, routes)(scope, receive, send))
+    assert [message["type"] for message in heard] == ["http.request", "http.disconnect"]
