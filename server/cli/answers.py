@@ -1,10 +1,11 @@
 """What every command shares: option types, the service's settings, a progress bar, and the answer on stdout."""
 
+import errno
 import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -56,14 +57,26 @@ Report = Callable[[str, float], None]
 def service_settings(**given: Any) -> Any:
     """The service's settings: options over variables over defaults. A wrong variable is wrong usage."""
     from pydantic import ValidationError
+    from pydantic_settings import SettingsError
 
-    from server.settings import ServiceSettings
+    from server.settings import ServiceSettings, variable_in
 
+    options = {name: value for name, value in given.items() if value is not None}
     try:
-        return ServiceSettings(**{name: value for name, value in given.items() if value is not None})
+        return ServiceSettings(**options)
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise typer.BadParameter(faults) from error
+        raise typer.BadParameter("; ".join(_setting_fault(fault, options) for fault in error.errors())) from error
+    except SettingsError as error:
+        raise typer.BadParameter(f'{variable_in(error)} is no JSON, such as ["first", "second"]') from error
+
+
+def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
+    """``fault`` as pydantic tells it, with the name by which its value came: an option's or a variable's."""
+    from server.settings import PREFIX
+
+    field, *inner = map(str, fault["loc"])
+    name = field if field in options else PREFIX + field.upper()
+    return f"{'.'.join([name, *inner])}: {fault['msg'].removeprefix('Value error, ')}"
 
 
 def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str | None]:
@@ -110,9 +123,23 @@ def prepare_file(path: Path, *, overwrite: bool = True) -> None:
     if path.exists() and not overwrite:
         raise Overwrites(path)
     try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
+    except OSError as error:
+        raise CannotWrite(path, error) from error
+
+
+def prepare_folder(path: Path) -> None:
+    """Makes an output folder and tries whether it can be written. Raises CannotWrite."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except FileExistsError as error:
+        raise CannotWrite(path, FileExistsError(errno.ENOTDIR, "it is a file, and a folder is written")) from error
     except OSError as error:
         raise CannotWrite(path, error) from error
 

@@ -49,7 +49,8 @@ def photographs_alone(folder: Path) -> bool:
     if find_rig_file(root) is not None:
         return False
     pictures = picture_folder(root)
-    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in pictures.rglob("*") if path.is_file())
+    found = (path for depth in ("*", "*/*") for path in pictures.glob(depth))  # as find_photographs looks for them
+    return any(path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() for path in found)
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Report) -> Prepared:
