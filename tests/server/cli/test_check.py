@@ -87,7 +87,7 @@ def test_a_key_that_nobody_reads_is_a_warning(masked: tuple[Capture, Rig], tmp_p
     path.write_text(json.dumps(document))
     found = found_in(tmp_path / "shot")
     assert [warning["code"] for warning in found["warnings"]] == ["unknown-key"]
-    assert "warning  unknown-key: cameras.json: the key units is not read" in "\n".join(lines(found))
+    assert "warning  unknown-key: cameras.json: the key 'units' is not read" in "\n".join(lines(found))
 
 
 def photographs(folder: Path) -> Path:
