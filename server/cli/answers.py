@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 import sys
 import tempfile
@@ -98,6 +99,17 @@ def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str
 def chosen(help_text: str, choices: Callable[[], tuple[str, ...]], *names: str) -> Any:
     """An option that takes one of ``choices``: asked for when it is given, or completed."""
     return typer.Option(*names, help=help_text, callback=one_of(choices), autocompletion=completing(choices))
+
+
+def _finite(value: float | None) -> float | None:
+    if value is not None and not math.isfinite(value):  # no comparison with a limit says so of NaN
+        raise typer.BadParameter(f"{value} is no finite number")
+    return value
+
+
+def number(help_text: str, **limits: Any) -> Any:
+    """An option that takes a finite number between ``min`` and ``max``."""
+    return typer.Option(help=help_text, callback=_finite, **limits)
 
 
 def model_names() -> tuple[str, ...]:

@@ -48,6 +48,10 @@ def board(
     A ruler beside it checks the print."""
     from calibration.board.board import board_from_document, write_board, write_board_pdf
 
+    if out.suffix.lower() not in ("", ".pdf"):
+        raise typer.BadParameter(
+            f"{out.suffix!r} is nothing that a board is written as; give a .pdf", param_hint="--out"
+        )
     columns, _, rows = squares.partition("x")
     if not (columns.isdigit() and rows.isdigit()):
         raise typer.BadParameter(f"{squares!r} is not like 9x6", param_hint="--squares")

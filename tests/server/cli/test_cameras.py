@@ -83,3 +83,12 @@ def test_formats_of_several_files_are_told_from_those_of_one(tmp_path: Path) -> 
     for kind in FORMATS:
         write_rig_file(wedge_rig(), tmp_path / kind, kind)
         assert (tmp_path / kind).is_dir() == (kind in FOLDER_FORMATS), kind
+
+
+def test_a_board_is_written_as_pdf_alone(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["board", "--out", str(tmp_path / "b.xyz")])
+    assert done.exit_code == 2
+    assert "'.xyz' is nothing that a board is written as; give a .pdf" in " ".join(
+        done.stderr.replace("│", " ").split()
+    )
+    assert list(tmp_path.iterdir()) == []

@@ -51,3 +51,11 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
     assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
     assert CliRunner().invoke(app, [*arguments, "--delight"]).exit_code == 0
     assert asked == [{"formats": ["glb", "usdz"]}, {"delight": True}]
+
+
+@pytest.mark.parametrize("option", ["--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps"])
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_what_is_no_finite_number_is_wrong_usage(option: str, value: str, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["simulate", str(tmp_path / "shot"), option, value])
+    assert done.exit_code == 2
+    assert option in done.stderr
