@@ -27,6 +27,13 @@ class CannotWrite(EigenheadError):
         super().__init__(f"{path} cannot be written ({error.strerror or error}); name another place with --out")
 
 
+class SpoilsCapture(EigenheadError):
+    """An output that would be read as a part of its own input from then on."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path} lies where the capture's own pictures do; name another place with --out")
+
+
 class Overwrites(EigenheadError):
     """An output that is there already."""
 
