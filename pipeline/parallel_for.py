@@ -12,7 +12,7 @@ from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
-from rig.errors import InputError
+from rig.errors import WrongVariable
 
 THREADS, THREADS_MOST = "EIGENHEAD_THREADS", 512
 Result = TypeVar("Result")
@@ -20,12 +20,13 @@ SLICES = 8  # of a loop: enough that threads end together
 
 
 def thread_count() -> int:
-    """How many threads share a loop: EIGENHEAD_THREADS, else the CPUs that this process may use. Raises InputError."""
+    """How many threads share a loop: EIGENHEAD_THREADS, else the CPUs that this process may use. Raises
+    WrongVariable."""
     given = os.environ.get(THREADS, "").strip()
     if not given:
         return len(os.sched_getaffinity(0))
     if not (given.isascii() and given.isdecimal() and 1 <= int(given[:9]) <= THREADS_MOST):
-        raise InputError(
+        raise WrongVariable(
             THREADS, [f"is {given!r}; give a whole number from 1 to {THREADS_MOST}, or unset it for one thread a CPU"]
         )
     return int(given)

@@ -23,6 +23,10 @@ class InputError(EigenheadError):
         super().__init__(f"{subject}: " + "; ".join(self.faults))
 
 
+class WrongVariable(InputError):
+    """A variable of the environment that cannot be used: a fault of nobody's capture."""
+
+
 def how_to_install(extra: str) -> str:
     """What to type for an optional part of the project, in a checkout and beside a wheel."""
     return f"run `deploy/setup.sh --extra {extra}`, or install eigenhead[{extra}] where a wheel was installed"

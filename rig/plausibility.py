@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from rig.camera import Camera
 from rig.geometry import RigidTransform
+from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 
 ONE_PLACE_MM = 1e-3
@@ -18,6 +19,9 @@ MIDDLE = (
 )
 FOCAL_LEAST = 0.15  # of the picture's width; 0.26 is a fisheye of 220 degrees, a pinhole of 0.15 sees 147
 FRAME_LEAST_MM = 100.0  # longer side of what the pictures show where the cameras look: half a head
+FRAME_USUAL_MM = 600.0  # of the studio's arrangements: 556 to 559
+FRAME_MOST_MM = 10_000.0  # and of the spread, since axes that hardly converge meet anywhere: a head is 2% of the side
+UNIT_MOST = 1_000_000  # nanometres; beyond, it is no unit
 UNITS = {10: "centimetres", 100: "decimetres", 1000: "metres"}
 GRID = (9, 7)
 CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
@@ -37,21 +41,39 @@ def _lens_fault(camera: Camera) -> str | None:
             f"{camera.name}: a focal length of {min(k.fx, k.fy):g} px is absurd for {k.width} x {k.height} pixels: "
             "of one in mm give mm times the picture's width in px, divided by the sensor's in mm"
         )
+    with np.errstate(all="ignore"):
+        straight, distorted = _through_lens(camera)
+        radius = np.linalg.norm(straight, axis=1)
+        growth = (np.sum(distorted * straight, axis=1) / radius**2)[radius > 1e-6]  # negative: turned inside out
+    lost = float(np.mean(~np.isfinite(radius)))
+    if lost <= LENS_LOST_MOST and (growth > LENS_GROWTH_LEAST).all() and (growth < LENS_GROWTH_MOST).all():
+        return None
+    told = ", ".join(f"{name} = {value:g}" for name, value in _coefficients(camera).items())
+    what = f"no ray meets {lost:.0%} of its middle" if lost > LENS_LOST_MOST else "it bends it out of all shape"
+    return f"{camera.name}: the lens is absurd ({told}; {what}): calibrate it again"
+
+
+def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """``X / Z, Y / Z`` without and with the lens, over the middle of the picture; NaN where no ray meets it.
+
+    A recorded lens is asked over the middle of the pinhole's picture, for which its own is read: what a fisheye saw
+    beyond has no place there, and says nothing against it."""
+    k = camera.intrinsics
     edge = 0.5 * (1.0 - MIDDLE)
     sides = zip((k.width, k.height), GRID, strict=True)
     columns, rows = (np.linspace(edge * size, (1.0 - edge) * size - 1, count) for size, count in sides)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    distorted = np.linalg.norm((pixels - (k.cx, k.cy)) / (k.fx, k.fy), axis=1)
-    with np.errstate(all="ignore"):
-        radius = np.linalg.norm(camera.undistort(pixels), axis=1)
-    lost = float(np.mean(~np.isfinite(radius)))
-    growth = distorted[radius > 1e-6] / radius[radius > 1e-6]
-    if lost <= LENS_LOST_MOST and (growth > LENS_GROWTH_LEAST).all() and (growth < LENS_GROWTH_MOST).all():
-        return None
-    d = k.distortion
-    told = f"k1 = {d.k1:g}, k2 = {d.k2:g}, p1 = {d.p1:g}, p2 = {d.p2:g}, k3 = {d.k3:g}"
-    what = f"no ray meets {lost:.0%} of its middle" if lost > LENS_LOST_MOST else "it bends it out of all shape"
-    return f"{camera.name}: the lens is absurd ({told}; {what}): calibrate it again"
+    middle, focal = np.array([k.cx, k.cy]), np.array([k.fx, k.fy])
+    if camera.recorded is None:
+        return camera.undistort(pixels), (pixels - middle) / focal
+    return (pixels - middle) / focal, (camera.recorded.distorted(pixels, k.matrix()) - middle) / focal
+
+
+def _coefficients(camera: Camera) -> dict[str, float]:
+    d, lens = camera.intrinsics.distortion, camera.recorded
+    if lens is None:
+        return {"k1": d.k1, "k2": d.k2, "p1": d.p1, "p2": d.p2, "k3": d.k3}
+    return dict(zip(COEFFICIENTS[lens.model], lens.coefficients, strict=True))
 
 
 def _spread_faults(rig: Rig) -> list[str]:
@@ -70,6 +92,13 @@ def _spread_faults(rig: Rig) -> list[str]:
         return [
             f"the pictures show {frame:.3g} mm where the cameras look, and no head fits: their translations look like "
             f"{UNITS[unit]}, and millimetres are wanted; multiply them by {unit}"
+        ]
+    if min(frame, spread) > FRAME_MOST_MM:
+        factor = 10 ** round(np.log10(frame / FRAME_USUAL_MM))
+        remedy = f"divide their translations by {factor}" if factor <= UNIT_MOST else "look for one that is wrong"
+        return [
+            f"the pictures show {frame / 1000:.3g} m where the cameras look, and a head would be lost there: "
+            f"translations are wanted in millimetres; {remedy}"
         ]
     return []
 

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from pydantic import Field, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
 from pipeline.eigenheads.data_folder import data_folder
 from server.address import is_loopback
@@ -13,6 +13,8 @@ from server.address import is_loopback
 PREFIX = "EIGENHEAD_"
 ORIGIN = re.compile(r"^https?://[^/?#\s@]+$")
 RECONSTRUCT = ".tasks.reconstruct:reconstruct_capture"
+DATABASES = ("sqlite", "postgres", "postgresql", "postgresql+psycopg")
+DATABASES_TOLD = "wanted is postgresql://HOST/NAME or sqlite:////FILE, or nothing for SQLite in the data folder"
 MOVED: dict[str, str] = {"server.work:reconstruct_capture": RECONSTRUCT}
 
 
@@ -91,6 +93,22 @@ class ServiceSettings(BaseSettings):
         """Where what a variable of an older version names lies now."""
         return MOVED.get(address, address)
 
+    @field_validator("database_url")
+    @classmethod
+    def _known_database(cls, url: str | None) -> str | None:
+        if url is None:
+            return None
+        from sqlalchemy import make_url  # half a second that a service on SQLite need not wait
+        from sqlalchemy.exc import ArgumentError
+
+        try:
+            driver = make_url(url).drivername
+        except (ArgumentError, ValueError) as error:
+            raise ValueError(f"is no database's URL; {DATABASES_TOLD}") from error
+        if driver not in DATABASES:
+            raise ValueError(f"{driver!r:.40} is no database that the service can use; {DATABASES_TOLD}")
+        return url
+
     @field_validator("import_origins", "webhook_origins")
     @classmethod
     def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
@@ -138,3 +156,8 @@ class ServiceSettings(BaseSettings):
         return {
             PREFIX + k.upper(): v if isinstance(v, str) else json.dumps(v) for k, v in values.items() if v is not None
         }
+
+
+def variable_in(error: SettingsError) -> str:
+    """The variable whose value cannot be decoded: pydantic names its field in the text alone."""
+    return next((PREFIX + name.upper() for name in ServiceSettings.model_fields if f'"{name}"' in str(error)), PREFIX)

@@ -37,6 +37,7 @@ WRITERS: dict[str, Callable[[Rig, Path], None]] = {
     "blender": write_blender,
 }
 FORMATS = tuple(WRITERS)
+FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # of several files
 NO_RIG = (
     "holds no cameras.json (nor a file of COLMAP, caliscope, aniposelib, Metashape, RealityCapture, nerfstudio or "
     "OpenCV)"

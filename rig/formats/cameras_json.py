@@ -68,9 +68,9 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
         raise InputError(subject, ["is no object with a list 'cameras'"])
     faults = []
     if document.get("format") != FORMAT:
-        faults.append(f"format is {document.get('format')!r}, wanted {FORMAT!r}")
+        faults.append(f"format is {document.get('format')!r:.80}, wanted {FORMAT!r}")
     if document.get("unit", "mm") != "mm":
-        faults.append(f"unit is {document['unit']!r}, wanted 'mm'")
+        faults.append(f"unit is {document['unit']!r:.80}, wanted 'mm'")
     entries = document["cameras"]
     if not CAMERAS_LEAST <= len(entries) <= CAMERAS_MOST:
         faults.append(f"{len(entries)} cameras; between {CAMERAS_LEAST} and {CAMERAS_MOST} work")

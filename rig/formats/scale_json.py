@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.errors import InputError
+from rig.formats.cameras_json import PIXELS_MOST
 
 KINDS = ("points", "tag", "cameras")
 
@@ -79,7 +80,12 @@ def _points(document: dict[str, Any], cameras: Collection[str], faults: list[str
         faults.append("points: wants an object of two points, each an object of camera: [x, y]")
         return None
     ends = [_pixels(views, f"points.{name}", cameras, faults) for name, views in points.items()]
-    return PointDistance(ends[0], ends[1], distance)
+    first, second = ends
+    shared = [name for name in first if name in second]
+    # One alone may lie behind the other in one picture, in two it cannot.
+    if len(shared) > 1 and all(np.array_equal(first[name], second[name]) for name in shared):
+        faults.append(f"points: {' and '.join(points)} are one place in {' and '.join(shared)}: pick two places")
+    return PointDistance(first, second, distance)
 
 
 def _pixels(views: Any, where: str, cameras: Collection[str], faults: list[str]) -> dict[str, np.ndarray]:
@@ -89,8 +95,8 @@ def _pixels(views: Any, where: str, cameras: Collection[str], faults: list[str])
     for name, pixel in views.items():
         if name not in cameras:
             faults.append(f"{where} names {name!r:.80}, of which there is no photograph")
-        if not (isinstance(pixel, list) and len(pixel) == 2 and all(map(_is_number, pixel))):
-            faults.append(f"{where}.{name} is {pixel!r:.80}, wanted [x, y] in pixels")
+        if not (isinstance(pixel, list) and len(pixel) == 2 and all(map(_is_place, pixel))):
+            faults.append(f"{where}.{name} is {pixel!r:.80}, wanted [x, y] in pixels, 0 to {PIXELS_MOST}")
     return {} if faults else {name: np.array(pixel, float) for name, pixel in views.items()}
 
 
@@ -129,6 +135,10 @@ def _length(document: dict[str, Any], key: str, faults: list[str], where: str = 
         faults.append(f"{where}{key} is {value!r:.80}, wanted a length in millimetres, 0.1 to 100000")
         return 1.0
     return float(value)
+
+
+def _is_place(value: Any) -> bool:
+    return _is_number(value) and -1.0 < value < PIXELS_MOST  # a pixel's area reaches half of one beyond its centre
 
 
 def _is_number(value: Any) -> bool:

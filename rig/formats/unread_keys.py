@@ -40,9 +40,9 @@ def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[str, .
     counts = Counter(_unread(document))
     told = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:
-        where = f"{place}.{key!s:.40}" if place else f"{key!s:.40}"
+        where = repr(f"{place}.{key}" if place else key)  # its signs may be none that a terminal shows
         whose = f" of {times} cameras" if times > 1 else ""
-        told.append(f"{subject}: the key {where}{whose} is not read: it is misspelt, or no key of this format")
+        told.append(f"{subject}: the key {where:.80}{whose} is not read: it is misspelt, or no key of this format")
     if len(counts) > TOLD_MOST:
         told.append(f"{subject}: {len(counts) - TOLD_MOST} more keys are not read")
     return tuple(told)

@@ -1,10 +1,12 @@
 """What every command shares: option types, the service's settings, a progress bar, and the answer on stdout."""
 
+import errno
 import json
+import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -23,6 +25,13 @@ class CannotWrite(EigenheadError):
 
     def __init__(self, path: Path, error: OSError) -> None:
         super().__init__(f"{path} cannot be written ({error.strerror or error}); name another place with --out")
+
+
+class SpoilsCapture(EigenheadError):
+    """An output that would be read as a part of its own input from then on."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path} lies where the capture's own pictures do; name another place with --out")
 
 
 class Overwrites(EigenheadError):
@@ -56,14 +65,26 @@ Report = Callable[[str, float], None]
 def service_settings(**given: Any) -> Any:
     """The service's settings: options over variables over defaults. A wrong variable is wrong usage."""
     from pydantic import ValidationError
+    from pydantic_settings import SettingsError
 
-    from server.settings import ServiceSettings
+    from server.settings import ServiceSettings, variable_in
 
+    options = {name: value for name, value in given.items() if value is not None}
     try:
-        return ServiceSettings(**{name: value for name, value in given.items() if value is not None})
+        return ServiceSettings(**options)
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise typer.BadParameter(faults) from error
+        raise typer.BadParameter("; ".join(_setting_fault(fault, options) for fault in error.errors())) from error
+    except SettingsError as error:
+        raise typer.BadParameter(f'{variable_in(error)} is no JSON, such as ["first", "second"]') from error
+
+
+def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
+    """``fault`` as pydantic tells it, with the name by which its value came: an option's or a variable's."""
+    from server.settings import PREFIX
+
+    field, *inner = map(str, fault["loc"])
+    name = field if field in options else PREFIX + field.upper()
+    return f"{'.'.join([name, *inner])}: {fault['msg'].removeprefix('Value error, ')}"
 
 
 def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str | None]:
@@ -85,6 +106,17 @@ def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str
 def chosen(help_text: str, choices: Callable[[], tuple[str, ...]], *names: str) -> Any:
     """An option that takes one of ``choices``: asked for when it is given, or completed."""
     return typer.Option(*names, help=help_text, callback=one_of(choices), autocompletion=completing(choices))
+
+
+def _finite(value: float | None) -> float | None:
+    if value is not None and not math.isfinite(value):  # no comparison with a limit says so of NaN
+        raise typer.BadParameter(f"{value} is no finite number")
+    return value
+
+
+def number(help_text: str, **limits: Any) -> Any:
+    """An option that takes a finite number between ``min`` and ``max``."""
+    return typer.Option(help=help_text, callback=_finite, **limits)
 
 
 def model_names() -> tuple[str, ...]:
@@ -110,9 +142,23 @@ def prepare_file(path: Path, *, overwrite: bool = True) -> None:
     if path.exists() and not overwrite:
         raise Overwrites(path)
     try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
+    except OSError as error:
+        raise CannotWrite(path, error) from error
+
+
+def prepare_folder(path: Path) -> None:
+    """Makes an output folder and tries whether it can be written. Raises CannotWrite."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except FileExistsError as error:
+        raise CannotWrite(path, FileExistsError(errno.ENOTDIR, "it is a file, and a folder is written")) from error
     except OSError as error:
         raise CannotWrite(path, error) from error
 

@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, Overwrite, answer, chosen, prepare_file, progress_bar, warn, wrong_usage
+from server.cli.answers import (
+    Json,
+    Overwrite,
+    answer,
+    chosen,
+    prepare_file,
+    prepare_folder,
+    progress_bar,
+    warn,
+    wrong_usage,
+)
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -38,6 +48,10 @@ def board(
     A ruler beside it checks the print."""
     from calibration.board.board import board_from_document, write_board, write_board_pdf
 
+    if out.suffix.lower() not in ("", ".pdf"):
+        raise typer.BadParameter(
+            f"{out.suffix!r} is nothing that a board is written as; give a .pdf", param_hint="--out"
+        )
     columns, _, rows = squares.partition("x")
     if not (columns.isdigit() and rows.isdigit()):
         raise typer.BadParameter(f"{squares!r} is not like 9x6", param_hint="--squares")
@@ -192,11 +206,13 @@ def convert(
 ) -> None:
     """Convert calibrations to and from other programs."""
     from rig.errors import InputError
-    from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, write_rig_file
+    from rig.formats.cameras_file import FOLDER_FORMATS, NO_RIG, find_rig_file, read_rig_file, write_rig_file
 
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:
         raise InputError(str(source), [NO_RIG])
     rig = read_rig_file(file)
+    prepare = prepare_folder if to in FOLDER_FORMATS else prepare_file
+    prepare(out)
     write_rig_file(rig, out, to)
     answer({"out": str(out), "cameras": list(rig.names)}, json_out, [f"{out}  {len(rig)} cameras"])

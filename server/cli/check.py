@@ -1,7 +1,9 @@
 """``eigenhead check``: what is wrong with a capture, before anybody waits for a fit.
 
-Files, cameras, plates and feature points are judged as at the service's door (``server.tasks.ingest``); where they are
-in order, outlines are asked what they say of pictures and cameras (``pipeline.silhouettes.usable_views``)."""
+Files, cameras, plates and feature points are judged as at the service's door (``server.tasks.ingest``), but for
+pictures of no camera, which a reconstruction passes over; where they are in order, outlines are asked what they say of
+pictures and cameras (``pipeline.silhouettes.usable_views``). What is wrong with this machine is no fault of the capture
+and is raised."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,11 +13,14 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypedDict
 
 from rig.capture import Capture
-from rig.errors import EigenheadError, InputError
-from rig.formats.capture_folder import capture_root, read_capture
+from rig.errors import EigenheadError, InputError, WrongVariable
+from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, listed_pictures, read_capture, stray_faults
+from rig.formats.images import decode_image_file
 from rig.formats.work_size import WORK_PIXELS
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
+from server.tasks.child import WorkFailed
 from server.tasks.ingest import check_capture, filed_by_other_names
 from server.tasks.photographs import SCALE, photographs_alone
 from server.tasks.prepare import prepare_kernels
@@ -46,7 +51,7 @@ class Checked(TypedDict):
 
 def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Checked:
     """Every fault and warning of a capture folder or archive that needs no fit. Raises InputError for settings that are
-    none."""
+    none, WrongVariable and WorkFailed."""
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
@@ -54,13 +59,18 @@ def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Ch
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
-                found["cameras"], found["will"] = _told_by_photographs(folder)
+                found["cameras"], found["will"] = _told_by_photographs(folder, report)
+                _check_front(chosen.front, found["cameras"])
                 return found
             with _named_by_camera(capture_root(folder)) as named:
-                content = check_capture(named, service_settings().image_pixels, report)
+                found["warnings"] = _told_by_strays(named)
+                content = check_capture(named, service_settings().image_pixels, report, strays_pass=True)
             found["cameras"] = [camera.name for camera in content.cameras]
-            found["front"] = content.front
-            found["warnings"] = _told_by_outlines(folder, chosen, report)
+            _check_front(chosen.front, found["cameras"])
+            found["front"] = chosen.front or content.front
+            found["warnings"] += _told_by_outlines(folder, chosen, report)
+    except (WrongVariable, WorkFailed):
+        raise
     except InputError as error:
         found["faults"] = list(error.faults)
     except EigenheadError as error:
@@ -85,14 +95,35 @@ def _named_by_camera(root: Path) -> Iterator[Path]:
         yield Path(scratch)
 
 
-def _told_by_photographs(folder: Path) -> tuple[list[str], list[str]]:
+def _check_front(front: str | None, cameras: list[str]) -> None:
+    if front is not None and front not in cameras:
+        raise InputError("front", [f"front camera {front!r:.80} is none of the capture's ({', '.join(cameras)})"])
+
+
+def _told_by_strays(root: Path) -> list[Warned]:
+    """Pictures of no camera; none where the cameras cannot be read, which ``check_capture`` tells."""
+    rig_file = find_rig_file(root)
+    if rig_file is None:
+        return []
+    try:
+        strays = stray_faults(root, read_rig_file(rig_file))
+    except InputError:
+        return []
+    passed = "a reconstruction from here passes it over, the service refuses it"
+    return [Warned(code="picture-unread", message=f"{stray}; {passed}") for stray in strays]
+
+
+def _told_by_photographs(folder: Path, report: Report) -> tuple[list[str], list[str]]:
     """Names of the photographs of a folder that has no cameras, and what a reconstruction will do with them. Raises
     InputError for photographs, or a scale.json, that cannot be used."""
     from calibration.scene.photographs import find_photographs
     from rig.formats.scale_json import read_scale
 
     root = capture_root(folder)
-    names = find_photographs(root).names
+    photographs = find_photographs(root)
+    names = photographs.names
+    beside = [path for kind in BESIDE_PICTURES for path in listed_pictures(root / kind)]
+    _check_pictures([*(path for shots in photographs.files.values() for path in shots.values()), *beside], root, report)
     known = (root / SCALE).is_file()
     if known:
         read_scale(root / SCALE, names)
@@ -105,6 +136,16 @@ def _told_by_photographs(folder: Path) -> tuple[list[str], list[str]]:
     unread = [f"{name} will not be read: it is no rig's file of a known program" for name in aside]
     begun = f"no cameras.json: {len(names)} photographs will be calibrated from the scene"
     return list(names), [begun, *unread, scale, masks]
+
+
+def _check_pictures(files: list[Path], root: Path, report: Report) -> None:
+    """Decodes one after the other. Raises InputError naming every one that cannot be, or is too large."""
+    faults = []
+    for number, path in enumerate(files):
+        report("check", number / len(files))
+        faults.append(decode_image_file(path, path.relative_to(root).as_posix(), grey=True)[2])
+    if any(faults):
+        raise InputError("photographs", filter(None, faults))
 
 
 def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[Warned]:

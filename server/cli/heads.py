@@ -18,6 +18,7 @@ from server.cli.answers import (
     chosen,
     completing,
     model_names,
+    number,
     prepare_file,
     progress_bar,
     warn,
@@ -196,10 +197,10 @@ def simulate(
     ] = None,
     subject: Annotated[str, typer.Option(help="random, mean, or a mesh file (head frame, mm).")] = "random",
     seed: Annotated[int, typer.Option(help="Of subject, looks, pose and noise.", min=0)] = 0,
-    noise: Annotated[float | None, typer.Option(help="Sensor noise, share of full scale.", min=0, max=1)] = None,
-    light_drift: Annotated[float | None, typer.Option(help="From plate to shot, share.", min=0, max=1)] = None,
-    defocus: Annotated[float | None, typer.Option(help="Blur, pixels.", min=0)] = None,
-    rolling_ms: Annotated[float | None, typer.Option(help="Readout of a rolling shutter.", min=0, max=200)] = None,
+    noise: Annotated[float | None, number("Sensor noise, share of full scale.", min=0, max=1)] = None,
+    light_drift: Annotated[float | None, number("From plate to shot, share.", min=0, max=1)] = None,
+    defocus: Annotated[float | None, number("Blur, pixels.", min=0)] = None,
+    rolling_ms: Annotated[float | None, number("Readout of a rolling shutter.", min=0, max=200)] = None,
     hair: Annotated[
         str | None,
         typer.Option(help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, glasses."),
@@ -216,7 +217,7 @@ def simulate(
         bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
     ] = False,
     port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
-    fps: Annotated[float, typer.Option(help="--serve: of the live views.", min=0.5, max=30)] = 4.0,
+    fps: Annotated[float, number("--serve: of the live views.", min=0.5, max=30)] = 4.0,
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:

@@ -58,4 +58,6 @@ def main() -> None:
     except Exception as error:
         if os.environ.get("EIGENHEAD_DEBUG"):
             raise
+        if isinstance(error, OSError) and error.filename:
+            fail(f"{error.filename} cannot be used ({error.strerror}): name another place, or mend who may use it")
         fail(f"{type(error).__name__}: {error} (EIGENHEAD_DEBUG=1 shows where)")

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 from rig.errors import InputError
 from rig.formats.archive import extract_archive
-from server.cli.answers import CannotWrite
+from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, picture_folder
+from server.cli.answers import CannotWrite, SpoilsCapture
 from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
 from server.tasks.prepare import prepare_kernels
@@ -55,6 +56,7 @@ def reconstruct_locally(
     share_one_heap()
     chosen = settings_from_document(settings)
     check_template(chosen.outputs.template, model or "default")
+    _check_apart(out, capture)
     with _result_folder(out) as fresh, folder_of(capture) as folder:
         _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)
         document = json.loads((fresh / "report.json").read_text(encoding="utf-8"))
@@ -93,6 +95,20 @@ def _reconstruct_folder(
     tell("write", 0.0)
     write_result(out, done, shot, template)
     durations.learn(chosen, progress.finish())
+
+
+def _check_apart(out: Path, capture: Path) -> None:
+    """Raises SpoilsCapture where the pictures of a result would be taken for the capture's."""
+    from server.tasks.photographs import photographs_alone
+
+    if not capture.is_dir():
+        return
+    place, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
+    pictures = [root / kind for kind in ("images", *BESIDE_PICTURES)]
+    pictures += [picture_folder(root)] if photographs_alone(root) else []  # any folder there is a camera's
+    beside_root = place.is_relative_to(whole) and not place.is_relative_to(root)  # which is told by being alone
+    if place == root or beside_root or any(place.is_relative_to(folder) for folder in pictures):
+        raise SpoilsCapture(out)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, answer, progress_bar
+from server.cli.answers import Json, answer, number, progress_bar
 
 rig_app = typer.Typer(help="The real rig of a rig.toml.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -82,7 +82,7 @@ def rig_board(
     out: Annotated[Path, typer.Option(help="The folder that `eigenhead calibrate` reads.", file_okay=False)],
     rig: RigFile = Path("rig.toml"),
     shots: Annotated[int, typer.Option(help="How many.", min=1)] = 25,
-    pause_s: Annotated[float, typer.Option(help="Before each, to move the board and hold it still.", min=0)] = 4.0,
+    pause_s: Annotated[float, number("Before each, to move the board and hold it still.", min=0)] = 4.0,
     json_out: Json = False,
 ) -> None:
     """Take shots of the calibration board with every camera."""

@@ -160,7 +160,11 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
     )
 
 
-def check_capture(root: Path, image_pixels: int, report: Report, *, measured: bool = False) -> CaptureContent:
+def check_capture(
+    root: Path, image_pixels: int, report: Report, *, measured: bool = False, strays_pass: bool = False
+) -> CaptureContent:
+    """What a capture folder holds; pictures of no camera are faults unless ``strays_pass``. Raises InputError naming
+    every fault."""
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", [NO_RIG])
@@ -169,7 +173,8 @@ def check_capture(root: Path, image_pixels: int, report: Report, *, measured: bo
     except InputError as error:
         raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
     check_folders(root, rig)
-    faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)] + stray_faults(root, rig)
+    faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
+    faults += [] if strays_pass else stray_faults(root, rig)
     digests: dict[str, str] = {}
     empty: list[str] = []
     views: dict[str, ViewCheck] = {}

@@ -49,7 +49,8 @@ def photographs_alone(folder: Path) -> bool:
     if find_rig_file(root) is not None:
         return False
     pictures = picture_folder(root)
-    return any(is_picture(path) for path in pictures.rglob("*"))
+    found = (path for depth in ("*", "*/*") for path in pictures.glob(depth))  # as find_photographs looks for them
+    return any(is_picture(path) for path in found)
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Report) -> Prepared:

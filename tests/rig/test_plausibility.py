@@ -8,6 +8,7 @@ import pytest
 from rig.camera import Distortion
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
+from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from rig.studio.scene.layout import ARRANGEMENTS_DEG, arrangement, default_layout
 from tests.support.scenes import fan
@@ -53,6 +54,37 @@ def test_an_absurd_lens_is_named(k1):
     assert fault.startswith("cam05: the lens is absurd (k1 = ")
 
 
+def recorded(rig, name, lens, **intrinsics):
+    return Rig(tuple(
+        replace(c, recorded=lens, intrinsics=replace(c.intrinsics, distortion=Distortion(), **intrinsics))
+        if c.name == name else c for c in rig
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("lens", "told"),
+    [
+        (RecordedLens("kannala-brandt", (1e11, 0.0, 0.0, 0.0)), "k1 = 1e+11, k2 = 0, k3 = 0, k4 = 0"),
+        (RecordedLens("kannala-brandt", (-30.0, 0.0, 0.0, 0.0)), "k1 = -30"),
+        (RecordedLens("rational", (0.0, 0.0, 0.0, 0.0, 0.0, -1000.0, 0.0, 0.0)), "k4 = -1000"),
+    ],
+)
+def test_an_absurd_recorded_lens_is_named(lens, told):
+    (fault,) = rig_faults(recorded(default_layout(), "cam05", lens))
+    assert fault.startswith("cam05: the lens is absurd (k1 = ")
+    assert told in fault
+
+
+def test_fisheyes_and_rational_lenses_of_real_cameras_have_no_faults():
+    rig = default_layout()
+    width = rig["cam05"].intrinsics.width
+    for share in (1.2, 0.5, 0.26):  # of the picture's width; the last sees 220 degrees
+        fisheye = RecordedLens("kannala-brandt", (-0.03, 0.011, -0.004, 0.0007))
+        assert rig_faults(recorded(rig, "cam05", fisheye, fx=share * width, fy=share * width)) == []
+    rational = RecordedLens("rational", (0.12, -0.05, 1e-3, -8e-4, 0.01, 0.31, 0.02, 0.003))
+    assert rig_faults(recorded(rig, "cam05", rational)) == []
+
+
 def test_a_focal_length_in_mm_is_named_and_not_its_lens():
     rig = default_layout()
     in_mm = Rig(tuple(replace(c, intrinsics=replace(c.intrinsics, fx=50.0, fy=50.0)) for c in rig))
@@ -65,6 +97,21 @@ def test_other_units_are_recognised_by_what_the_pictures_show(unit, name):
     (fault,) = rig_faults(posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation / unit)))
     assert f"look like {name}" in fault
     assert f"multiply them by {unit}" in fault
+
+
+@pytest.mark.parametrize(
+    ("factor", "remedy"),
+    [
+        (100, "divide their translations by 100"),
+        (1000, "divide their translations by 1000"),
+        (1e8, "look for one that is wrong"),
+    ],
+)
+def test_translations_that_are_too_large_are_named_with_the_remedy(factor, remedy):
+    (fault,) = rig_faults(
+        posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation * factor))
+    )
+    assert fault.endswith(f"translations are wanted in millimetres; {remedy}")
 
 
 def test_cameras_at_one_place_are_named():

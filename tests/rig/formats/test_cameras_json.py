@@ -127,6 +127,13 @@ def test_a_fault_is_named(path: str, value: Any, words: str) -> None:
     assert len(str(caught.value)) < 400
 
 
+@pytest.mark.parametrize("key", ["format", "unit"])
+def test_a_value_of_any_length_is_told_cut(key: str) -> None:
+    with pytest.raises(InputError) as refused:
+        rig_from_document(document_from_rig(fan()) | {key: "x" * 100_000})
+    assert len(str(refused.value)) < 200
+
+
 def test_the_distortion_may_be_absent() -> None:
     rig = rig_from_document(fault("cameras.3.distortion", ...))
     assert rig["cam03"].intrinsics.distortion.is_zero

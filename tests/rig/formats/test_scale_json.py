@@ -11,10 +11,11 @@ from rig.formats.scale_json import CameraDistance, PointDistance, TagSize, read_
 
 CAMERAS = ("cam00", "cam01", "cam02")
 POINT = {"cam00": [10, 20.5], "cam01": [11, 21]}
+OTHER = {"cam00": [10, 20.5], "cam01": [31, 21]}  # behind the first in one picture
 
 
 def test_two_points_are_read() -> None:
-    known = scale_from_document({"points": {"a": POINT, "b": POINT}, "distance_mm": 62.0}, CAMERAS)
+    known = scale_from_document({"points": {"a": POINT, "b": OTHER}, "distance_mm": 62.0}, CAMERAS)
     assert isinstance(known, PointDistance)
     assert known.distance_mm == 62.0
     assert known.first["cam00"].tolist() == [10.0, 20.5]
@@ -38,6 +39,11 @@ def test_a_tag_and_a_pair_of_cameras_are_read() -> None:
         (
             {"points": {"a": {**POINT, "cam00": ["x", 1]}, "b": {**POINT, "cam01": 3}}, "distance_mm": -4},
             ["distance_mm is -4", "points.a.cam00 is ['x', 1]", "points.b.cam01 is 3"],
+        ),
+        ({"points": {"a": POINT, "b": POINT}, "distance_mm": 62}, ["a and b are one place in cam00 and cam01"]),
+        (
+            {"points": {"a": {**POINT, "cam00": [1e8, 2]}, "b": {**POINT, "cam01": [3, -40]}}, "distance_mm": 62},
+            ["points.a.cam00 is [100000000.0, 2], wanted [x, y] in pixels, 0 to 20000", "points.b.cam01 is [3, -40]"],
         ),
         ({"tag": {"dictionary": "DICT_9", "size_mm": "4", "side": 1}}, ["'DICT_9'", "size_mm is '4'", "tag.side"]),
         ({"tag": "DICT_4X4_50"}, ["tag: wants an object"]),

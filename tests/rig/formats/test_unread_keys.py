@@ -28,7 +28,7 @@ def test_a_key_that_is_not_read_is_named_with_its_place(place: tuple[str, ...], 
         entry = entry[part][3] if part == "cameras" else entry[part]
     entry[key] = 1.0
     (told,) = unread_keys_of(document)
-    assert f"the key {'.'.join((*place, key))} is not read" in told
+    assert f"the key {'.'.join((*place, key))!r} is not read" in told
 
 
 def test_what_all_cameras_have_alike_is_said_once() -> None:
@@ -36,7 +36,14 @@ def test_what_all_cameras_have_alike_is_said_once() -> None:
     for camera in document["cameras"]:
         camera["owner"] = "x"
     (told,) = unread_keys_of(document)
-    assert f"cameras.owner of {len(document['cameras'])} cameras" in told
+    assert f"'cameras.owner' of {len(document['cameras'])} cameras" in told
+
+
+@pytest.mark.parametrize("key", ["\ud800", "\x1b[31m", "\a", "a" * 1000])
+def test_a_key_of_any_signs_can_be_printed(key: str) -> None:
+    (told,) = unread_keys_of({"format": FORMAT, key: 1})
+    assert told.isprintable()
+    assert len(told.encode()) < 200
 
 
 def test_a_thousand_keys_are_a_few_lines() -> None:
@@ -51,7 +58,7 @@ def test_a_capture_with_such_a_key_is_read_and_says_so(tmp_path: Path) -> None:
     path.write_text(json.dumps(document))
     assert len(read_rig(path)) == 3
     capture, _ = read_capture(folder)
-    assert [remark for remark in capture.remarks if "cameras.covarianse is not read" in remark]
+    assert [remark for remark in capture.remarks if "'cameras.covarianse' is not read" in remark]
 
 
 def test_each_lens_model_has_its_own_keys() -> None:

@@ -4,8 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from rig.formats.cameras_json import read_rig
+from rig.formats.cameras_file import FOLDER_FORMATS, FORMATS, write_rig_file
+from rig.formats.cameras_json import read_rig, write_rig
+from server.cli.answers import CannotWrite
+from server.cli.main import app
 from tests.server.cli.test_main import run
 from tests.support.textured_wedge import wedge_rig, write_photographs
 
@@ -52,3 +56,39 @@ def test_options_that_do_not_go_together_are_wrong_usage(tmp_path: Path, options
     done = run("calibrate", str(tmp_path), "--out", str(tmp_path / "cameras.json"), *given)
     assert done.returncode == 2
     assert told in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("kind", "out", "told"),
+    [
+        ("eigenhead", "file/cameras.json", "cannot be written"),
+        ("eigenhead", "folder", "it is a folder"),
+        ("colmap", "file", "it is a file, and a folder is written"),
+        ("colmap", "file/sparse", "cannot be written"),
+    ],
+)
+def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: str, out: str, told: str) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    write_rig(wedge_rig(), tmp_path / "cameras.json")
+    done = CliRunner().invoke(
+        app, ["convert", str(tmp_path / "cameras.json"), "--to", kind, "--out", str(tmp_path / out)]
+    )
+    assert isinstance(done.exception, CannotWrite)
+    assert str(done.exception).startswith(f"{tmp_path / out} ")
+    assert told in str(done.exception)
+
+
+def test_formats_of_several_files_are_told_from_those_of_one(tmp_path: Path) -> None:
+    for kind in FORMATS:
+        write_rig_file(wedge_rig(), tmp_path / kind, kind)
+        assert (tmp_path / kind).is_dir() == (kind in FOLDER_FORMATS), kind
+
+
+def test_a_board_is_written_as_pdf_alone(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["board", "--out", str(tmp_path / "b.xyz")])
+    assert done.exit_code == 2
+    assert "'.xyz' is nothing that a board is written as; give a .pdf" in " ".join(
+        done.stderr.replace("│", " ").split()
+    )
+    assert list(tmp_path.iterdir()) == []

@@ -1,6 +1,7 @@
 """`eigenhead check`: every fault of a capture at once, and what outlines say, without a fit."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from pipeline.eigenheads.model import load_model
 from rig.capture import Capture, refiled
+from rig.errors import WrongVariable
 from rig.formats.archive import pack_folder
 from rig.formats.capture_folder import write_capture
 from rig.render.renderer import Renderer
@@ -45,8 +47,9 @@ def test_every_fault_is_told_at_once_and_is_status_2(tmp_path: Path) -> None:
         done = run("check", str(capture), "--json")
         assert (done.returncode, done.stderr) == (2, "")
         told = json.loads(done.stdout)
-        for word in ("at one place", "images/foo.png has no camera", "'third_eye'", "images/cam01.png is missing"):
+        for word in ("at one place", "'third_eye'", "images/cam01.png is missing"):
             assert [fault for fault in told["faults"] if word in fault]
+        assert [w for w in told["warnings"] if "images/foo.png has no camera" in w["message"]]
     done = run("check", str(folder))
     assert done.returncode == 2
     assert "cannot be reconstructed" in done.stdout.splitlines()[0]
@@ -84,4 +87,49 @@ def test_a_key_that_nobody_reads_is_a_warning(masked: tuple[Capture, Rig], tmp_p
     path.write_text(json.dumps(document))
     found = found_in(tmp_path / "shot")
     assert [warning["code"] for warning in found["warnings"]] == ["unknown-key"]
-    assert "warning  unknown-key: cameras.json: the key units is not read" in "\n".join(lines(found))
+    assert "warning  unknown-key: cameras.json: the key 'units' is not read" in "\n".join(lines(found))
+
+
+def photographs(folder: Path) -> Path:
+    """Those of a small capture, without its cameras."""
+    (small_capture(folder) / "cameras.json").unlink()
+    return folder
+
+
+def test_damaged_photographs_without_cameras_are_all_named(tmp_path: Path) -> None:
+    folder = photographs(tmp_path / "photos")
+    assert not found_in(folder)["faults"]
+    (folder / "images" / "cam00.png").write_bytes(b"")
+    whole = (folder / "images" / "cam02.png").read_bytes()
+    (folder / "images" / "cam02.png").write_bytes(whole[: len(whole) // 2])
+    faults = found_in(folder)["faults"]
+    assert [fault.split()[0] for fault in faults] == ["images/cam00.png", "images/cam02.png"]
+
+
+@pytest.mark.parametrize("kind", [small_capture, photographs])
+def test_a_front_camera_that_nobody_knows_is_a_fault(kind: Callable[[Path], Path], tmp_path: Path) -> None:
+    (fault,) = found_in(kind(tmp_path / "capture"), front="nosuch")["faults"]
+    assert "'nosuch' is none of the capture's (cam00, cam01, cam02)" in fault
+
+
+@pytest.mark.gl
+def test_a_picture_of_no_camera_is_a_warning_as_a_reconstruction_passes_it_over(
+    masked: tuple[Capture, Rig], tmp_path: Path
+) -> None:
+    write_capture(tmp_path / "shot", *masked)
+    (tmp_path / "shot" / "images" / "foo.png").write_bytes(b"")
+    found = found_in(tmp_path / "shot", front="cam03")
+    assert (found["faults"], found["front"]) == ([], "cam03")
+    assert [(w["code"], w["message"].split(":")[0]) for w in found["warnings"]] == [
+        ("picture-unread", "images/foo.png has no camera")
+    ]
+
+
+@pytest.mark.gl
+def test_a_wrong_variable_is_no_fault_of_the_capture(
+    masked: tuple[Capture, Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_capture(tmp_path / "shot", *masked)
+    monkeypatch.setenv("EIGENHEAD_THREADS", "-4")
+    with pytest.raises(WrongVariable, match="EIGENHEAD_THREADS: is '-4'"):
+        found_in(tmp_path / "shot")

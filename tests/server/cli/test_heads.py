@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from server.cli import reconstruct_local
+from server.cli.answers import SpoilsCapture
 from server.cli.main import app
 from tests.support.services import small_capture
 
@@ -51,3 +52,34 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
     assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
     assert CliRunner().invoke(app, [*arguments, "--delight"]).exit_code == 0
     assert asked == [{"formats": ["glb", "usdz"]}, {"delight": True}]
+
+
+@pytest.mark.parametrize("option", ["--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps"])
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_what_is_no_finite_number_is_wrong_usage(option: str, value: str, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["simulate", str(tmp_path / "shot"), option, value])
+    assert done.exit_code == 2
+    assert option in done.stderr
+
+
+@pytest.mark.parametrize("enclosed", [False, True])
+@pytest.mark.parametrize("inside", ["", "images", "images/head", "background", "masks/x", "images/../images"])
+def test_a_result_never_lies_among_the_pictures_of_its_capture(inside: str, enclosed: bool, tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    folder = small_capture(capture / "anna" if enclosed else capture)
+    before = sorted(tmp_path.rglob("*"))
+    for out in [folder / inside, *([capture / "head"] if enclosed else [])]:
+        with pytest.raises(SpoilsCapture, match="name another place with --out"):
+            reconstruct_local.reconstruct_locally(
+                capture, out, model=None, settings={}, report=lambda stage, share: None
+            )
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_result_never_looks_like_a_camera_s_folder_of_photographs(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    photographs = folder / "images"
+    with pytest.raises(SpoilsCapture):
+        reconstruct_local.reconstruct_locally(
+            photographs, photographs / "out", model=None, settings={}, report=lambda stage, share: None
+        )

@@ -9,7 +9,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import typer
 
+from server.cli.answers import service_settings
 from tests.support.services import ROOT, small_capture
 
 COMMANDS = [
@@ -82,6 +84,35 @@ def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "no .zip, .tar or .tar.gz" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_data_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = run("serve", "--port", "0", "--data", str(tmp_path / "file" / "x"))
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"eigenhead: {tmp_path}/file")
+    assert "cannot be used (" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("CORS_ORIGINS", "abc", "is no JSON"),
+        ("PORT", "abc", "valid integer"),
+        ("DATABASE_URL", "foo", "postgresql://HOST/NAME or sqlite"),
+        ("DATABASE_URL", "mysql://a/b", "'mysql' is no database"),
+        ("DATABASE_URL", "postgresql://a:port/b", "is no database's URL"),
+    ],
+)
+def test_a_wrong_variable_is_wrong_usage_and_is_named(
+    name: str, value: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(f"EIGENHEAD_{name}", value)
+    with pytest.raises(typer.BadParameter) as refused:
+        service_settings()
+    assert refused.value.message.startswith(f"EIGENHEAD_{name}")
+    assert told in refused.value.message
 
 
 def test_keys_on_the_command_line(tmp_path: Path) -> None:

@@ -56,3 +56,14 @@ def test_too_few_photographs_are_refused_by_name(tmp_path: Path) -> None:
     write_photographs(tmp_path, rig.subset(rig.names[:2]))
     with pytest.raises(InputError, match="2 photographs; at least 3"):
         read_or_calibrate(tmp_path, tmp_path / "out", front=None, report=quiet)
+
+
+@pytest.mark.parametrize(
+    ("inside", "found"), [("a.png", True), ("images/a/1.png", True), ("home/user/2019/a.png", False)]
+)
+def test_photographs_are_looked_for_where_they_are_read(tmp_path: Path, inside: str, found: bool) -> None:
+    """Deeper is somebody's disk, not a capture."""
+    (tmp_path / "beside").mkdir()
+    (tmp_path / inside).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / inside).write_bytes(b"")
+    assert photographs_alone(tmp_path) == found
