@@ -896,6 +896,7 @@ export default {
   "is {1} x {2} pixels; at most {3} are read": "hat {1} x {2} Pixel; höchstens {3} werden gelesen",
   "every picture is its own clean plate: nobody was there, or the plates were copied; shoot again": "jedes Bild ist sein eigenes Leerbild: Niemand war da, oder die Leerbilder wurden kopiert; noch einmal aufnehmen",
   "The multipart body breaks off before its end; send it again.": "Das Hochladen brach vor dem Ende ab; noch einmal senden.",
+  "Nothing more came for {1} s; send the rest again, by a resumable upload only what is missing.": "Seit {1} s kam nichts mehr; noch einmal senden.",
   "features.json: {1} is picked in one view only; two are needed": "features.json: {1} ist nur in einer Ansicht gesetzt; nötig sind zwei",
   "features.json: {1} landmarks can be located, {2} that are not on a line are needed": "features.json: {1} Landmarken lassen sich verorten, nötig sind {2}, die nicht auf einer Linie liegen",
   "features.json: the feature points lie on one line; pick one that does not": "features.json: Die Merkmale liegen auf einer Linie; eines setzen, das nicht darauf liegt",
