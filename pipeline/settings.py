@@ -72,7 +72,7 @@ class FittingSettings:
         None  # of a contour; None: estimated from the residuals, misfit of the model included
     )
     contour_correlation_px: float | None = None  # of that noise along the contour; None: estimated
-    calibration_px: float = 0.2  # prior of a camera without a covariance of its own (contract)
+    calibration_px: float = 0.2  # prior of a camera without a covariance of its own (docs/capture-format.md)
     scale_spread: float = 0.01  # prior of log scale: rigs are metric, size is a mode
     feature_noise_px: float = CLICK_NOISE_PX
     landmark_noise_mm: float = LANDMARK_NOISE_MM

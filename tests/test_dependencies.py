@@ -39,6 +39,10 @@ def test_the_page_names_every_package_that_is_locked() -> None:
     assert set(rows()) == {package["name"] for package in locked()}
 
 
+def test_every_package_has_a_reason_or_one_that_needs_it() -> None:
+    assert [name for name, (_, why) in rows().items() if why.strip() == "for"] == []
+
+
 def test_every_package_that_is_delivered_states_its_licence() -> None:
     document = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     delivered = {named(requirement) for requirement in document["project"]["dependencies"]}

@@ -121,7 +121,8 @@ def _figures(rows: list[Row], labels: tuple[str, ...]) -> dict[str, float]:
 
 
 def _correlation(rows: list[Row], label: str) -> float:
-    """Of found and true weights, the ten largest true ones of every posed head (zeros fill up)."""
+    """Of found and true weights, the ten largest true ones of every posed head; where it has fewer, the
+    largest others that it is told to have, as far as there are any."""
     true, ours = [], []
     for row in rows:
         if row["model"] == label and row["kind"] == "posed":

@@ -33,7 +33,6 @@ from rig.rig import Rig
 
 USED = 11
 SIDE_DEG = 100.0  # from the front view's direction: the eleven, and the views they are judged by, look from there
-SHOWN_LEAST = 0.85  # of the surface's picture inside the image, in a view that judges its outline
 INSIDE_PX = 8  # of the outline: points and colours nearer to it than that may be another thing's
 GAIN_STEPS = 4  # of the robust fit of a view's exposure
 CLIPPED = 250

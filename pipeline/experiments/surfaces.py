@@ -44,7 +44,6 @@ from rig.render.renderer import Renderer
 Report = Callable[[str, float], None]
 POISSON_DEPTH = 9  # of its octree: cells of 1 to 1.5 mm about a bust
 SURE_MM = 1.0  # points with a larger deviation stay out
-PEERS = ("eigenhead", "hull", "poisson", "openmvs")
 COLUMNS = (
     "recall_all_within_2mm", "recall_head_within_2mm", "recall_hair_within_2mm", "recall_clothes_within_2mm",
     "recall_all_median", "precision_head_within_2mm", "precision_hair_within_2mm", "face_median_mm", "face_mean_mm",

@@ -1,6 +1,6 @@
-"""The result folder of the contract, and the pictures beside it.
+"""The result folder of docs/capture-format.md, and the pictures beside it.
 
-    head.ply  head.glb  report.json  overlays/<camera>.png     fixed by the contract
+    head.ply  head.glb  report.json  overlays/<camera>.png     fixed by docs/capture-format.md
     bust.ply  bust.glb  the whole visible surface; settings.outputs.surface says which of the two is written, or both
     contact_sheet.png   input, silhouette difference before and after the fit (section 5.4), the head from new views
     turntable.png       the head from the right to the left profile

@@ -180,10 +180,6 @@ def balls(mesh: Surface, parts: Int[np.ndarray, " t"], among: Bool[np.ndarray, "
     return number[parts]
 
 
-def _of_parts(mesh: Surface, skin: Bool[np.ndarray, " t"]) -> Surface:
-    return Surface(mesh.vertices, mesh.faces[skin[mesh.faces].all(axis=1)], mesh.normals)
-
-
 def _head(model: HeadModel, vertices: Float[np.ndarray, "v 3"]) -> Surface:
     faces = model.levels["full"].faces
     return Surface(vertices, faces, vertex_normals(vertices, faces))

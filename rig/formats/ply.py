@@ -1,6 +1,5 @@
-"""PLY as the contract fixes it. The writer is our own: trimesh writes neither the extra vertex properties nor the same
-bytes in
-every version."""
+"""PLY as docs/capture-format.md fixes it. The writer is our own: trimesh writes neither the extra vertex properties nor
+the same bytes in every version."""
 
 import re
 from collections.abc import Sequence

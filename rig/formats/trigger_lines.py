@@ -10,7 +10,6 @@ DELAY_MOST_US = 500_000
 PULSE_MOST_US = 500_000
 WINDOW_MOST_MS = 60_000
 CLOCK_PERIOD_US = 2**32  # the box counts microseconds in 32 bits: it wraps every 71.6 minutes
-TICK_US = 50  # delays and pulses of the firmware are rounded to its 50 us tick
 
 
 def crc16(data: bytes) -> int:

@@ -1,7 +1,7 @@
 """Artefacts on disk: captures, sessions, results.
 
-    <data>/captures/<id>/record.json  files/...          one folder a capture, as the contract lays it out; checks.json
-                                                         has what was measured of each camera's picture
+    <data>/captures/<id>/record.json  files/...          one folder a capture, as docs/capture-format.md has it;
+                                                         checks.json has what was measured of each camera's picture
     <data>/sessions/<id>.json
     <data>/jobs/<id>/result/...  log.txt                 and attempt-*/ while a worker writes
     <data>/cache/captures/<id>/...                       what is worth keeping of a capture, and can be made anew

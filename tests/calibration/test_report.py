@@ -1,4 +1,4 @@
-"""The report is one well-formed page with every camera, parameter and warning, and its JSON keeps the contract."""
+"""One well-formed page with every camera, parameter and warning, and JSON with the rig of docs/capture-format.md."""
 
 import json
 import re

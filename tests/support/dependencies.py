@@ -2,6 +2,7 @@
 
 import tomllib
 from importlib.metadata import PackageNotFoundError, metadata
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ def page() -> str:
     packages, why = locked(), reasons()
     needed_by: dict[str, list[str]] = {}
     for package in packages:
-        for needed in package.get("dependencies", []):
+        extras = package.get("optional-dependencies", {}).values()
+        for needed in chain(package.get("dependencies", []), *extras):
             needed_by.setdefault(needed["name"], []).append(package["name"])
     rows = []
     for name in sorted({package["name"] for package in packages}):

@@ -1,4 +1,4 @@
-"""A simulated capture on disk: the folder that the contract fixes, and its truth beside it."""
+"""A simulated capture on disk: the folder that docs/capture-format.md fixes, and its truth beside it."""
 
 import io
 import json

@@ -53,7 +53,7 @@ export function decimal(text) { return language === "de" && /^[+-]?\d+\.\d+( [A-
 const PARTS = /(<[^!](?:"[^"]*"|[^">])*>)|([^<]+)/g, READ_OUT = /(\s(?:aria-label|title|placeholder|alt|label)=")([^"]+)(?=")/g;
 const key = (words) => words.trim().replace(/\s+/g, " ");
 
-export function inLanguage(markup) {
+function inLanguage(markup) {
   return markup.replace(PARTS, (_, tag, words) => (tag ? tag.replace(READ_OUT, (_, before, read) => before + (table[read] ?? read)) : words.replace(/\S(?:[^]*\S)?/, (said) => table[key(said)] ?? said)));
 }
 

@@ -12,7 +12,7 @@ export function verdictTag(capture) {
 }
 
 // One line a fault; the same fault of several cameras is one line.
-export function faultLines(faults) {
+function faultLines(faults) {
   const lines = new Map();
   for (const fault of faults || []) {
     const line = lines.get(fault.code) || { code: fault.code, title: say(CODES[fault.code] || fault.code), cameras: [], details: [], remedy: say(fault.remedy) };

@@ -1,4 +1,4 @@
-"""The coloured whole surface: its colours are the photographs', its files what the contract says."""
+"""The coloured whole surface: its colours are the photographs', its files what docs/capture-format.md says."""
 
 import json
 from dataclasses import replace

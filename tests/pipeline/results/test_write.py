@@ -77,7 +77,7 @@ def folder(scene: tuple[Reconstruction, Capture], tmp_path_factory: pytest.TempP
 
 
 def read_vertices(path: Path) -> tuple[list[str], np.ndarray]:
-    """An independent reader of the contract's PLY: header lines, vertex records."""
+    """An independent reader of the PLY of docs/capture-format.md: header lines, vertex records."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     header = data[:end].decode("ascii").splitlines()

@@ -1,4 +1,4 @@
-"""Capture folders: what is written is read back; every layout of the contract; every fault named at once."""
+"""Capture folders: what is written is read back; every layout of docs/capture-format.md; every fault named at once."""
 
 import json
 from collections.abc import Callable

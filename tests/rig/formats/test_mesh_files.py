@@ -1,4 +1,4 @@
-"""Mesh files: trimesh reads what we write, the bytes are the contract's, and damage ends in InputError."""
+"""Mesh files: trimesh reads what we write, bytes are those of docs/capture-format.md, and damage ends in InputError."""
 
 import json
 import struct
