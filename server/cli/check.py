@@ -143,7 +143,7 @@ def _check_pictures(files: list[Path], root: Path, report: Report) -> None:
     faults = []
     for number, path in enumerate(files):
         report("check", number / len(files))
-        faults.append(decode_image_file(path, path.relative_to(root).as_posix(), grey=True)[2])
+        faults.append(decode_image_file(path, path.relative_to(root).as_posix(), "grey")[2])
     if any(faults):
         raise InputError("photographs", filter(None, faults))
 
