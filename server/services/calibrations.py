@@ -21,6 +21,7 @@ from rig.errors import InputError
 from server.errors import Conflict, NotFound
 from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES, failure
 from server.services.records import Calibration
+from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
 from server.storage.store import Store, StoredFile, is_id, move_durably, new_id
@@ -37,7 +38,9 @@ class Calibrations:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> Calibration:
-        """Accepts ``folder`` (images/, and board.toml where they show one) and queues the work."""
+        """Accepts ``folder`` (images/, and board.toml where they show one) and queues the work. Raises InputError for
+        a label that cannot be."""
+        check_texts({"label": label})
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -10,7 +10,6 @@ from typing import cast
 
 from rig.acquisition.shot import Fault, ShotDocument
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
-from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
@@ -18,6 +17,7 @@ from server.services.jobs import Jobs, refuse_board
 from server.services.records import Found
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.tags import checked_tags, typed_tags
+from server.services.texts import check_texts
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
@@ -26,27 +26,23 @@ from server.tasks.child import Children
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
 SAMPLE_SEED = 11
-TEXT_MOST = 500  # characters of a label and the like
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What people say of a capture."""
+    """What people say of a capture. Raises InputError for texts that cannot be."""
 
     session: str | None = None
     label: str = ""
     expression: str = ""
     tags: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        check_texts({"session": self.session, "label": self.label, "expression": self.expression})
+
     @classmethod
     def of(cls, fields: Mapping[str, str | None]) -> "About":
         """From a form, in which commas stand between tags. Raises InputError."""
-        names = ("session", "label", "expression")
-        faults = [
-            f"{name}: longer than {TEXT_MOST} characters" for name in names if len(fields.get(name) or "") > TEXT_MOST
-        ]
-        if faults:
-            raise InputError("form", faults)
         tags = typed_tags(fields.get("tags") or "")
         return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "", tags)
 
@@ -138,7 +134,8 @@ class Captures:
         self, identity: str, given: Mapping[str, str | None], *, tags: Sequence[str] | None = None
     ) -> CaptureRecord:
         """Another label, expression or session, or other ``tags``; what is not given stays. Raises NotFound, and
-        InputError for tags that cannot be."""
+        InputError for texts and tags that cannot be."""
+        check_texts({name: given.get(name) for name in ("label", "expression")})
         checked = None if tags is None else checked_tags(tags)
         if given.get("session") is not None:
             self._store.session(str(given["session"]))

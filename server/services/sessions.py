@@ -9,6 +9,7 @@ from server.errors import NotFound
 from server.services.erasure import erase_captures
 from server.services.jobs import Jobs
 from server.services.records import Found, Session, Subject
+from server.services.texts import check_texts
 from server.storage.library import Library, SubjectOrder, subject_of
 from server.storage.records import SessionRecord
 from server.storage.store import Store, new_id
@@ -21,6 +22,8 @@ class Sessions:
         self._store, self._jobs, self._library = store, jobs, library
 
     def add(self, label: str, consent: str) -> Session:
+        """Raises InputError for texts that cannot be."""
+        check_texts({"label": label, "consent": consent})
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         record = SessionRecord(new_id(), created, label, consent)
         self._store.save_session(record)
@@ -76,7 +79,8 @@ class Sessions:
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
-        """Another label or consent note; what is None stays. Raises NotFound."""
+        """Another label or consent note; what is None stays. Raises NotFound, InputError."""
+        check_texts({"label": label, "consent": consent})
         record = self._store.session(identity)
         new_label = record.label if label is None else label
         new_consent = record.consent if consent is None else consent

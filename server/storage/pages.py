@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 
 from rig.errors import InputError
+from rig.text import encodes
 
 WORDS_MOST = 10  # of a search: each is one comparison with every row
 ID_LEAST = 6  # digits of an id's end that name it
@@ -75,7 +76,7 @@ def place_of(cursor: str) -> Place:
         raise no_cursor() from error
     if not (_is_whole(total) and total >= 0 and (isinstance(value, str) or _is_whole(value))):
         raise no_cursor()
-    if not isinstance(identity, str) or "\0" in f"{value}{identity}":
+    if not isinstance(identity, str) or "\0" in f"{value}{identity}" or not encodes(f"{value}{identity}"):
         raise no_cursor()
     return Place(value, identity, total)
 
@@ -110,12 +111,17 @@ def page_of(
 
 def words_of(sought: str) -> Sequence[str]:
     """The words of a search, which must all be found."""
-    return folded(sought).replace("\0", "").split()[:WORDS_MOST]
+    return folded(sought).split()[:WORDS_MOST]
 
 
 def folded(*texts: str | None) -> str:
-    """What searches compare: without case."""
-    return " ".join(text for text in texts if text).casefold()
+    """What searches compare: without case, and without what PostgreSQL keeps in no text."""
+    return storable(" ".join(text for text in texts if text)).casefold()
+
+
+def storable(text: str) -> str:
+    """Without NUL, which PostgreSQL keeps in no text; records of earlier versions may have it."""
+    return text.replace("\0", "")
 
 
 def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:

@@ -40,6 +40,26 @@ def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archiv
     assert form.json()["errors"] == ["body: is no JSON object; send one, as application/json"]
 
 
+def test_text_that_no_database_keeps_is_refused_wherever_it_comes_in(http: httpx.Client, archive: bytes) -> None:
+    capture = upload(http, archive).json()["id"]
+    sessions = http.get("/v1/sessions").json()["total"]
+    for answer in (
+        http.post("/v1/sessions", json={"label": "a\0b"}),
+        http.post("/v1/captures/uploads", files={"file": archive}, data={"label": "a\0b"}),
+        http.patch(f"/v1/captures/{capture}", json={"expression": "a\0b"}),
+        http.post("/v1/jobs", json={"capture_id": capture, "name": "a\0b"}),
+        http.post("/v1/keys", json={"name": "a\0b", "scopes": ["read"]}),
+        http.post("/v1/webhooks", json={"url": "https://a\0b"}),
+        http.get("/v1/jobs", params={"q": "\0"}),
+        http.get("/v1/jobs", params={"session": "\0"}),
+        http.get("/v1/captures", params={"tag": "\0"}),
+        http.get("/v1/captures", params={"before": "\0"}),
+    ):
+        assert answer.status_code == 422, answer.text
+    assert http.get("/v1/sessions").json()["total"] == sessions
+    assert http.get(f"/v1/captures/{capture}").json()["expression"] == ""
+
+
 def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: bytes) -> None:
     capture = upload(http, archive).json()["id"]
     wanted = {"capture_id": capture, "model": "nobody", "settings": {"metod": "contour", "fitting": {"modes": "many"}}}

@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
 from rig.errors import InputError
 from server.settings import ServiceSettings
-from server.storage.database import open_database
+from server.storage.database import capture_index, open_database
 from server.storage.library import CaptureQuery, Library, subject_of
 from server.storage.records import CAPTURE, CaptureRecord, SessionRecord
 from server.storage.store import Store
@@ -146,3 +147,16 @@ def test_each_start_mends_what_differs_from_the_records(tmp_path: Path, library:
     library.reconcile(bare)
     assert library.captures(CaptureQuery(), 10).ids == (identity(2),)  # the damaged one was set aside
     assert library.tags(9) == []
+
+
+def test_a_record_that_no_column_takes_does_not_keep_the_service_from_starting(store: Store, library: Library) -> None:
+    bare = Store(store.data)
+    for number in range(1, 6):
+        stored(bare, capture(number, bytes=1 << 70 if number == 3 else 1, label="Anna\0", tags=("a\0b",)))
+    bare.save_session(SessionRecord(identity(9), "2026-01-01T00:00:00.000Z", "Anna\0", ""))
+    assert library.reconcile(store) == 5
+    assert library.captures(CaptureQuery("anna", tag="ab"), 10).ids == tuple(identity(n) for n in (5, 4, 2, 1))
+    assert library.subjects("anna", "-created", 10).subjects == ((identity(9),),)
+    with library._engine.connect() as connection:
+        stored_texts = [*connection.scalars(sa.select(capture_index.c.label)), *library.tags(10)]
+    assert not any("\0" in text for text in stored_texts)
