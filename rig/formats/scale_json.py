@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.errors import InputError
+from rig.text import printable
 
 KINDS = ("points", "tag", "cameras")
 
@@ -78,7 +79,7 @@ def _points(document: dict[str, Any], cameras: Collection[str], faults: list[str
     if not isinstance(points, dict) or len(points) != 2:
         faults.append("points: wants an object of two points, each an object of camera: [x, y]")
         return None
-    ends = [_pixels(views, f"points.{name}", cameras, faults) for name, views in points.items()]
+    ends = [_pixels(views, f"points.{printable(name):.80}", cameras, faults) for name, views in points.items()]
     return PointDistance(ends[0], ends[1], distance)
 
 
@@ -90,7 +91,7 @@ def _pixels(views: Any, where: str, cameras: Collection[str], faults: list[str])
         if name not in cameras:
             faults.append(f"{where} names {name!r:.80}, of which there is no photograph")
         if not (isinstance(pixel, list) and len(pixel) == 2 and all(map(_is_number, pixel))):
-            faults.append(f"{where}.{name} is {pixel!r:.80}, wanted [x, y] in pixels")
+            faults.append(f"{where}.{printable(name):.80} is {pixel!r:.80}, wanted [x, y] in pixels")
     return {} if faults else {name: np.array(pixel, float) for name, pixel in views.items()}
 
 
@@ -99,7 +100,7 @@ def _tag(document: dict[str, Any], cameras: Collection[str], faults: list[str]) 
     if not isinstance(tag, dict):
         faults.append("tag: wants an object with dictionary and size_mm")
         return None
-    faults += [f"tag.{key:.80} is no key of it" for key in sorted(set(tag) - {"dictionary", "size_mm"})]
+    faults += [f"{'tag.' + key!r:.80} is no key of it" for key in sorted(set(tag) - {"dictionary", "size_mm"})]
     name = tag.get("dictionary")
     if not isinstance(name, str) or name not in dictionaries():
         faults.append(f"tag.dictionary is {name!r:.80}, wanted one of OpenCV's, such as 'DICT_4X4_50'")

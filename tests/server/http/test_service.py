@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import httpx
+import pytest
 
 from server.services import health
 from server.settings import ServiceSettings
@@ -58,6 +59,23 @@ def test_text_that_no_database_keeps_is_refused_wherever_it_comes_in(http: httpx
         assert answer.status_code == 422, answer.text
     assert http.get("/v1/sessions").json()["total"] == sessions
     assert http.get(f"/v1/captures/{capture}").json()["expression"] == ""
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        r'{"front": "\ud800"}',
+        r'{"\ud800": 1}',
+        r'{"outputs": {"\ud800": 1}}',
+        f'{{"bust": {{"spacing_mm": {"9" * 400}}}}}',
+        f'{{"front": {"[" * 500 + "]" * 500}}}',
+    ],
+)
+def test_settings_that_no_answer_could_repeat_make_no_job(http: httpx.Client, archive: bytes, settings: str) -> None:
+    capture = upload(http, archive).json()["id"]
+    body = f'{{"capture_id": "{capture}", "settings": {settings}}}'
+    assert http.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"}).status_code == 422
+    assert http.get("/v1/jobs", params={"capture": capture}).json()["jobs"] == []
 
 
 def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: bytes) -> None:
