@@ -1,5 +1,6 @@
 """Captures: taken with the rig or made of an archive, found, given feature points, changed, removed."""
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -10,6 +11,8 @@ from typing import cast
 
 from rig.acquisition.shot import Fault, ShotDocument
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
+from rig.atomic_write import write_atomically
+from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
@@ -22,7 +25,7 @@ from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
 from server.storage.store import Store, StoredFile, new_id
-from server.tasks.child import Children
+from server.tasks.child import Children, WorkFailed
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
 SAMPLE_SEED = 11
@@ -187,14 +190,19 @@ class Captures:
         return json.loads(path.read_text())["points"]
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
-        """Stores feature points. Raises InputError naming every point that the capture cannot have."""
+        """Stores feature points. Raises NotFound, and InputError naming every point that the capture cannot have."""
         refuse_board(self._store.capture(identity))
         folder = self._store.folder("captures", identity) / "files"
-        with self._children.one() as child:
-            digest = child.remote(check_features)(folder=str(folder), points=points)
+        try:
+            with self._children.one() as child:
+                data = child.remote(check_features)(folder=str(folder), points=points)
+        except (InputError, WorkFailed):
+            self._store.capture(identity)  # removed while its cameras were read
+            raise
 
         def change(record: CaptureRecord) -> CaptureRecord:
-            inputs = dict(sorted({**record.inputs, "features.json": digest}.items()))
+            write_atomically(folder / "features.json", data, parents=False)
+            inputs = dict(sorted({**record.inputs, "features.json": hashlib.sha256(data).hexdigest()}.items()))
             return replace(record, inputs=inputs, features=True)
 
         return self._store.change_capture(identity, change)
@@ -267,6 +275,12 @@ class Captures:
             tags=about.tags,
         )
         self._store.add_capture(folder, record)
+        try:
+            if about.session is not None:
+                self._store.session(about.session)
+        except NotFound:  # erased while this was taken
+            self._store.remove_capture(record.id)
+            raise
         return record
 
 

@@ -79,7 +79,7 @@ def test_every_order_shows_each_capture_once_though_values_are_equal(
 
 
 def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library: Library) -> None:
-    store.save_session(session(1, "Änne Müller"))
+    store.add_session(session(1, "Änne Müller"))
     stored(store, capture(2, label="Profile 100%_left", session=identity(1), verdict="poor"))
     stored(store, capture(3, label="front", board=True))
 
@@ -92,7 +92,7 @@ def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library
     assert found("nobody") == found("front poor") == ()
     assert found("", session=identity(1)) == found("", verdict="poor") == found("", board=False) == (identity(2),)
     assert found("", verdict="none") == found("", before=identity(3))[:0] + (identity(3),)
-    store.save_session(session(1, "Berta"))
+    store.add_session(session(1, "Berta"))
     assert found("müller") == ()
     assert found("berta") == (identity(2),)
 
@@ -114,7 +114,7 @@ def test_a_cursor_of_another_order_is_refused(store: Store, library: Library) ->
 
 def test_sessions_of_one_name_are_one_person(store: Store, library: Library) -> None:
     for number, label in ((1, "Anna"), (2, "bert"), (3, "anna "), (4, ""), (5, "")):
-        store.save_session(session(number, label))
+        store.add_session(session(number, label))
     page = library.subjects("", "-created", 10)
     assert page.subjects == ((identity(5),), (identity(4),), (identity(3), identity(1)), (identity(2),))
     assert page.total == 4
@@ -131,7 +131,7 @@ def test_each_start_mends_what_differs_from_the_records(tmp_path: Path, library:
     bare = Store(tmp_path)  # of a version without an index
     for number in (1, 2, 3):
         stored(bare, capture(number, label=f"old {number}", tags=(f"tag {number}", "all")))
-    bare.save_session(session(4, "Anna"))
+    bare.add_session(session(4, "Anna"))
     assert library.captures(CaptureQuery(), 10).ids == ()
     assert library.reconcile(bare) == 4
     assert library.reconcile(bare) == 0
@@ -153,7 +153,7 @@ def test_a_record_that_no_column_takes_does_not_keep_the_service_from_starting(s
     bare = Store(store.data)
     for number in range(1, 6):
         stored(bare, capture(number, bytes=1 << 70 if number == 3 else 1, label="Anna\0", tags=("a\0b",)))
-    bare.save_session(SessionRecord(identity(9), "2026-01-01T00:00:00.000Z", "Anna\0", ""))
+    bare.add_session(SessionRecord(identity(9), "2026-01-01T00:00:00.000Z", "Anna\0", ""))
     assert library.reconcile(store) == 5
     assert library.captures(CaptureQuery("anna", tag="ab"), 10).ids == tuple(identity(n) for n in (5, 4, 2, 1))
     assert library.subjects("anna", "-created", 10).subjects == ((identity(9),),)
