@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
 
+from pydantic import TypeAdapter
+
 from rig.acquisition.shot import Fault, ShotDocument
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.atomic_write import write_atomically
@@ -29,6 +31,7 @@ from server.tasks.child import Children, WorkFailed
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
 SAMPLE_SEED = 11
+POINTS = TypeAdapter(Points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,11 +186,14 @@ class Captures:
         raise NotFound("such file of a camera", camera, "the capture's 'inputs' list what there is")
 
     def features(self, identity: str) -> Points:
-        """The stored feature points, by point and camera."""
+        """The stored feature points, by point and camera. Raises NotFound, also where their file is gone or damaged."""
         if not self._store.capture(identity).features:
             return {}
         path = self._store.folder("captures", identity) / "files" / "features.json"
-        return json.loads(path.read_text())["points"]
+        try:
+            return POINTS.validate_python(json.loads(path.read_bytes())["points"])
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise NotFound("whole file of feature points of the capture", identity, "put them again") from error
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
         """Stores feature points. Raises NotFound, and InputError naming every point that the capture cannot have."""

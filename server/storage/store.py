@@ -32,7 +32,16 @@ import structlog
 from rig.acquisition.verdict import ViewDocument
 from rig.atomic_write import unfinished, write_atomically
 from server.errors import DiskFull, NotFound
-from server.storage.records import CAPTURE, SESSION, CaptureRecord, RecordFormat, SessionRecord
+from server.storage.records import (
+    CALIBRATION,
+    CAPTURE,
+    SESSION,
+    CalibrationRecord,
+    CaptureRecord,
+    RecordFormat,
+    SessionRecord,
+    read_checks,
+)
 
 ID = re.compile(r"^[0-9a-f]{28}$")
 FOLDERS = ("captures", "sessions", "jobs", "incoming", "uploads", "trash", "set-aside", "calibrations", "cache", "rig")
@@ -149,15 +158,23 @@ class Store:
             raise NotFound("capture", identity)
         return record
 
+    def calibration(self, identity: str) -> CalibrationRecord:
+        """The record of a calibration. Raises NotFound."""
+        path = self.folder("calibrations", identity) / "record.json"
+        record = self._read(path, CALIBRATION, path.parent)
+        if record is None:
+            raise NotFound("calibration", identity)
+        return record
+
     def put_checks(self, folder: Path, checks: Mapping[str, ViewDocument]) -> None:
         """Into a capture's folder that is not yet in its place."""
         write_atomically(folder / "checks.json", _encoded(checks))
 
     def checks(self, identity: str) -> dict[str, ViewDocument]:
-        """What was measured of a capture's pictures, by camera; nothing of one of an earlier version. Raises
-        NotFound."""
-        with suppress(FileNotFoundError, ValueError):
-            return json.loads((self.folder("captures", identity) / "checks.json").read_bytes())
+        """What was measured of a capture's pictures, by camera; nothing of one of an earlier version, or where
+        the file is damaged. Raises NotFound."""
+        with suppress(FileNotFoundError, ValueError, RecursionError):
+            return read_checks(json.loads((self.folder("captures", identity) / "checks.json").read_bytes()))
         self.capture(identity)
         return {}
 

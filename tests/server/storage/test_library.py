@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -12,6 +13,7 @@ from rig.errors import InputError
 from server.settings import ServiceSettings
 from server.storage.database import capture_index, open_database
 from server.storage.library import CaptureQuery, Library, subject_of
+from server.storage.pages import PageOf, page_of
 from server.storage.records import CAPTURE, CaptureRecord, SessionRecord
 from server.storage.store import Store
 from tests.server.storage.test_records import capture_record, stored
@@ -160,3 +162,18 @@ def test_a_record_that_no_column_takes_does_not_keep_the_service_from_starting(s
     with library._engine.connect() as connection:
         stored_texts = [*connection.scalars(sa.select(capture_index.c.label)), *library.tags(10)]
     assert not any("\0" in text for text in stored_texts)
+
+
+def test_a_page_of_people_passes_over_who_was_erased_meanwhile(
+    store: Store, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in (1, 2):
+        store.add_session(session(number, f"Anna {number}"))
+
+    def page_then_erasure(*arguments: Any, **named: Any) -> PageOf:
+        page = page_of(*arguments, **named)
+        store.remove_session(identity(1))
+        return page
+
+    monkeypatch.setattr("server.storage.library.page_of", page_then_erasure)
+    assert library.subjects("", "-created", 10).subjects == ((identity(2),),)

@@ -17,7 +17,16 @@ import pytest
 
 from rig.atomic_write import write_atomically
 from server.errors import NotFound
-from server.storage.records import CAPTURE, UPLOAD, CameraSize, CaptureRecord, SessionRecord, UploadRecord
+from server.storage.records import (
+    CALIBRATION,
+    CAPTURE,
+    UPLOAD,
+    CalibrationRecord,
+    CameraSize,
+    CaptureRecord,
+    SessionRecord,
+    UploadRecord,
+)
 from server.storage.store import Store, new_id
 
 
@@ -161,3 +170,29 @@ def slow_writes(monkeypatch: pytest.MonkeyPatch) -> None:
         write_atomically(*arguments, **named)
 
     monkeypatch.setattr("server.storage.store.write_atomically", slowly)
+
+
+@pytest.mark.parametrize(
+    "damage", ["", "[]", '{"cam00": 3}', '{"cam00": {"mean": "dark"}}', '{"cam00": {"subject": {}}}', "[" * 100_000]
+)
+def test_damaged_checks_say_nothing(tmp_path: Path, damage: str) -> None:
+    store, record = Store(tmp_path), capture_record()
+    path = stored(store, record).with_name("checks.json")
+    path.write_text('{"cam00": {"mean": 90.5, "blur_px": null}}')
+    assert store.checks(record.id) == {"cam00": {"mean": 90.5, "blur_px": None}}
+    path.write_text(damage)
+    assert store.checks(record.id) == {}
+
+
+@pytest.mark.parametrize("damage", ["", "{}", "[]"])
+def test_a_damaged_calibration_is_set_aside(tmp_path: Path, damage: str) -> None:
+    store, identity = Store(tmp_path), new_id()
+    path = store.folder("calibrations", identity) / "record.json"
+    path.parent.mkdir()
+    record = CalibrationRecord(identity, "2026-01-01T00:00:00.000Z", "rig", "", {"cam00": 3})
+    path.write_text(json.dumps(CALIBRATION.document(record)))
+    assert store.calibration(identity) == record
+    path.write_text(damage)
+    with pytest.raises(NotFound):
+        store.calibration(identity)
+    assert len(store.set_aside()) == 1
