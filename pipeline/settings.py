@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeVar
 
 from pipeline.diagnostics import WARNING_CODES
 from rig.errors import InputError
+from rig.text import encodes
 
 T = TypeVar("T")
 
@@ -303,7 +304,7 @@ def _read(kind: type[T], document: Any, where: str, faults: list[str]) -> T:
     for key in document:
         if key not in hints:
             near = difflib.get_close_matches(str(key), hints, n=1)
-            faults.append(f"unknown key {where}{key!s:.80}" + (f"; did you mean {near[0]!r}?" if near else ""))
+            faults.append(f"unknown key {where + str(key)!r:.80}" + (f"; did you mean {near[0]!r}?" if near else ""))
     values = {key: _value(hints[key], document[key], where + key, faults) for key in hints if key in document}
     return kind(**{key: value for key, value in values.items() if value is not ...})
 
@@ -321,18 +322,43 @@ def _value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
             return None
         if typing.get_origin(option) is Literal and isinstance(value, str) and value in typing.get_args(option):
             return value
-        if option is float and isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-            return float(value)
+        if option is float and (number := _number(value)) is not None:
+            return number
         if typing.get_origin(option) is tuple and _are_texts(value):
             return tuple(typing.cast(list, value))
-        if option in (int, bool, str) and type(value) is option:
+        if option in (int, bool) and type(value) is option:
             return value
-    faults.append(f"{where} is {value!r:.80}, wanted {_wanted(options)}")
+        if option is str and _is_text(value):
+            return value
+    faults.append(f"{where} is {_shown(value)}, wanted {_wanted(options)}")
     return ...
 
 
+def _number(value: Any) -> float | None:
+    """None for what is no finite number; a whole number of JSON may be larger than any float."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and encodes(value)
+
+
 def _are_texts(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(isinstance(entry, str) for entry in value)
+    return isinstance(value, list | tuple) and all(map(_is_text, value))
+
+
+def _shown(value: Any) -> str:
+    """A wrong value in a fault. Python writes down no number of thousands of digits, and nothing nested deeply."""
+    try:
+        return f"{value!r:.80}"
+    except (ValueError, RecursionError):
+        return "too large a value"
 
 
 def _wanted(options: tuple[Any, ...]) -> str:

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from rig.errors import InputError
 from rig.formats.cameras_json import PIXELS_MOST
+from rig.text import printable
 
 KINDS = ("points", "tag", "cameras")
 
@@ -79,12 +80,13 @@ def _points(document: dict[str, Any], cameras: Collection[str], faults: list[str
     if not isinstance(points, dict) or len(points) != 2:
         faults.append("points: wants an object of two points, each an object of camera: [x, y]")
         return None
-    ends = [_pixels(views, f"points.{name}", cameras, faults) for name, views in points.items()]
+    ends = [_pixels(views, f"points.{printable(name):.80}", cameras, faults) for name, views in points.items()]
     first, second = ends
     shared = [name for name in first if name in second]
     # One alone may lie behind the other in one picture, in two it cannot.
     if len(shared) > 1 and all(np.array_equal(first[name], second[name]) for name in shared):
-        faults.append(f"points: {' and '.join(points)} are one place in {' and '.join(shared)}: pick two places")
+        told = " and ".join(f"{printable(name):.80}" for name in points)
+        faults.append(f"points: {told} are one place in {' and '.join(shared)}: pick two places")
     return PointDistance(first, second, distance)
 
 
@@ -96,7 +98,9 @@ def _pixels(views: Any, where: str, cameras: Collection[str], faults: list[str])
         if name not in cameras:
             faults.append(f"{where} names {name!r:.80}, of which there is no photograph")
         if not (isinstance(pixel, list) and len(pixel) == 2 and all(map(_is_place, pixel))):
-            faults.append(f"{where}.{name} is {pixel!r:.80}, wanted [x, y] in pixels, 0 to {PIXELS_MOST}")
+            faults.append(
+                f"{where}.{printable(name):.80} is {pixel!r:.80}, wanted [x, y] in pixels, 0 to {PIXELS_MOST}"
+            )
     return {} if faults else {name: np.array(pixel, float) for name, pixel in views.items()}
 
 
@@ -105,7 +109,7 @@ def _tag(document: dict[str, Any], cameras: Collection[str], faults: list[str]) 
     if not isinstance(tag, dict):
         faults.append("tag: wants an object with dictionary and size_mm")
         return None
-    faults += [f"tag.{key:.80} is no key of it" for key in sorted(set(tag) - {"dictionary", "size_mm"})]
+    faults += [f"{'tag.' + key!r:.80} is no key of it" for key in sorted(set(tag) - {"dictionary", "size_mm"})]
     name = tag.get("dictionary")
     if not isinstance(name, str) or name not in dictionaries():
         faults.append(f"tag.dictionary is {name!r:.80}, wanted one of OpenCV's, such as 'DICT_4X4_50'")

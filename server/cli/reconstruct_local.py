@@ -33,7 +33,7 @@ def settings_document(path: Path | None, **given: str | Mapping[str, object] | N
         try:
             text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
             document = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(path.name, [f"cannot be read ({error})"]) from error
         if not isinstance(document, dict):
             raise InputError(path.name, ["is no table of settings"])

@@ -17,11 +17,15 @@ from server.http.schemas import (
     SessionOut,
     Tags,
 )
+from server.services.texts import PLAIN
 
 Limit = Annotated[int, Query(ge=1, le=1000)]
 Cursor = Annotated[str | None, Query(max_length=2000, description="``next`` of the page before, in the same order")]
-WithTag = Annotated[str | None, Query(max_length=200, description="only what bears this tag, in whatever case")]
-Sought = Annotated[str, Query(max_length=200, description="words that must all be found")]
+Key = Annotated[str | None, Query(max_length=64, pattern=PLAIN)]
+WithTag = Annotated[
+    str | None, Query(max_length=200, pattern=PLAIN, description="only what bears this tag, in whatever case")
+]
+Sought = Annotated[str, Query(max_length=200, pattern=PLAIN, description="words that must all be found")]
 
 
 class Listed(Answer):

@@ -10,10 +10,11 @@ from pydantic_core import PydanticCustomError
 from server.http.openapi import SETTINGS
 from server.services.service import Check
 from server.services.tags import TAG_MOST, TAGS_MOST
+from server.services.texts import PLAIN, TEXT_MOST
 from server.storage.records import JsonObject
 
 Id = Annotated[str, Field(pattern="^[0-9a-f]{28}$", description="28 hex digits")]
-Text = Annotated[str, Field(max_length=500)]
+Text = Annotated[str, Field(max_length=TEXT_MOST, pattern=PLAIN)]
 Tag = Annotated[str, Field(min_length=1, max_length=TAG_MOST, pattern="^[^\\x00-\\x1f\\x7f,]*$")]
 Tags = Annotated[list[Tag], Field(max_length=TAGS_MOST, description="without commas and control characters")]
 Moment = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
@@ -152,7 +153,7 @@ class Restart(Received):
 class NewWebhook(Received):
     model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://lab.example/hooks/heads"}]})
 
-    url: str = Field(pattern="^https?://", max_length=2000)
+    url: str = Field(pattern="^https?://[^\\x00-\\x1f\\x7f]*$", max_length=2000)
 
 
 class NewKey(Received):
@@ -160,7 +161,7 @@ class NewKey(Received):
         json_schema_extra={"examples": [{"name": "console", "scopes": ["read", "capture", "submit"]}]}
     )
 
-    name: str = Field(min_length=1, max_length=200)
+    name: str = Field(min_length=1, max_length=200, pattern=PLAIN)
     scopes: list[Literal["read", "capture", "submit", "admin"]] = Field(min_length=1, max_length=4)
 
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,9 +22,10 @@ from rig.errors import InputError
 from server.errors import Conflict, NotFound
 from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES, failure
 from server.services.records import Calibration
+from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
-from server.storage.store import Store, StoredFile, is_id, move_durably, new_id
+from server.storage.store import Store, StoredFile, move_durably, new_id
 from server.tasks.calibrate import BOARD, check_scale, is_of_board
 from server.tasks.photographs import SCALE
 
@@ -37,7 +39,9 @@ class Calibrations:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> Calibration:
-        """Accepts ``folder`` (images/, and board.toml where they show one) and queues the work."""
+        """Accepts ``folder`` (images/, and board.toml where they show one) and queues the work. Raises InputError for
+        a label that cannot be."""
+        check_texts({"label": label})
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -74,13 +78,7 @@ class Calibrations:
 
     def get(self, identity: str) -> Calibration:
         """Raises NotFound."""
-        if not is_id(identity):
-            raise NotFound("calibration", identity)
-        folder = self._store.folder("calibrations", identity)
-        try:
-            record = CALIBRATION.read(json.loads((folder / "record.json").read_bytes()))
-        except (OSError, ValueError) as error:
-            raise NotFound("calibration", identity) from error
+        record = self._store.calibration(identity)
         row = self._row(identity)
         state = STATES[row.status] if row else "queued"
         if row is None:  # the service was killed between accepting and queueing
@@ -113,7 +111,11 @@ class Calibrations:
 
     def find(self) -> list[Calibration]:
         """Newest first."""
-        return [self.get(identity) for identity in self._store.ids("calibrations")]
+        found = []
+        for identity in self._store.ids("calibrations"):
+            with suppress(NotFound):  # removed since they were listed, or damaged
+                found.append(self.get(identity))
+        return found
 
     def cameras_json(self, identity: str) -> Path:
         """Raises NotFound, Conflict."""

@@ -1,5 +1,6 @@
 """Captures: taken with the rig or made of an archive, found, given feature points, changed, removed."""
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -8,8 +9,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
 
+from pydantic import TypeAdapter
+
 from rig.acquisition.shot import Fault, ShotDocument
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
+from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
@@ -18,35 +22,33 @@ from server.services.jobs import Jobs, refuse_board
 from server.services.records import Found
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.tags import checked_tags, typed_tags
+from server.services.texts import check_texts
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
 from server.storage.store import Store, StoredFile, new_id
-from server.tasks.child import Children
+from server.tasks.child import Children, WorkFailed
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
 SAMPLE_SEED = 11
-TEXT_MOST = 500  # characters of a label and the like
+POINTS = TypeAdapter(Points)
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What people say of a capture."""
+    """What people say of a capture. Raises InputError for texts that cannot be."""
 
     session: str | None = None
     label: str = ""
     expression: str = ""
     tags: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        check_texts({"session": self.session, "label": self.label, "expression": self.expression})
+
     @classmethod
     def of(cls, fields: Mapping[str, str | None]) -> "About":
         """From a form, in which commas stand between tags. Raises InputError."""
-        names = ("session", "label", "expression")
-        faults = [
-            f"{name}: longer than {TEXT_MOST} characters" for name in names if len(fields.get(name) or "") > TEXT_MOST
-        ]
-        if faults:
-            raise InputError("form", faults)
         tags = typed_tags(fields.get("tags") or "")
         return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "", tags)
 
@@ -138,7 +140,8 @@ class Captures:
         self, identity: str, given: Mapping[str, str | None], *, tags: Sequence[str] | None = None
     ) -> CaptureRecord:
         """Another label, expression or session, or other ``tags``; what is not given stays. Raises NotFound, and
-        InputError for tags that cannot be."""
+        InputError for texts and tags that cannot be."""
+        check_texts({name: given.get(name) for name in ("label", "expression")})
         checked = None if tags is None else checked_tags(tags)
         if given.get("session") is not None:
             self._store.session(str(given["session"]))
@@ -183,21 +186,29 @@ class Captures:
         raise NotFound("such file of a camera", camera, "the capture's 'inputs' list what there is")
 
     def features(self, identity: str) -> Points:
-        """The stored feature points, by point and camera."""
+        """The stored feature points, by point and camera. Raises NotFound, also where their file is gone or damaged."""
         if not self._store.capture(identity).features:
             return {}
         path = self._store.folder("captures", identity) / "files" / "features.json"
-        return json.loads(path.read_text())["points"]
+        try:
+            return POINTS.validate_python(json.loads(path.read_bytes())["points"])
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise NotFound("whole file of feature points of the capture", identity, "put them again") from error
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
-        """Stores feature points. Raises InputError naming every point that the capture cannot have."""
+        """Stores feature points. Raises NotFound, and InputError naming every point that the capture cannot have."""
         refuse_board(self._store.capture(identity))
         folder = self._store.folder("captures", identity) / "files"
-        with self._children.one() as child:
-            digest = child.remote(check_features)(folder=str(folder), points=points)
+        try:
+            with self._children.one() as child:
+                data = child.remote(check_features)(folder=str(folder), points=points)
+        except (InputError, WorkFailed):
+            self._store.capture(identity)  # removed while its cameras were read
+            raise
 
         def change(record: CaptureRecord) -> CaptureRecord:
-            inputs = dict(sorted({**record.inputs, "features.json": digest}.items()))
+            write_atomically(folder / "features.json", data, parents=False)
+            inputs = dict(sorted({**record.inputs, "features.json": hashlib.sha256(data).hexdigest()}.items()))
             return replace(record, inputs=inputs, features=True)
 
         return self._store.change_capture(identity, change)
@@ -270,6 +281,12 @@ class Captures:
             tags=about.tags,
         )
         self._store.add_capture(folder, record)
+        try:
+            if about.session is not None:
+                self._store.session(about.session)
+        except NotFound:  # erased while this was taken
+            self._store.remove_capture(record.id)
+            raise
         return record
 
 

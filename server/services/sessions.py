@@ -9,6 +9,7 @@ from server.errors import NotFound
 from server.services.erasure import erase_captures
 from server.services.jobs import Jobs
 from server.services.records import Found, Session, Subject
+from server.services.texts import check_texts
 from server.storage.library import Library, SubjectOrder, subject_of
 from server.storage.records import SessionRecord
 from server.storage.store import Store, new_id
@@ -21,9 +22,11 @@ class Sessions:
         self._store, self._jobs, self._library = store, jobs, library
 
     def add(self, label: str, consent: str) -> Session:
+        """Raises InputError for texts that cannot be."""
+        check_texts({"label": label, "consent": consent})
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         record = SessionRecord(new_id(), created, label, consent)
-        self._store.save_session(record)
+        self._store.add_session(record)
         return _with_captures(record, [])
 
     def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[Session]:
@@ -76,23 +79,26 @@ class Sessions:
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
-        """Another label or consent note; what is None stays. Raises NotFound."""
-        record = self._store.session(identity)
-        new_label = record.label if label is None else label
-        new_consent = record.consent if consent is None else consent
-        self._store.save_session(replace(record, label=new_label, consent=new_consent))
-        return self.get(identity)
+        """Another label or consent note; what is None stays. Raises NotFound, InputError."""
+        check_texts({"label": label, "consent": consent})
+        given = {name: text for name, text in (("label", label), ("consent", consent)) if text is not None}
+        record = self._store.change_session(identity, lambda old: replace(old, **given))
+        return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def erase(self, identity: str) -> None:
         """Cancels the jobs, then removes images, results, caches and what the job database holds of them. The session's
         own record goes last, so that an erasure that was cut short can be asked for again. Raises NotFound, and
         Unavailable while a worker still writes."""
         self._store.session(identity)
-        captures = self._library.captures_of([identity])[identity]
-        jobs = {job.id for job in self._jobs.find(session=identity, limit=100_000)}
-        erase_captures(self._store, self._jobs, captures, jobs)
+        self._erase_captures(identity)
         self._store.remove_session(identity)
+        self._erase_captures(identity)  # what was being taken or uploaded meanwhile; from now on nothing can be
         self._library.scrub()
+
+    def _erase_captures(self, session: str) -> None:
+        captures = self._library.captures_of([session])[session]
+        jobs = {job.id for job in self._jobs.find(session=session, limit=100_000)}
+        erase_captures(self._store, self._jobs, captures, jobs)
 
 
 def _with_captures(record: SessionRecord, captures: list[str]) -> Session:

@@ -58,8 +58,12 @@ class ResumableUploads:
         return self._store.folder("uploads", record.id) / "data"
 
     def save(self, record: UploadRecord) -> None:
+        """Raises NotFound."""
         path = self._store.folder("uploads", record.id) / "upload.json"
-        write_atomically(path, json.dumps(UPLOAD.document(record)).encode())
+        try:
+            write_atomically(path, json.dumps(UPLOAD.document(record)).encode(), parents=False)
+        except FileNotFoundError as error:  # given up meanwhile
+            raise NotFound("upload", record.id) from error
 
     @contextmanager
     def lock(self, identity: str) -> Iterator[None]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from pipeline.settings import TEMPLATE_NAME, settings_from_document
 from rig.errors import EigenheadError, InputError
+from server.services.texts import check_texts
 from server.storage.records import JobWebhook
 
 
@@ -19,8 +20,9 @@ class Work:
     webhook: JobWebhook | None = None
 
     def check(self) -> None:
-        """Raises InputError naming an unknown model, every wrong setting and a template that the model cannot have,
-        before a job fails by it hours later."""
+        """Raises InputError naming a name that cannot be, an unknown model, every wrong setting and a template that the
+        model cannot have, before a job fails by it hours later."""
+        check_texts({"name": self.name}, "request")
         model, settings = self._model_faults(), self._settings_faults()
         if model and settings:
             raise InputError("request", [*(f"model: {f}" for f in model), *(f"settings: {f}" for f in settings)])

@@ -4,16 +4,17 @@ mends at each start what differs: a backup that was put back, a record that some
 version.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import sqlalchemy as sa
 import structlog
 from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import DataError
 
 from server.storage.database import capture_index, capture_tags, scrub, session_index
-from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, words_of
+from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, storable, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store
 
@@ -23,6 +24,8 @@ CaptureOrder = Literal["-created", "created", "label", "-label", "verdict", "-by
 SubjectOrder = Literal["-created", "created", "label", "-label"]
 
 log = structlog.get_logger()
+UNFIT = (DataError, OverflowError)  # of one row's values, not of the database
+Record = CaptureRecord | SessionRecord
 T = TypeVar("T")
 
 
@@ -169,10 +172,9 @@ class Library:
             found: dict[str, list[str]] = {}
             for row in connection.execute(sessions):
                 found.setdefault(row.subject, []).append(row.id)
-        of = {ids[0]: tuple(ids) for ids in found.values()}
-        missing = [identity for identity in page.ids if identity not in of]  # its newest session has another name
-        of |= {i: next(tuple(ids) for ids in found.values() if i in ids) for i in missing}
-        return SubjectPage(tuple(of[identity] for identity in page.ids), page.next, page.total)
+        of = {identity: tuple(ids) for ids in found.values() for identity in ids}
+        there = (of[identity] for identity in page.ids if identity in of)  # the others were erased since the page
+        return SubjectPage(tuple(there), page.next, page.total)
 
     def reconcile(self, store: Store) -> int:
         """Makes the rows those of the records in the data folder; returns how many differed."""
@@ -184,15 +186,26 @@ class Library:
             self._drop(table, gone := [identity for identity in known if identity not in there])
             differing = [identity for identity, changed in there.items() if known.get(identity) != changed]
             records = [record for identity in differing if (record := store.found(kind, identity)) is not None]
-            rows = [_row_of(record, there[record.id]) for record in records]
-            self._put(table, rows)
             if table is capture_index:
                 self._drop_tags(gone)
-                self._put_tags([record for record in records if isinstance(record, CaptureRecord)])
-            mended += len(gone) + len(rows)
+            mended += len(gone) + self._put_fitting(table, records, there)
         if mended:
             log.info("index mended", rows=mended)
         return mended
+
+    def _put_fitting(self, table: sa.Table, records: Sequence[Record], changes: Mapping[str, int]) -> int:
+        """Writes the rows of records and returns how many. One whose values no column takes is left out and named in
+        the log: it must not keep the service from starting."""
+        try:
+            self._put(table, [_row_of(record, changes[record.id]) for record in records])
+            self._put_tags([record for record in records if isinstance(record, CaptureRecord)])
+        except UNFIT as error:
+            if len(records) == 1:
+                log.error("record left out of the index", table=table.name, id=records[0].id, error=str(error)[:300])
+                return 0
+            half = len(records) // 2
+            return sum(self._put_fitting(table, some, changes) for some in (records[:half], records[half:]))
+        return len(records)
 
     def _put(self, table: sa.Table, rows: list[dict[str, object]]) -> None:
         insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
@@ -203,7 +216,7 @@ class Library:
                 connection.execute(statement.on_conflict_do_update(index_elements=["id"], set_=new), some)
 
     def _put_tags(self, records: Collection[CaptureRecord]) -> None:
-        names = {(record.id, folded(tag)): tag for record in records for tag in record.tags}
+        names = {(record.id, folded(tag)): storable(tag) for record in records for tag in record.tags}
         rows = [{"capture_id": capture, "folded": tag, "name": name} for (capture, tag), name in names.items()]
         self._drop_tags([record.id for record in records])
         with self._engine.begin() as connection:
@@ -230,7 +243,7 @@ def captures_with(word: str) -> sa.ColumnElement[bool]:
 
 def tagged(tag: str) -> sa.Select:
     """Ids of the captures that bear a tag, in whatever case."""
-    return sa.select(capture_tags.c.capture_id).where(capture_tags.c.folded == folded(tag).replace("\0", ""))
+    return sa.select(capture_tags.c.capture_id).where(capture_tags.c.folded == folded(tag))
 
 
 def sessions_with(word: str) -> sa.ColumnElement[bool]:
@@ -243,7 +256,7 @@ def subject_of(record: SessionRecord) -> str:
     return folded(record.label).strip() or record.id
 
 
-def _row_of(record: CaptureRecord | SessionRecord, changed: int) -> dict[str, object]:
+def _row_of(record: Record, changed: int) -> dict[str, object]:
     return _capture_row(record, changed) if isinstance(record, CaptureRecord) else _session_row(record, changed)
 
 
@@ -251,8 +264,8 @@ def _capture_row(record: CaptureRecord, changed: int) -> dict[str, object]:
     verdict = record.verdict or UNJUDGED
     return {
         "id": record.id,
-        "session": record.session,
-        "label": record.label,
+        "session": None if record.session is None else storable(record.session),
+        "label": storable(record.label),
         "verdict": verdict,
         "source": record.source,
         "board": record.board,
@@ -266,7 +279,7 @@ def _session_row(record: SessionRecord, changed: int) -> dict[str, object]:
     return {
         "id": record.id,
         "subject": subject_of(record),
-        "label": record.label,
+        "label": storable(record.label),
         "words": folded(record.label, record.consent),
         "changed": changed,
     }

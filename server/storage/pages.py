@@ -111,12 +111,17 @@ def page_of(
 
 def words_of(sought: str) -> Sequence[str]:
     """The words of a search, which must all be found."""
-    return folded(sought).replace("\0", "").split()[:WORDS_MOST]
+    return folded(sought).split()[:WORDS_MOST]
 
 
 def folded(*texts: str | None) -> str:
-    """What searches compare: without case."""
-    return " ".join(text for text in texts if text).casefold()
+    """What searches compare: without case, and without what PostgreSQL keeps in no text."""
+    return storable(" ".join(text for text in texts if text)).casefold()
+
+
+def storable(text: str) -> str:
+    """Without NUL, which PostgreSQL keeps in no text; records of earlier versions may have it."""
+    return text.replace("\0", "")
 
 
 def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:

@@ -131,6 +131,34 @@ RIG_ADJUSTMENT = RecordFormat(RigAdjustment, "eigenhead-rig-adjustment/1")
 UPLOAD = RecordFormat(UploadRecord, "eigenhead-upload/1")
 
 
+@dataclass(frozen=True, slots=True)
+class _Subject:
+    share: float
+    cut_off: list[str]
+    outline: list[list[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """The shape of a ``ViewDocument``, whose own type pydantic reads from Python 3.12 on."""
+
+    mean: float | None = None
+    clipped_share: float | None = None
+    blur_px: float | None = None
+    background_found: float | None = None
+    background_moved_px: float | None = None
+    subject: _Subject | None = None
+
+
+_CHECKS = TypeAdapter(dict[str, _View])
+
+
+def read_checks(document: Any) -> dict[str, ViewDocument]:
+    """What a ``checks.json`` says by camera. Raises ValueError for what is none."""
+    _CHECKS.validate_python(document)
+    return document
+
+
 class JobWebhook(TypedDict):
     """The address that is told of one job; ``secret`` signs the messages."""
 

@@ -30,9 +30,18 @@ from typing import Protocol, TypeVar
 import structlog
 
 from rig.acquisition.verdict import ViewDocument
-from rig.atomic_write import write_atomically
+from rig.atomic_write import unfinished, write_atomically
 from server.errors import DiskFull, NotFound
-from server.storage.records import CAPTURE, SESSION, CaptureRecord, RecordFormat, SessionRecord
+from server.storage.records import (
+    CALIBRATION,
+    CAPTURE,
+    SESSION,
+    CalibrationRecord,
+    CaptureRecord,
+    RecordFormat,
+    SessionRecord,
+    read_checks,
+)
 
 ID = re.compile(r"^[0-9a-f]{28}$")
 FOLDERS = ("captures", "sessions", "jobs", "incoming", "uploads", "trash", "set-aside", "calibrations", "cache", "rig")
@@ -149,15 +158,23 @@ class Store:
             raise NotFound("capture", identity)
         return record
 
+    def calibration(self, identity: str) -> CalibrationRecord:
+        """The record of a calibration. Raises NotFound."""
+        path = self.folder("calibrations", identity) / "record.json"
+        record = self._read(path, CALIBRATION, path.parent)
+        if record is None:
+            raise NotFound("calibration", identity)
+        return record
+
     def put_checks(self, folder: Path, checks: Mapping[str, ViewDocument]) -> None:
         """Into a capture's folder that is not yet in its place."""
         write_atomically(folder / "checks.json", _encoded(checks))
 
     def checks(self, identity: str) -> dict[str, ViewDocument]:
-        """What was measured of a capture's pictures, by camera; nothing of one of an earlier version. Raises
-        NotFound."""
-        with suppress(FileNotFoundError, ValueError):
-            return json.loads((self.folder("captures", identity) / "checks.json").read_bytes())
+        """What was measured of a capture's pictures, by camera; nothing of one of an earlier version, or where
+        the file is damaged. Raises NotFound."""
+        with suppress(FileNotFoundError, ValueError, RecursionError):
+            return read_checks(json.loads((self.folder("captures", identity) / "checks.json").read_bytes()))
         self.capture(identity)
         return {}
 
@@ -170,35 +187,59 @@ class Store:
                 yield record
 
     def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
-        """Puts what ``change`` makes of a capture's record in its place and returns it. Raises NotFound."""
-        with self._changing:
+        """Puts what ``change`` makes of a capture's record, and perhaps writes beside it, in its place and returns it.
+        Raises NotFound."""
+        with self._change("capture", identity):
             record = change(self.capture(identity))
-            write_atomically(self.folder("captures", identity) / "record.json", _encoded(CAPTURE.document(record)))
+            path = self.folder("captures", identity) / "record.json"
+            write_atomically(path, _encoded(CAPTURE.document(record)), parents=False)
             self._tell(record)
         return record
 
+    @contextmanager
+    def _change(self, what: str, identity: str) -> Iterator[None]:
+        """One change or removal at a time, so that none is lost and nothing comes back that was removed. Raises
+        NotFound, also for what another process removed meanwhile."""
+        with self._changing:
+            try:
+                yield
+            except FileNotFoundError as error:
+                raise NotFound(what, identity) from error
+
     def remove_capture(self, identity: str) -> None:
         """Removes a capture with what was kept of it: that shows a face too."""
-        self.remove(self.folder("captures", identity))
-        self.remove(self.cache_of(identity))
-        if self._index is not None:
-            self._index.drop_capture(identity)
+        with self._change("capture", identity):
+            self.remove(self.folder("captures", identity))
+            self.remove(self.cache_of(identity))
+            if self._index is not None:
+                self._index.drop_capture(identity)
 
     def cache_of(self, identity: str) -> Path:
         """Where silhouettes, thumbnails and the like of a capture are kept."""
         return self.folder("cache/captures", identity)
 
-    def save_session(self, record: SessionRecord) -> None:
+    def add_session(self, record: SessionRecord) -> None:
         path = self.folder("sessions", record.id).with_suffix(".json")
         write_atomically(path, _encoded(SESSION.document(record)))
         _sync_folder(path.parent)
         self._tell(record)
 
+    def change_session(self, identity: str, change: Callable[[SessionRecord], SessionRecord]) -> SessionRecord:
+        """Puts what ``change`` makes of a session's record in its place and returns it. Raises NotFound."""
+        with self._change("session", identity):
+            record = change(self.session(identity))
+            self.add_session(record)
+        return record
+
     def remove_session(self, identity: str) -> None:
-        """Removes a session's record; its captures are not its own."""
-        self.remove(self.folder("sessions", identity).with_suffix(".json"))
-        if self._index is not None:
-            self._index.drop_session(identity)
+        """Removes a session's record, and what a kill left of writing it; its captures are not its own."""
+        with self._change("session", identity):
+            path = self.folder("sessions", identity).with_suffix(".json")
+            for part in [*unfinished(path.parent, path.name)]:
+                self.remove(part)
+            self.remove(path)
+            if self._index is not None:
+                self._index.drop_session(identity)
 
     def session(self, identity: str) -> SessionRecord:
         """The record of a session. Raises NotFound."""
@@ -225,7 +266,8 @@ class Store:
         shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(missing_ok=True)
 
     def sweep(self, older_s: float) -> int:
-        """Deletes what a crash left in ``incoming`` and ``trash``, if nobody touched it for ``older_s``."""
+        """Deletes what a crash left in ``incoming`` and ``trash``, and of files that were being written, if nobody
+        touched it for ``older_s``."""
         removed = 0
         for kind in ("incoming", "trash"):
             for identity in self.ids(kind):
@@ -234,7 +276,20 @@ class Store:
                     if time.time() - newest(folder) > older_s:
                         shutil.rmtree(folder, ignore_errors=True) if folder.is_dir() else folder.unlink()
                         removed += 1
+        for part in self._unfinished():
+            with suppress(FileNotFoundError):  # its write has ended
+                if time.time() - part.stat().st_mtime > older_s:
+                    part.unlink()
+                    removed += 1
         return removed
+
+    def _unfinished(self) -> Iterator[Path]:
+        """In the folders themselves and in those of one thing; what lies deeper goes with the thing."""
+        for kind in FOLDERS:
+            yield from unfinished(self.data / kind)
+            for entry in os.scandir(self.data / kind):
+                if entry.is_dir(follow_symlinks=False):
+                    yield from unfinished(Path(entry))
 
     def set_aside(self) -> list[str]:
         """Names of the damaged records that were moved out of the way."""

@@ -15,7 +15,6 @@ import numpy as np
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
 from pipeline.diagnostics import ReportWarning
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
-from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
@@ -222,18 +221,18 @@ def _shows_its_plate(shot: Capture, name: str) -> bool:
     return image is not None and any(np.array_equal(image, plate) for plate in plates)
 
 
-def check_features(bench: Bench, report: Report, *, folder: str, points: Points) -> str:
-    """Judges feature points for the capture in ``folder`` and stores them; returns the file's sha256."""
+def check_features(bench: Bench, report: Report, *, folder: str, points: Points) -> bytes:
+    """Judges feature points for the capture in ``folder``; returns the file of them. Raises InputError."""
     rig_file = find_rig_file(Path(folder))
-    assert rig_file is not None  # it was accepted with one
+    if rig_file is None:
+        raise InputError("capture", [NO_RIG])
     faults: list[str] = []
     data = json.dumps({"format": FEATURES_FORMAT, "points": points}, indent=1).encode()
     # Points come one after the other: whether they suffice is asked when the job starts.
     faults += unknown_landmarks(features_from_bytes(data, read_rig_file(rig_file), faults))
     if faults:
         raise InputError("features.json", faults)
-    write_atomically(Path(folder) / "features.json", data)
-    return _sha256(Path(folder) / "features.json")
+    return data
 
 
 def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:

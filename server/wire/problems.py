@@ -10,10 +10,11 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import DataError, DBAPIError
 from starlette.exceptions import HTTPException
 
 from rig.errors import EigenheadError, InputError
+from rig.text import printable
 from server.errors import (
     URN,
     Conflict,
@@ -90,12 +91,13 @@ class Problem(EigenheadError):
 
     def document(self) -> ProblemDocument:
         title = self.kind.replace("-", " ").capitalize()
+        errors = [printable(error) for error in self.errors]
         return {
             "type": URN + self.kind,
             "title": title,
             "status": self.status,
-            "detail": self.detail,
-            "errors": self.errors,
+            "detail": printable(self.detail),
+            "errors": errors,
         }
 
     def response(self) -> JSONResponse:
@@ -123,6 +125,9 @@ def problem_from(error: Exception) -> Problem:
         return Problem(error.status_code, kind, str(detail), headers=error.headers)
     if (isinstance(error, OSError) and error.errno in DISK_FULL) or "database or disk is full" in str(error):
         return problem_from(DiskFull())
+    if isinstance(error, DataError):
+        detail = "The request has a text or a number that the database cannot keep; leave out control characters."
+        return Problem(422, "invalid-request", detail)
     if isinstance(error, DBAPIError):
         log.error("database failed", error=str(error)[:500])
         return Problem(503, "database-unavailable", "The job database does not answer; try again in a moment.")

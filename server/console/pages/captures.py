@@ -10,14 +10,12 @@ from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model_names import list_models
 from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
-from rig.errors import InputError
 from server.console.identity import permit
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
 from server.console.work_form import PresetLine, TemplateLine, WorkForm, chosen_work, preset_lines, template_lines
 from server.errors import NotFound, Unusable
 from server.services.bulk import each
-from server.services.captures import TEXT_MOST, About
 from server.services.records import Session
 from server.services.service import Service
 from server.services.tags import typed_tags
@@ -261,21 +259,19 @@ def sample(page: Page, event: object) -> str:
 
 def edit(page: Page, event: EditForm) -> None:
     given: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
-    About.of({name: given[name] for name in given if name != "session"})
     tags = typed_tags(event["tags"]) if "tags" in event else None
     page.service.captures.edit(event["id"], given, tags=tags)
     forget_captures()
 
 
 def new_session(page: Page, event: SessionForm) -> str:
-    made = page.service.sessions.add(*session_texts(event.get("label", ""), event.get("consent", "")))
+    made = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
     return f"Session {made.label or made.id[-6:]}: what is taken or uploaded now belongs to it."
 
 
 def edit_consent(page: Page, event: SessionEditForm) -> None:
     given = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
-    session_texts(*given.values())
     page.service.sessions.edit(event["id"], label=given.get("label"), consent=given.get("consent"))
     forget_captures()
 
@@ -337,13 +333,6 @@ def bulk(page: Page, event: BulkForm) -> str | None:
 
 def forget_captures() -> None:
     shared.forget("captures", "sessions", "tags", "subjects")
-
-
-def session_texts(*texts: str) -> tuple[str, ...]:
-    """Raises InputError for texts that are too long."""
-    if any(len(text) > TEXT_MOST for text in texts):
-        raise InputError("form", [f"a text is longer than {TEXT_MOST} characters"])
-    return texts
 
 
 CapturesPage.actions = {

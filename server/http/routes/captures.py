@@ -11,13 +11,14 @@ from fastapi.responses import FileResponse
 from rig.errors import InputError
 from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Limit, Sought, WithTag
+from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Key, Limit, Sought, WithTag
 from server.http.rig_schemas import CaptureChecks, HoldingsOut
 from server.http.schemas import CaptureEdit, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
 from server.services.bulk import each
-from server.services.captures import TEXT_MOST, About
+from server.services.captures import About
 from server.services.keys import Caller
 from server.services.tags import checked_tags
+from server.services.texts import PLAIN, TEXT_MOST
 from server.services.work import Work
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
@@ -75,13 +76,15 @@ def list_captures(
     service: ServiceOf,
     caller: Reader,
     q: Sought = "",
-    session: Annotated[str | None, Query(max_length=64)] = None,
+    session: Key = None,
     verdict: Annotated[Literal["good", "usable", "poor", "none"] | None, Query(description="none: not judged")] = None,
     tag: WithTag = None,
     sort: CaptureOrder = "-created",
     limit: Limit = 100,
     cursor: Cursor = None,
-    before: Annotated[str | None, Query(max_length=64, description="only captures older than this id")] = None,
+    before: Annotated[
+        str | None, Query(max_length=64, pattern=PLAIN, description="only captures older than this id")
+    ] = None,
 ) -> CaptureList:
     """A page at a time, newest first unless asked otherwise; ``q`` looks into label, expression, tags, session,
     verdict, source and id."""

@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse, PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Limit, Sought
+from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, Sought
 from server.http.schemas import JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.bulk import each
 from server.services.jobs import FINISHED, STATUSES
@@ -59,8 +59,8 @@ def list_jobs(
     caller: Reader,
     q: Sought = "",
     state: State | None = None,
-    capture: Annotated[str | None, Query(max_length=64)] = None,
-    session: Annotated[str | None, Query(max_length=64)] = None,
+    capture: Key = None,
+    session: Key = None,
     sort: JobOrder = "-created",
     limit: Limit = 100,
     cursor: Cursor = None,

@@ -49,6 +49,8 @@ def test_a_tag_and_a_pair_of_cameras_are_read() -> None:
         ({"tag": "DICT_4X4_50"}, ["tag: wants an object"]),
         ({"cameras": ["cam00", "cam00"], "distance_mm": 1e9}, ["distance_mm is 1000000000.0", "two cameras"]),
         ({"cameras": ["cam00", "x"], "distance_mm": float("nan")}, ["distance_mm is nan", "'x'"]),
+        ({"tag": {"dictionary": "DICT_4X4_50", "size_mm": 4, "\ud800": 1}}, [r"'tag.\ud800' is no key"]),
+        ({"points": {"\ud800": {}, "b": {}}, "distance_mm": 4}, [r"points.\ud800: a point"]),
         ({"cameras": ["cam00", "cam01"], "distance_cm": 41}, ["distance_mm is None", "'distance_cm' is no key"]),
     ],
 )

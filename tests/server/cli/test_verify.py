@@ -46,7 +46,7 @@ def test_limits_come_from_a_file(tmp_path: Path) -> None:
     assert read_limits(tmp_path / "limits.toml") == Limits(face_rms_mm=0.2)
     assert read_limits(None) == Limits()
     (tmp_path / "limits.json").write_text('{"faces": 1}')
-    with pytest.raises(InputError, match=r"limits\.json: unknown key faces"):
+    with pytest.raises(InputError, match=r"limits\.json: unknown key 'faces'"):
         read_limits(tmp_path / "limits.json")
 
 

@@ -112,12 +112,18 @@ def test_a_capture_in_use_is_not_removed_and_a_finished_job_is(http: httpx.Clien
     assert http.get(f"/v1/jobs/{job}").status_code == 404
 
 
-def test_features_are_stored_or_refused_by_name(http: httpx.Client, archive: bytes) -> None:
+def test_features_are_stored_or_refused_by_name(http: httpx.Client, service: RunningService, archive: bytes) -> None:
     capture = upload(http, archive).json()["id"]
     points = {"pronasale": {"cam00": [3.0, 4.0], "cam01": [5.0, 6.0]}}
     assert http.put(f"/v1/captures/{capture}/features", json={"points": points}).json()["features"] is True
     assert http.get(f"/v1/captures/{capture}/features").json()["points"] == points
     wrong = {"pronasale": {"cam09": [1, 2], "cam00": [900, 2]}}
+    stored = service.data / "captures" / capture / "files" / "features.json"
+    whole = stored.read_bytes()
+    for damaged in (b"", b"[]", b'{"points": 3}'):
+        stored.write_bytes(damaged)
+        assert http.get(f"/v1/captures/{capture}/features").status_code == 404
+    stored.write_bytes(whole)
     bad = http.put(f"/v1/captures/{capture}/features", json={"points": wrong})
     assert bad.status_code == 422
     assert len(bad.json()["errors"]) == 2

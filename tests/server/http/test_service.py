@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import httpx
+import pytest
 
 from server.services import health
 from server.settings import ServiceSettings
@@ -38,6 +39,43 @@ def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archiv
     assert "takes GET, POST, and not PUT" in http.put("/v1/jobs").json()["detail"]
     form = http.post("/v1/captures", files={"file": b"x"})
     assert form.json()["errors"] == ["body: is no JSON object; send one, as application/json"]
+
+
+def test_text_that_no_database_keeps_is_refused_wherever_it_comes_in(http: httpx.Client, archive: bytes) -> None:
+    capture = upload(http, archive).json()["id"]
+    sessions = http.get("/v1/sessions").json()["total"]
+    for answer in (
+        http.post("/v1/sessions", json={"label": "a\0b"}),
+        http.post("/v1/captures/uploads", files={"file": archive}, data={"label": "a\0b"}),
+        http.patch(f"/v1/captures/{capture}", json={"expression": "a\0b"}),
+        http.post("/v1/jobs", json={"capture_id": capture, "name": "a\0b"}),
+        http.post("/v1/keys", json={"name": "a\0b", "scopes": ["read"]}),
+        http.post("/v1/webhooks", json={"url": "https://a\0b"}),
+        http.get("/v1/jobs", params={"q": "\0"}),
+        http.get("/v1/jobs", params={"session": "\0"}),
+        http.get("/v1/captures", params={"tag": "\0"}),
+        http.get("/v1/captures", params={"before": "\0"}),
+    ):
+        assert answer.status_code == 422, answer.text
+    assert http.get("/v1/sessions").json()["total"] == sessions
+    assert http.get(f"/v1/captures/{capture}").json()["expression"] == ""
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        r'{"front": "\ud800"}',
+        r'{"\ud800": 1}',
+        r'{"outputs": {"\ud800": 1}}',
+        f'{{"bust": {{"spacing_mm": {"9" * 400}}}}}',
+        f'{{"front": {"[" * 500 + "]" * 500}}}',
+    ],
+)
+def test_settings_that_no_answer_could_repeat_make_no_job(http: httpx.Client, archive: bytes, settings: str) -> None:
+    capture = upload(http, archive).json()["id"]
+    body = f'{{"capture_id": "{capture}", "settings": {settings}}}'
+    assert http.post("/v1/jobs", content=body, headers={"Content-Type": "application/json"}).status_code == 422
+    assert http.get("/v1/jobs", params={"capture": capture}).json()["jobs"] == []
 
 
 def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: bytes) -> None:

@@ -130,6 +130,13 @@ def test_a_result_is_there_once_it_succeeded(calibrations: Calibrations, store: 
     assert calibrations.file(made.id, "cameras.json").sha256 == digest
 
 
+def test_a_damaged_one_holds_up_no_list(calibrations: Calibrations, store: Store) -> None:
+    damaged, whole = (calibrations.add_shots(BOARD, [board_shot(store, "1")], "").id for _ in range(2))
+    (store.folder("calibrations", damaged) / "record.json").write_text("[]")
+    assert [found.id for found in calibrations.find()] == [whole]
+    assert len(store.set_aside()) == 1
+
+
 def test_one_is_in_use_until_another_is(calibrations: Calibrations, store: Store, engine: Engine) -> None:
     first, second = (calibrations.add_shots(BOARD, [board_shot(store, name)], name).id for name in ("a", "b"))
     assert calibrations.in_use() is None

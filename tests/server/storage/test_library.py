@@ -4,13 +4,16 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+import sqlalchemy as sa
 
 from rig.errors import InputError
 from server.settings import ServiceSettings
-from server.storage.database import open_database
+from server.storage.database import capture_index, open_database
 from server.storage.library import CaptureQuery, Library, subject_of
+from server.storage.pages import PageOf, page_of
 from server.storage.records import CAPTURE, CaptureRecord, SessionRecord
 from server.storage.store import Store
 from tests.server.storage.test_records import capture_record, stored
@@ -78,7 +81,7 @@ def test_every_order_shows_each_capture_once_though_values_are_equal(
 
 
 def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library: Library) -> None:
-    store.save_session(session(1, "Änne Müller"))
+    store.add_session(session(1, "Änne Müller"))
     stored(store, capture(2, label="Profile 100%_left", session=identity(1), verdict="poor"))
     stored(store, capture(3, label="front", board=True))
 
@@ -91,7 +94,7 @@ def test_words_are_found_in_the_capture_and_in_its_session(store: Store, library
     assert found("nobody") == found("front poor") == ()
     assert found("", session=identity(1)) == found("", verdict="poor") == found("", board=False) == (identity(2),)
     assert found("", verdict="none") == found("", before=identity(3))[:0] + (identity(3),)
-    store.save_session(session(1, "Berta"))
+    store.add_session(session(1, "Berta"))
     assert found("müller") == ()
     assert found("berta") == (identity(2),)
 
@@ -119,7 +122,7 @@ def test_a_cursor_of_another_order_is_refused(store: Store, library: Library) ->
 
 def test_sessions_of_one_name_are_one_person(store: Store, library: Library) -> None:
     for number, label in ((1, "Anna"), (2, "bert"), (3, "anna "), (4, ""), (5, "")):
-        store.save_session(session(number, label))
+        store.add_session(session(number, label))
     page = library.subjects("", "-created", 10)
     assert page.subjects == ((identity(5),), (identity(4),), (identity(3), identity(1)), (identity(2),))
     assert page.total == 4
@@ -136,7 +139,7 @@ def test_each_start_mends_what_differs_from_the_records(tmp_path: Path, library:
     bare = Store(tmp_path)  # of a version without an index
     for number in (1, 2, 3):
         stored(bare, capture(number, label=f"old {number}", tags=(f"tag {number}", "all")))
-    bare.save_session(session(4, "Anna"))
+    bare.add_session(session(4, "Anna"))
     assert library.captures(CaptureQuery(), 10).ids == ()
     assert library.reconcile(bare) == 4
     assert library.reconcile(bare) == 0
@@ -152,3 +155,31 @@ def test_each_start_mends_what_differs_from_the_records(tmp_path: Path, library:
     library.reconcile(bare)
     assert library.captures(CaptureQuery(), 10).ids == (identity(2),)  # the damaged one was set aside
     assert library.tags(9) == []
+
+
+def test_a_record_that_no_column_takes_does_not_keep_the_service_from_starting(store: Store, library: Library) -> None:
+    bare = Store(store.data)
+    for number in range(1, 6):
+        stored(bare, capture(number, bytes=1 << 70 if number == 3 else 1, label="Anna\0", tags=("a\0b",)))
+    bare.add_session(SessionRecord(identity(9), "2026-01-01T00:00:00.000Z", "Anna\0", ""))
+    assert library.reconcile(store) == 5
+    assert library.captures(CaptureQuery("anna", tag="ab"), 10).ids == tuple(identity(n) for n in (5, 4, 2, 1))
+    assert library.subjects("anna", "-created", 10).subjects == ((identity(9),),)
+    with library._engine.connect() as connection:
+        stored_texts = [*connection.scalars(sa.select(capture_index.c.label)), *library.tags(10)]
+    assert not any("\0" in text for text in stored_texts)
+
+
+def test_a_page_of_people_passes_over_who_was_erased_meanwhile(
+    store: Store, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in (1, 2):
+        store.add_session(session(number, f"Anna {number}"))
+
+    def page_then_erasure(*arguments: Any, **named: Any) -> PageOf:
+        page = page_of(*arguments, **named)
+        store.remove_session(identity(1))
+        return page
+
+    monkeypatch.setattr("server.storage.library.page_of", page_then_erasure)
+    assert library.subjects("", "-created", 10).subjects == ((identity(2),),)

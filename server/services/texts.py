@@ -1,0 +1,23 @@
+"""Texts that people give: names, labels, notes. Every way in (HTTP, forms, the console) comes by here."""
+
+import re
+from collections.abc import Mapping
+
+from rig.errors import InputError
+from rig.text import encodes
+
+TEXT_MOST = 500  # characters
+PLAIN = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"  # no control characters but tabs and line breaks, which notes have
+CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
+
+
+def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
+    """Raises InputError naming, by its field, every text that is too long or has what no database keeps."""
+    faults = []
+    for name, text in texts.items():
+        if text is not None and len(text) > TEXT_MOST:
+            faults.append(f"{name}: longer than {TEXT_MOST} characters")
+        elif text is not None and (CONTROL.search(text) or not encodes(text)):
+            faults.append(f"{name}: has control characters or halves of characters: type it anew")
+    if faults:
+        raise InputError(subject, faults)

@@ -1,0 +1,29 @@
+"""Settings from a file and from options."""
+
+from pathlib import Path
+
+import pytest
+
+from rig.errors import InputError
+from server.cli.reconstruct_local import settings_document
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fault"),
+    [
+        ("deep.json", "[" * 100_000, "cannot be read"),
+        ("deep.toml", "front = " + "[" * 100_000, "cannot be read"),
+        ("half.json", "{", "cannot be read"),
+        ("list.json", "[]", "is no table of settings"),
+    ],
+)
+def test_a_file_that_holds_no_settings_is_named(tmp_path: Path, name: str, text: str, fault: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=f"{name}: {fault}"):
+        settings_document(tmp_path / name)
+
+
+def test_options_add_to_the_tables_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text('front = "cam00"\n[outputs]\nsurface = "head"\n')
+    found = settings_document(tmp_path / "a.toml", front="cam01", outputs={"formats": ["ply"]}, detail=None)
+    assert found == {"front": "cam01", "outputs": {"surface": "head", "formats": ["ply"]}}
