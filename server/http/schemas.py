@@ -4,6 +4,7 @@ import base64
 import binascii
 from typing import Annotated, Literal
 
+from fastapi import Header
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
@@ -19,6 +20,7 @@ Tag = Annotated[str, Field(min_length=1, max_length=TAG_MOST, pattern="^[^\\x00-
 Tags = Annotated[list[Tag], Field(max_length=TAGS_MOST, description="without commas and control characters")]
 Moment = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
 JobSettings = Annotated[JsonObject, WithJsonSchema(SETTINGS)]
+Idempotency = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1, max_length=200)]
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 EXAMPLE_ID = "0198c0de" + 20 * "0"
 

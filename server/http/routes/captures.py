@@ -13,7 +13,7 @@ from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
 from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Key, Limit, Sought, WithTag
 from server.http.rig_schemas import CaptureChecks, HoldingsOut
-from server.http.schemas import CaptureEdit, CaptureOut, JobOut, NewCapture, NewFeatures, NewImport
+from server.http.schemas import CaptureEdit, CaptureOut, Idempotency, JobOut, NewCapture, NewFeatures, NewImport
 from server.services.bulk import each
 from server.services.captures import About
 from server.services.keys import Caller
@@ -203,14 +203,14 @@ async def reconstruct_upload(
     caller: Annotated[Caller, Depends(require("submit"))],
     request: Request,
     response: Response,
+    idempotency_key: Idempotency = None,
 ) -> JobOut:
-    """Upload and job in one call."""
+    """Upload and job in one call. The same Idempotency-Key with the same files and settings returns the first job."""
     record, fields = await receive_capture(service, request, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
         wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")), name)
-        key = request.headers.get("idempotency-key")
-        submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=key)
+        submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=idempotency_key)
         job = await service.threads.disk(submit)
     except BaseException:
         service.store.remove_capture(record.id)

@@ -12,7 +12,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.http.auth import ServiceOf, require
 from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, Sought
-from server.http.schemas import JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
+from server.http.schemas import Idempotency, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.bulk import each
 from server.services.jobs import FINISHED, STATUSES
 from server.services.keys import Caller
@@ -26,7 +26,6 @@ from server.wire.send_file import media_type, send_archive, send_file
 router = APIRouter(prefix="/v1", tags=["jobs"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Submitter = Annotated[Caller, Depends(require("submit"))]
-Idempotency = Annotated[str | None, Header(alias="Idempotency-Key", min_length=1, max_length=200)]
 
 
 @router.post("/jobs", status_code=202, responses=documented(400, 404, 409, 413, 415, 507))

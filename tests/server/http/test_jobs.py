@@ -82,6 +82,22 @@ def test_an_idempotency_key_makes_one_job(http: httpx.Client, archive: bytes) ->
     assert other.status_code == 409
 
 
+def test_an_upload_that_is_sent_again_with_its_key_makes_one_job_and_one_capture(
+    http: httpx.Client, archive: bytes
+) -> None:
+    def send(data: bytes = archive, key: str = "again", **fields: str) -> httpx.Response:
+        files = {"file": ("shot.zip", data)}
+        return http.post("/v1/reconstructions", files=files, data=fields, headers={"Idempotency-Key": key})
+
+    first, captures = send(), len(http.get("/v1/captures").json()["captures"])
+    again = send()
+    assert (first.status_code, again.status_code) == (202, 202)
+    assert again.json()["id"] == first.json()["id"]
+    assert len(http.get("/v1/captures").json()["captures"]) == captures
+    assert send(settings='{"method": "simplex"}').status_code == 409
+    assert send(key="x" * 201).status_code == 422
+
+
 def test_the_events_of_a_job_name_a_camera_that_has_moved(http: httpx.Client, client: Client, archive: bytes) -> None:
     capture = upload(http, archive).json()["id"]
     for front, told in (("moved", [["cam02 has moved by 5.0 px"]]), ("cam00", [])):
