@@ -18,11 +18,12 @@ from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
 from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
-from server.services.jobs import Jobs, refuse_board
+from server.services.jobs import Jobs
 from server.services.records import Found
 from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
 from server.services.tags import checked_tags, typed_tags
 from server.services.texts import check_texts
+from server.services.work import refuse_board
 from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord

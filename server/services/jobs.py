@@ -22,7 +22,7 @@ from server.errors import URN, Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
 from server.services.records import Failure, Found, Job
-from server.services.work import Work
+from server.services.work import Work, refuse_board
 from server.settings import ServiceSettings
 from server.storage.database import alive_workers, workers
 from server.storage.events import EventLog, JobEvent
@@ -386,12 +386,6 @@ def failure(row: WorkflowStatus) -> Failure:
         return Failure(URN + "worker-died", detail)
     log.error("job failed in an unforeseen way", job=row.workflow_id, error=str(error))
     return Failure(URN + "internal-error", "The job failed in a way that nobody foresaw; the log says more.")
-
-
-def refuse_board(record: CaptureRecord) -> None:
-    """Raises Conflict for pictures of the calibration board, which show no head."""
-    if record.board:
-        raise Conflict("board-shot", "The capture is of the calibration board; it can only be calibrated from.")
 
 
 def _id_of(key: str, idempotency_key: str) -> str:

@@ -1,12 +1,13 @@
-"""What a job is asked for."""
+"""What a job is asked for, and of what."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.settings import TEMPLATE_NAME, settings_from_document
 from rig.errors import EigenheadError, InputError
+from server.errors import Conflict
 from server.services.texts import check_texts
-from server.storage.records import JobWebhook
+from server.storage.records import CaptureRecord, JobWebhook
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,3 +64,9 @@ def _template_faults(name: str, model: str) -> list[str]:
     except EigenheadError as error:
         return [f"outputs.template: {error}"]
     return []
+
+
+def refuse_board(record: CaptureRecord) -> None:
+    """Raises Conflict for pictures of the calibration board, which show no head."""
+    if record.board:
+        raise Conflict("board-shot", "The capture is of the calibration board; it can only be calibrated from.")
