@@ -42,10 +42,10 @@ def expressions(
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
     """``<model>_posed_median_mm``, ``<model>_neutral_before_median_mm`` and so on. Of weights:
-    ``<model>_weights_correlation`` over the ten largest of each posed head, ``..._true`` over those that it truly has,
-    ``..._all`` over all that any of them has or is told to have; ``<model>_weights_off`` is how far the true ones are
-    told off in the mean, ``<model>_off_<expression>`` the same of one, and ``<model>_weights_told_of_none`` the sum of
-    what a posed head is told beside its own."""
+    ``<model>_weights_correlation`` over the ten largest of each posed head, ``..._but_eyes`` the same without those of
+    lids and looks, ``..._true`` over those that it truly has, ``..._all`` over all that any of them has or is told to
+    have; ``<model>_weights_off`` is how far the true ones are told off in the mean, ``<model>_off_<expression>`` the
+    same of one, and ``<model>_weights_told_of_none`` the sum of what a posed head is told beside its own."""
     code = (*CONTOUR, expression_evidence, expression_reading)
     kept = {
         label: Records(folder, f"expressions-{label}", key_of(model.sha256, Settings(), *code))
@@ -116,22 +116,28 @@ def _figures(rows: list[Row], labels: tuple[str, ...]) -> dict[str, float]:
                     found[f"{label}_{kind}_{infix}{quantity}"] = float(np.mean([row[when][quantity] for row in of]))
             found[f"{label}_{kind}_weights"] = float(np.mean([sum(row["after"]["weights"].values()) for row in of]))
         found[f"{label}_weights_correlation"] = _correlation(rows, label)
+        found[f"{label}_weights_correlation_but_eyes"] = _correlation(rows, label, _is_no_eye)
         found |= {f"{label}_{name}": value for name, value in _weights(rows, label).items()}
     return {name: round(value, 4) for name, value in found.items()}
 
 
-def _correlation(rows: list[Row], label: str) -> float:
+def _correlation(rows: list[Row], label: str, counts: Callable[[str], bool] = lambda name: True) -> float:
     """Of found and true weights, the ten largest true ones of every posed head; where it has fewer, the
     largest others that it is told to have, as far as there are any."""
     true, ours = [], []
     for row in rows:
         if row["model"] == label and row["kind"] == "posed":
-            told = row["after"]["weights"]
-            names = sorted(row["truth"], key=lambda name, of=row["truth"]: -of[name])[:LARGEST]
+            told = {name: weight for name, weight in row["after"]["weights"].items() if counts(name)}
+            names = sorted(filter(counts, row["truth"]), key=lambda name, of=row["truth"]: -of[name])[:LARGEST]
             others = sorted(set(told) - set(names), key=lambda name, of=told: -of[name])[: LARGEST - len(names)]
             true += [row["truth"].get(name, 0.0) for name in [*names, *others]]
             ours += [told.get(name, 0.0) for name in [*names, *others]]
     return float(np.corrcoef(true, ours)[0, 1]) if len(true) > 1 else float("nan")
+
+
+def _is_no_eye(name: str) -> bool:
+    """Whether an expression is none of lids and looks, which move the surface least and are told worst."""
+    return not name.startswith("eye") or name.startswith("eyebrow")
 
 
 def _weights(rows: list[Row], label: str) -> dict[str, float]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import load_model
-from pipeline.experiments.expressions import JAW, WEIGHTS, _correlation, _weights, drawn_weights
+from pipeline.experiments.expressions import JAW, WEIGHTS, _correlation, _is_no_eye, _weights, drawn_weights
 
 
 def test_draws_are_faces_that_people_make() -> None:
@@ -28,6 +28,9 @@ def test_the_correlation_counts_what_was_found_and_is_not_there() -> None:
     assert _correlation([exact], "m") == pytest.approx(1.0)
     wrong = row({"a": 0.2, "b": 0.8}, {"a": 0.2, "b": 0.8, "c": 0.9})
     assert _correlation([wrong], "m") < 0.5
+    lids = row({"a": 0.2, "eyebrows-up": 0.8, "eyeBlink_R": 0.7}, {"a": 0.2, "eyebrows-up": 0.8, "eye-left-slit": 0.5})
+    assert _correlation([lids], "m") < 0.5
+    assert _correlation([lids], "m", _is_no_eye) == pytest.approx(1.0)
 
 
 def test_weights_are_judged_over_the_true_ones_over_all_and_each() -> None:
