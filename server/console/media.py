@@ -17,13 +17,13 @@ from nicegui import app as pages
 from rig.errors import EigenheadError
 from rig.formats.images import open_picture, read_image, write_image
 from server.console import comparison
+from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
 from server.console.look_through import camera_views, rig_of, straightened
 from server.console.page import as_problem
-from server.console.portrait import write_portrait
 from server.console.silhouettes import draw
-from server.errors import Conflict, NotFound
+from server.errors import NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import CaptureRecord
@@ -142,7 +142,7 @@ def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Respo
 @pages.get("/console/jobs/{job_id}/{surface}.{name}.f32")
 def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Literal["quality", "part"]) -> Response:
     """A number a vertex (float32) of head.ply or bust.ply: posterior standard deviation (mm), or part."""
-    path = _result_folder(who[0], job_id) / f"{surface}.ply"
+    path = result_folder(who[0], job_id) / f"{surface}.ply"
     if not path.is_file():
         raise NotFound("surface of the result", surface)
     return _floats(comparison.ply_property(path, name))
@@ -150,13 +150,14 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
 
 @pages.get("/console/jobs/{job_id}/portrait.jpg")
 def portrait(who: Reader, job_id: str) -> Response:
-    """A small picture of the head, drawn at the first look; it goes with the job."""
-    result = _result_folder(who[0], job_id)
-    kept = result.parent / "portrait.jpg"
-    if not kept.is_file():
-        with _drawing:
-            write_portrait(result, kept)
-    return FileResponse(kept, headers=FOREVER)
+    """A small picture of the head."""
+    return FileResponse(head_picture(who[0], job_id, "portrait.jpg"), headers=FOREVER)
+
+
+@pages.get("/console/jobs/{job_id}/first-view.jpg")
+def first_view(who: Reader, job_id: str) -> Response:
+    """The head as the page Result shows it first."""
+    return FileResponse(head_picture(who[0], job_id, "first-view.jpg"), headers=FOREVER)
 
 
 @pages.get("/console/jobs/{job_id}/cameras")
@@ -164,7 +165,7 @@ def cameras(who: Reader, job_id: str) -> Response:
     """The cameras that took the pictures, in the head's frame; none where the capture was removed, or the result has no
     report that places the head."""
     service, found = who[0], []
-    report = _result_folder(who[0], job_id) / "report.json"
+    report = result_folder(who[0], job_id) / "report.json"
     with suppress(NotFound, FileNotFoundError, KeyError):
         capture, _ = _capture_files(service, job_id)
         found = camera_views(rig_of(capture), json.loads(report.read_text()))
@@ -189,7 +190,7 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
     """Distance (mm, float32) of every vertex to the surface of another job's head, or of the truth (``truth``)."""
     service = who[0]
     job = service.jobs.get(job_id)
-    mine = _result_folder(service, job_id)
+    mine = result_folder(service, job_id)
     if other == "truth":
         theirs = service.store.folder("captures", job.capture_id or "") / "truth" / "head.ply"
         if not theirs.is_file():
@@ -197,13 +198,13 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
         return _floats(comparison.to_surface(mine, theirs))
     other_job = service.jobs.get(other)
     same = other_job.capture_id == job.capture_id
-    return _floats(comparison.to_surface(mine, _result_folder(service, other) / "head.ply", align=not same))
+    return _floats(comparison.to_surface(mine, result_folder(service, other) / "head.ply", align=not same))
 
 
 @pages.get("/console/jobs/{job_id}/all.zip")
 def all_files(who: Reader, request: Request, job_id: str) -> Response:
     """Every file of the result in one archive."""
-    return send_archive(request, _result_folder(who[0], job_id), who[0].jobs.files(job_id), name=None)
+    return send_archive(request, result_folder(who[0], job_id), who[0].jobs.files(job_id), name=None)
 
 
 @pages.get("/console/jobs/{job_id}/{name}")
@@ -245,13 +246,6 @@ def _capture_files(service: Service, job_id: str) -> tuple[Path, CaptureRecord]:
     """Raises NotFound for a job without a capture that is still there."""
     capture = service.jobs.get(job_id).capture_id or ""
     return service.store.folder("captures", capture) / "files", service.store.capture(capture)
-
-
-def _result_folder(service: Service, job_id: str) -> Path:
-    state = service.jobs.state(job_id)
-    if state != "succeeded":
-        raise Conflict("no-result", f"The job is {state}; it has no result.")
-    return service.store.folder("jobs", job_id) / "result"
 
 
 def _floats(values: np.ndarray) -> Response:

@@ -1,8 +1,9 @@
 """What all pages share: a component that shows a state document, actions that run in threads, and their messages."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from threading import Lock
 from typing import Any, TypedDict
 
@@ -16,6 +17,7 @@ from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
+from server.console.head_pictures import draw_first_view, warm_up
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
 from server.console.theme import Frame, page_frame
@@ -32,6 +34,7 @@ STATUS_S = 2.0
 FOLLOW_S = 0.15  # how often a job that was started on a page is looked at: its head opens there as soon as it is done
 FIRST_LOOK_S = 1.0  # so long a page waits to be sent with its state in it, which saves it a turn over the socket
 FOLLOWED_MOST = 50
+CROSSING = {"image": "", "fetch": "crossorigin"}  # the mode in which scripts ask, else the browser fetches twice
 KEEP_S = 3600.0  # of a value that is shared by all pages
 KEEP_TIMES = 9.0  # a value is kept so many times as long as it took to make,
 KEEP_MOST_S = 5.0  # but no longer: the one look that waited for a locked database would stand for minutes
@@ -134,6 +137,10 @@ class Page(Element):
         """The state document. Runs in a thread."""
         raise NotImplementedError
 
+    def preloads(self) -> Iterable[tuple[str, str]]:
+        """What the browser is to fetch while it still reads the page: what as (``image``, ``fetch``) and where."""
+        return ()
+
     async def refresh(self) -> None:
         try:
             state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
@@ -162,14 +169,19 @@ class Page(Element):
         """Jobs that an action began: the browser's tab follows them; ``opens``: the head is shown when it is ready."""
         self._started = ([*jobs], opens)
 
-    def _follow(self, event: GenericEventArguments) -> None:
+    async def _follow(self, event: GenericEventArguments) -> None:
         self._followed = [str(job) for job in event.args][:FOLLOWED_MOST]
         self._following.active = bool(self._followed)
+        if self._followed:
+            await anyio.to_thread.run_sync(warm_up, limiter=_threads)
 
     async def _refresh_followed(self) -> None:
         ids = tuple(self._followed)
         found = await anyio.to_thread.run_sync(followed_jobs, self.service, ids, limiter=_threads)
         self.frame.show(followed=found)
+        for job in found:
+            if job["state"] == "succeeded":  # the page goes there now
+                await anyio.to_thread.run_sync(draw_first_view, self.service, job["id"], limiter=_threads)
 
     async def _choose(self, event: GenericEventArguments) -> None:
         self.choice |= event.args
@@ -268,6 +280,8 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
         drawn = page(frame, caller, **initial)
         with anyio.move_on_after(FIRST_LOOK_S):
             await drawn.refresh()
+        for kind, address in drawn.preloads():
+            ui.add_head_html(f'<link rel="preload" as="{kind}" href="{escape(address)}" {CROSSING[kind]}>')
         drawn.begin()
     return None
 

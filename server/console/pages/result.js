@@ -37,7 +37,7 @@ export default spoken({
   mixins: [besideIt, exports3d, views3d],
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", digits: 1 }),
+  data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", drawn: false, digits: 1 }),
   computed: {
     job() { return this.state.job; },
     surfaces() { return SURFACES.filter(([name]) => this.job?.files[`${name}.glb`]); },
@@ -71,6 +71,7 @@ export default spoken({
         <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button></template></header>
       <div class="columns beside">
         <div class="panel view3d" ref="view">
+          <img v-if="surfaces.length && !drawn" id="first-view" class="first" :src="'/console/jobs/' + job.id + '/first-view.jpg'" alt="" @error="drawn = true">
           <img v-if="picture" :src="picture.address" :alt="say('Photograph of {name}', { name: through })" :style="picture.style">
           <canvas ref="canvas" v-show="job" :style="{ opacity: through ? 1 - fade : 1 }" tabindex="0" role="img" aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded" @keydown="turn" @pointerdown="press" @click="pick"></canvas>
           <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ say(state.asked ? 'This job has no head' : 'No heads yet') }}</h2><p>{{ say(state.asked ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.') }}</p><a class="b main-action" :href="state.asked ? '/jobs' : '/captures'">{{ say(state.asked ? 'Go to jobs' : 'Go to captures') }}</a></div>
@@ -204,6 +205,7 @@ export default spoken({
         await this.paint();
         if (first) this.goOnComparing();
         this.loaded = `${id} ${surface}`;
+        requestAnimationFrame(() => requestAnimationFrame(() => { this.drawn = true; })); // the service's picture goes when ours is there
       } catch (error) { this.fault = say("The head cannot be shown: {reason}", { reason: say(error.message) }); }
       this.loading = false;
     },

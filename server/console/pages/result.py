@@ -92,6 +92,12 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
         head = head_of(self.service, known)
         return {"results": shown, "total": total, "job": head, "asked": self.choice.get("job")}
 
+    def preloads(self) -> Iterable[tuple[str, str]]:
+        job = self.props["state"].get("job")
+        if job and "head.glb" in job["files"]:
+            yield "image", f"/console/jobs/{job['id']}/first-view.jpg"
+            yield "fetch", f"/console/jobs/{job['id']}/head.glb"
+
 
 def newest_heads(service: Service, sought: str) -> tuple[list[ResultLine], int]:
     """The newest finished jobs that are sought, and how many there are."""

@@ -30,6 +30,9 @@ def test_a_head_opens_where_it_was_begun_and_never_over_what_is_typed(
         expect(page).to_have_title(re.compile(r"^\d+ % Captures - eigenhead$"))
         page.wait_for_url("**/result/*", timeout=30_000)
         page.wait_for_selector("canvas[data-loaded$=head]", timeout=30_000)
+        head = page.url.rpartition("/")[2]
+        assert (service.data / "jobs" / head / "first-view.jpg").is_file(), "the service draws it before it is asked"
+        assert page.locator("link[rel=preload]").count() == 2
         assert page.evaluate("tones") == 2
         assert elsewhere.url.endswith(f"/captures?capture={capture}"), "another tab stays"
         page = mine.go("/captures")

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.support.ball_results import RADIUS_MM
 from tests.support.browser import Visit, keep_screenshots, keep_widths, visit
@@ -120,6 +120,29 @@ def test_views_from_fixed_sides_fit_the_head(browser: Browser, heads: RunningSer
     page.keyboard.press("f")
     page.wait_for_function("!document.fullscreenElement")
     keep_widths(page, screenshots, "viewer-sides")
+    v.check_clean()
+
+
+def test_a_picture_of_the_head_stands_where_the_browser_will_draw_it(browser: Browser, heads: RunningService) -> None:
+    v = visit(browser, heads.url)
+    held: list[Route] = []
+    v.page.route("**/head.glb", lambda route: held.append(route))
+    page = v.go("/result")
+    first = page.locator("#first-view")
+    expect(first).to_be_visible()
+    page.wait_for_function("document.querySelector('#first-view').naturalWidth === 720")
+    before = np.asarray(Image.open(io.BytesIO(page.locator(".view3d").screenshot())).convert("RGB"), float)
+    for route in held:
+        route.continue_()
+    page.wait_for_selector("canvas[data-loaded$=head]", timeout=60_000)
+    expect(first).to_have_count(0)
+    after = np.asarray(Image.open(io.BytesIO(page.locator(".view3d").screenshot())).convert("RGB"), float)
+    height, width = after.shape[:2]
+    middle = np.s_[round(0.1 * height) : round(0.85 * height), width // 2 - height // 2 : width // 2 + height // 2]
+    ball = after[middle].max(axis=2) > 60
+    assert 0.1 < ball.mean() < 0.9
+    assert np.abs(before - after)[middle][ball].mean() < 6, "colours and light"
+    assert (ball != (before[middle].max(axis=2) > 60)).mean() < 0.02, "place and size"
     v.check_clean()
 
 

@@ -1,0 +1,55 @@
+"""Pictures of a job's head: drawn by the service at the first look, one at a time, and kept beside the result, so that
+they go with the job."""
+
+import threading
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from rig.errors import EigenheadError
+from rig.mesh import Mesh
+from server.console.first_view import drawn, write_first_view
+from server.console.portrait import write_portrait
+from server.errors import Conflict
+from server.services.service import Service
+
+HeadPicture = Literal["portrait.jpg", "first-view.jpg"]
+WRITERS = {"portrait.jpg": write_portrait, "first-view.jpg": write_first_view}
+
+_drawing = threading.Lock()
+
+
+def result_folder(service: Service, job_id: str) -> Path:
+    """Raises Conflict where the job has no result."""
+    state = service.jobs.state(job_id)
+    if state != "succeeded":
+        raise Conflict("no-result", f"The job is {state}; it has no result.")
+    return service.store.folder("jobs", job_id) / "result"
+
+
+def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
+    """Raises Conflict where the job has no result, FileNotFoundError where that has no head."""
+    result = result_folder(service, job_id)
+    kept = result.parent / name
+    if not kept.is_file():
+        with _drawing:
+            if not kept.is_file():
+                WRITERS[name](result, kept)
+    return kept
+
+
+def draw_first_view(service: Service, job_id: str) -> None:
+    """Of a head that is about to be opened, so that it is there when the page asks for it."""
+    with suppress(EigenheadError, OSError):  # removed meanwhile, or a result without a head: the page tells
+        head_picture(service, job_id, "first-view.jpg")
+
+
+@cache
+def warm_up() -> None:
+    """The first picture of a service loads what draws it: half a second that nobody should wait for at a head."""
+    corners = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    drawn(Mesh(corners, faces, np.full((4, 3), 128, np.uint8)))
