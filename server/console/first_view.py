@@ -48,7 +48,7 @@ def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
     eye, size = centre + AWAY * radius * direction, 2 * SIDE
     focal = size / 2 / np.tan(np.radians(FOV_DEG / 2))
     lens = Intrinsics(size, size, focal, focal, (size - 1) / 2, (size - 1) / 2)
-    camera = Camera("first view", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
+    camera = Camera("view", lens, look_at(eye, centre, np.array([0.0, 1.0, 0.0])))
     large = picture(camera, vertices, mesh.faces, lit(mesh), GROUND)
     return np.asarray(cv2.resize(large, (SIDE, SIDE), interpolation=cv2.INTER_AREA), np.uint8)
 

@@ -57,7 +57,7 @@ UNREAD = {
         "truth of",
     ),
     "server/console/mount.py": ("This page is not open to other web pages.",),
-    "server/console/page.py": ("{} and all", "not removed"),
+    "server/console/page.py": ("{} and all", "not removed", "<link"),
     "server/console/removal.py": ("not removed",),
     "server/console/theme.py": ("<link", "<meta", "document."),
     "server/console/pages/calibration.py": ("calibration board", "calibration page"),
