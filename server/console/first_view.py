@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from pipeline.imaging.cpu_raster import picture
 from rig.camera import Camera, Intrinsics
 from rig.formats.images import write_image
-from rig.formats.mesh_file import read_mesh
+from rig.formats.ply import read_head_ply
 from rig.geometry import look_at
 from rig.mesh import Mesh, vertex_normals
 from server.console.portrait import placed
@@ -29,12 +29,12 @@ GAMMA = 2.2  # near enough to sRGB's curve for a picture that is there for half 
 
 
 def write_first_view(result: Path, target: Path) -> None:
-    """Raises FileNotFoundError where there is no head."""
+    """Raises InputError where there is no head."""
     write_image(target, first_view(result), quality=QUALITY)
 
 
 def first_view(result: Path) -> UInt8[np.ndarray, "s s 3"]:
-    head = read_mesh(result / "head.ply")
+    head, _ = read_head_ply(result / "head.ply")
     mesh = Mesh(placed(result).apply(head.vertices), head.faces, head.colours)
     return drawn(mesh)
 

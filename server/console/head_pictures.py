@@ -5,13 +5,15 @@ import threading
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 
 from rig.errors import EigenheadError
+from rig.formats.ply import write_ply
 from rig.mesh import Mesh
-from server.console.first_view import drawn, write_first_view
+from server.console.first_view import write_first_view
 from server.console.portrait import write_portrait
 from server.errors import Conflict
 from server.services.service import Service
@@ -31,7 +33,7 @@ def result_folder(service: Service, job_id: str) -> Path:
 
 
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
-    """Raises Conflict where the job has no result, FileNotFoundError where that has no head."""
+    """Raises Conflict where the job has no result, InputError or FileNotFoundError where that has no head."""
     result = result_folder(service, job_id)
     kept = result.parent / name
     if not kept.is_file():
@@ -49,7 +51,18 @@ def draw_first_view(service: Service, job_id: str) -> None:
 
 @cache
 def warm_up() -> None:
-    """The first picture of a service loads what draws it: half a second that nobody should wait for at a head."""
+    """The first picture of a service loads what reads and draws it: a second that nobody should wait for at a head."""
     corners = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
-    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
-    drawn(Mesh(corners, faces, np.full((4, 3), 128, np.uint8)))
+    corner = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
+    with TemporaryDirectory() as folder:
+        result = Path(folder)
+        grey, none = np.full((4, 3), 128, np.uint8), np.zeros(4)
+        write_ply(
+            result / "head.ply",
+            corner,
+            normals=corner.normals(),
+            colours=grey,
+            quality=none.astype(np.float32),
+            views=none.astype(np.uint8),
+        )
+        write_first_view(result, result / "first-view.jpg")

@@ -155,7 +155,7 @@ def main() -> None:
         v.page.add_init_script(WATCH)
         figures: dict[str, Any] = time_viewer(v, job, chosen.rounds)
         figures |= time_clicks(v, service, client, capture, chosen.rounds)
-        figures |= time_opening(v, service, client, capture, min(chosen.rounds, 3))
+        figures |= time_opening(v, service, client, capture, chosen.rounds)
         bytes_of = {
             n: f["bytes"] for n, f in client.get(f"/v1/jobs/{job}").json()["files"].items() if n.endswith("glb")
         }

@@ -71,7 +71,7 @@ export default spoken({
         <button class="b" :aria-pressed="measuring" @click="measuring = !measuring">Measure <kbd>M</kbd></button></template></header>
       <div class="columns beside">
         <div class="panel view3d" ref="view">
-          <img v-if="surfaces.length && !drawn" id="first-view" class="first" :src="'/console/jobs/' + job.id + '/first-view.jpg'" alt="" @error="drawn = true">
+          <img v-if="surfaces.length && !drawn" id="first-view" ref="first" class="first" :src="'/console/jobs/' + job.id + '/first-view.jpg'" alt="" @error="drawn = true">
           <img v-if="picture" :src="picture.address" :alt="say('Photograph of {name}', { name: through })" :style="picture.style">
           <canvas ref="canvas" v-show="job" :style="{ opacity: through ? 1 - fade : 1 }" tabindex="0" role="img" aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded" @keydown="turn" @pointerdown="press" @click="pick"></canvas>
           <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ say(state.asked ? 'This job has no head' : 'No heads yet') }}</h2><p>{{ say(state.asked ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.') }}</p><a class="b main-action" :href="state.asked ? '/jobs' : '/captures'">{{ say(state.asked ? 'Go to jobs' : 'Go to captures') }}</a></div>
@@ -185,6 +185,7 @@ export default spoken({
       this.loading = true; this.fault = ""; this.loaded = ""; this.clearPoints();
       try {
         const head = await new GLTFLoader().loadAsync(`/console/jobs/${id}/${surface}.glb`);
+        if (!this.drawn) await this.pictureShown();
         if (id !== this.job?.id || surface !== this.surface) return;
         if (this.mesh) { this.scene.remove(this.mesh); this.mesh.geometry.dispose(); }
         let found = null;
@@ -208,6 +209,9 @@ export default spoken({
         requestAnimationFrame(() => requestAnimationFrame(() => { this.drawn = true; })); // the service's picture goes when ours is there
       } catch (error) { this.fault = say("The head cannot be shown: {reason}", { reason: say(error.message) }); }
       this.loading = false;
+    },
+    async pictureShown() { // a machine without graphics shows nothing while it draws the head: the picture goes first
+      if (this.$refs.first?.complete) await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
     },
     paintAs(name) { if (!this.mateId) this.other = ""; this.colouring = name; this.paint(); },
     async paint() {
