@@ -15,6 +15,7 @@ WARNING_CODES = (
     "mask-loose",
     "no-albedo",
     "no-bust",
+    "no-chart",
     "no-texture",
     "no-texture-layout",
     "old-setting",

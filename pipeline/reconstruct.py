@@ -39,6 +39,7 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import FINE_LEVELS, Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import usable_views
+from pipeline.texture.chart_colours import chart_colours, find_charts, with_true_colours, without_chart_plates
 from pipeline.texture.delight import DIM_SHARE, delight
 from pipeline.texture.head_texture import find_layout, paint_head
 from pipeline.texture.reduced_layout import reduced_layout
@@ -74,8 +75,10 @@ def reconstruct(
     clock = Clock(report)
     clock("segmentation")
 
+    charts = find_charts(capture) if settings.texture.chart else {}
+
     def segmented(shot: Capture) -> dict[str, Silhouette]:
-        return segment(shot, rig, settings.segmentation, report=report)
+        return segment(without_chart_plates(shot, charts), rig, settings.segmentation, report=report)
 
     found = usable_views(capture, rig, segmented, exchanged=settings.exchanged_pictures)
     digests, capture, silhouettes = capture.digests, found.capture, found.silhouettes
@@ -111,16 +114,18 @@ def reconstruct(
     layout, texture_warnings = find_layout(model, settings)
     around = None if layout is None else layout.around
     dim_share = DIM_SHARE if settings.outputs.delit else None
-    given = (mesh, normals, capture, silhouettes, rig, depths, settings.texture)
+    chart, chart_warnings = chart_colours(capture, charts, rig) if settings.texture.chart else (None, [])
+    shown = capture if chart is None else with_true_colours(capture, chart)
+    given = (mesh, normals, shown, silhouettes, rig, depths, settings.texture)
     coloured = texture(*given, around=around, dim_share=dim_share)
     atlas = paint_head(layout, mesh, coloured, full.face_region, settings)
-    lit = (mesh, normals, coloured, atlas, full.face_region, around)
+    lit = (mesh, normals, coloured, atlas, full.face_region, around, chart)
     light = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo, albedo_warnings = delight(*lit) if settings.outputs.delit else (None, [])
     bust, bust_warnings = None, []
     if settings.outputs.surface != "head":
         skin = None if finer is None else part_of(mesh, finer.observed)
-        bust, bust_warnings = find_bust(maps, votes, bias, capture, silhouettes, rig, mesh, skin, settings, clock)
+        bust, bust_warnings = find_bust(maps, votes, bias, shown, silhouettes, rig, mesh, skin, settings, clock)
     clock("evidence")
     before = start_masks(model, start, rig)
     fitted_masks = {name: np.isfinite(depth) for name, depth in depths.items()}
@@ -139,6 +144,7 @@ def reconstruct(
         *implausible,
         *warnings,
         *eye_warnings(closed),
+        *chart_warnings,
         *coloured.warnings,
         *texture_warnings,
         *albedo_warnings,
@@ -169,6 +175,7 @@ def reconstruct(
         seconds=clock.seconds | {"total": time.perf_counter() - started},
         warnings=told,
         gains=coloured.gains,
+        chart=chart,
         detail=detail,
         atlas=atlas,
         reduced=light,

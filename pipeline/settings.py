@@ -186,6 +186,7 @@ class TextureSettings:
     footprint_px: float = 0.45  # sigma of the sampling window; 0.7 loses 0.3 dB of detail, 0.4 lets 1.5 dB more noise
     sharpening: float = 1.0  # unsharp mask of 1 px where there is detail: 1.2, 2.2 and 0.8 dB on three true heads
     outlier: float = 0.12  # difference from the median of the views, by its level, at which a view counts half
+    chart: bool = False  # a colour chart in the clean plates says what the colours truly are
     selection: SelectionSettings = field(default_factory=SelectionSettings)
 
 

@@ -4,7 +4,7 @@ Compared are texels of the face that all three captures saw, by CIEDE2000, a pai
 texture against texture/albedo.png. ``_level`` is the same with each image's overall colour brought to the first one's
 (the median by channel, in linear light): what is left is shading and shadow alone. The heads are fitted anew for each
 light, so that both figures hold what the fits and the cameras' noise differ by; ``floor`` is that, the same light shot
-twice.
+twice. ``chart_...`` is the same where a colour chart was held before the cameras in one clean plate each.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,25 +24,28 @@ from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.pictures import labelled
 from pipeline.experiments.records import Records, key_of
 from pipeline.experiments.texture import drawn_texture
+from pipeline.imaging import colour_chart
 from pipeline.imaging.cpu_raster import depth_map
 from pipeline.imaging.cpu_raster_kernels import rasterise
 from pipeline.imaging.masks import box_around
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
-from pipeline.texture import decision, delight
+from pipeline.texture import chart_colours, decision, delight
 from pipeline.texture import light as fitted_light
 from pipeline.texture.delight import Albedo
 from pipeline.texture.uv_unwrap import Layout
+from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
+from rig.studio.scene.chart import chart_plate
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.lights import LAMPS, Lamp
-from rig.studio.scene.simulate import build_scene, shoot
+from rig.studio.scene.simulate import Scene, build_scene, shoot
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 
@@ -51,6 +54,7 @@ Image = UInt8[np.ndarray, "s s 3"]
 SUBJECTS = 1
 GRID = 512  # texels that are compared: 0.7 mm a texel, beyond what two fits differ by
 PANEL = (540, 780)
+LEAST_FACING = 0.3  # cosine: flatter, the patches of a chart run together
 LIGHTS: Mapping[str, tuple[Lamp, ...]] = {
     "studio": LAMPS,
     "left": (  # a warm window on the subject's left, hardly a fill
@@ -83,7 +87,8 @@ def light(
         folder: keeps rows, so that a stopped run goes on, and a picture of every subject.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", delight=True, texture_size=2048))
-    records = Records(folder, "light", key_of(model.sha256, settings, LIGHTS, fitted_light, delight, decision))
+    code = (fitted_light, delight, decision, chart_colours, colour_chart)
+    records = Records(folder, "light", key_of(model.sha256, settings, LIGHTS, *code))
     rows = []
     for number in range(subjects):
         name = f"{number:02}"
@@ -97,10 +102,24 @@ def light(
 
 
 def row_of(model: HeadModel, seed: int, renderer: Renderer, settings: Settings, picture: Path | None) -> Row:
-    """One subject in every light, and in the first one twice."""
+    """One subject in every light, and in the first one twice; all of it again with a colour chart."""
     rig = default_layout()
     found = {name: lit_head(model, seed, rig, lamps, renderer, settings) for name, lamps in LIGHTS.items()}
     again = lit_head(model, seed, rig, LAMPS, renderer, settings, shot=1)
+    row = differences(model, found, again)
+    if picture is not None:
+        write_image(picture, sheet(found, rig))
+    charted = replace(settings, texture=replace(settings.texture, chart=True))
+    found = {name: lit_head(model, seed, rig, lamps, renderer, charted) for name, lamps in LIGHTS.items()}
+    again = lit_head(model, seed, rig, LAMPS, renderer, charted, shot=1)
+    row |= {f"chart_{key}": value for key, value in differences(model, found, again).items()}
+    if picture is not None:
+        write_image(picture.with_stem(f"{picture.stem}-chart"), sheet(found, rig))
+    return row | {"chart_ratio_to_plain_texture": row["chart_albedo"] / row["texture"]}
+
+
+def differences(model: HeadModel, found: Mapping[str, Reconstruction], again: Reconstruction) -> Row:
+    """Of textures and albedos, in the mean over the pairs of lights; ``again`` is the first light's second shot."""
     every = [*found.values(), again]
     layout = albedo_of(every[0]).atlas.layout
     seen = np.asarray(np.all([head.views > 0 for head in every], axis=0)) & model.levels["full"].face_region
@@ -119,10 +138,7 @@ def row_of(model: HeadModel, seed: int, renderer: Renderer, settings: Settings, 
             }
             row |= {f"{kind}{suffix}_{key}": value for key, value in pairs.items()}
             row |= {f"{kind}{suffix}": float(np.mean(list(pairs.values())))}
-    row |= {f"ratio{suffix}": row[f"albedo{suffix}"] / row[f"texture{suffix}"] for suffix in ("", "_level")}
-    if picture is not None:
-        write_image(picture, sheet(found, rig))
-    return row
+    return row | {f"ratio{suffix}": row[f"albedo{suffix}"] / row[f"texture{suffix}"] for suffix in ("", "_level")}
 
 
 def lit_head(
@@ -142,9 +158,26 @@ def lit_head(
     subject = Subject(head, marks, level.face_region, f"seed-{seed}")
     scene = build_scene(subject, rig, PRESET, np.random.default_rng((10, seed)), renderer=renderer, lamps=lamps)
     noise = np.random.default_rng((11, seed, shot, *(round(100 * lamp.towards[0]) % 256 for lamp in lamps)))
-    return reconstruct(
-        shoot(scene, noise), rig, model, settings, renderer=renderer, report=lambda stage, share: None
-    )  # fmt: skip
+    capture = shoot(scene, noise)
+    if settings.texture.chart:
+        capture = with_chart_plates(capture, scene, lamps, noise)
+    return reconstruct(capture, rig, model, settings, renderer=renderer, report=lambda stage, share: None)
+
+
+def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], rng: np.random.Generator) -> Capture:
+    """One more clean plate of every camera that a chart, held up for the front camera, is turned to."""
+    front, middle = scene.rig.front_camera(), scene.world_from_head.translation
+    towards = {camera.name: camera.centre_world - middle for camera in scene.rig}
+    facing = {
+        name: way @ towards[front] / np.linalg.norm(way) / np.linalg.norm(towards[front])
+        for name, way in towards.items()
+    }
+    plates = dict(capture.backgrounds)
+    for name in scene.rig.names:
+        if facing[name] > LEAST_FACING:
+            chart = chart_plate(scene, name, colour_chart.true_colours(), rng, turned_to=front, lamps=lamps)
+            plates[name] = (*plates[name], chart)
+    return replace(capture, backgrounds=plates)
 
 
 def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, "s s"]:

@@ -18,6 +18,7 @@ from pipeline.results.bust import Bust
 from pipeline.results.expression import Found, Posable
 from pipeline.results.measurements import Landmark, Measurement
 from pipeline.settings import Settings
+from pipeline.texture.chart_colours import ChartColours
 from pipeline.texture.delight import Albedo
 from pipeline.texture.reduced_layout import ReducedLayout
 from pipeline.texture.uv_unwrap import Atlas
@@ -70,6 +71,7 @@ class Reconstruction:
     warnings: tuple[ReportWarning, ...] = ()
     detail: Detail = field(default_factory=lambda: Detail("span", "not stated"))
     gains: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)  # linear RGB, by camera
+    chart: ChartColours | None = None  # where the settings ask for it and a plate shows one
     pictures: Mapping[str, str] = field(default_factory=dict)  # cameras that were given another's, and whose
     atlas: Atlas | None = None  # where a format has a texture and the model a layout
     reduced: ReducedLayout | None = None  # of the atlas, where the settings ask for a normal map

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.parallel_for import in_threads
+from pipeline.texture.chart_colours import ChartColours, levelled_by_chart
 from pipeline.texture.inpaint import fill_unknown
 from pipeline.texture.layout_image import spread_texels
 from pipeline.texture.light import Light, fit_light, transfer
@@ -48,8 +49,10 @@ def delight(
     atlas: Atlas | None,
     face_region: Bool[np.ndarray, " v"],
     around: Neighbourhood | None,
+    chart: ChartColours | None = None,
 ) -> tuple[Albedo | None, list[ReportWarning]]:
-    """The albedo of a textured head; a warning where it cannot be told."""
+    """The albedo of a textured head; a warning where it cannot be told. With a ``chart`` it is the skin's own in level
+    and colour, too; else by convention (``pipeline.texture.light``)."""
     if atlas is None or around is None or coloured.dim is None:
         return None, [ReportWarning("no-albedo", "there is no texture that light could be taken off")]
     seen = coloured.views > 0
@@ -61,6 +64,8 @@ def delight(
         return None, [
             ReportWarning("no-albedo", "too little of the face is seen, or it is black: no light can be told")
         ]
+    if chart is not None:
+        light = levelled_by_chart(light, chart.normal_world)
     shading = white @ light.coefficients
     least = LEAST_SHADING * np.median(shading[seen & face_region], axis=0)
     shading = 0.5 * (shading + least + np.hypot(shading - least, 0.5 * least))  # a maximum without a crease

@@ -43,11 +43,12 @@ LEAST_VERTICES = 100
 @dataclass(frozen=True, slots=True, eq=False)
 class Light:
     """``coefficients``: radiance in orthonormal real harmonics, order as ``harmonics`` gives them, world frame, by
-    channel; the mean over the sphere is 1. ``residual``: what it leaves of the face's linear colours, by their level
-    (the median)."""
+    channel; the mean over the sphere is 1, or, ``on_chart``, what it gives to the colour chart. ``residual``: what it
+    leaves of the face's linear colours, by their level (the median)."""
 
     coefficients: Float[np.ndarray, "9 3"]
     residual: float
+    on_chart: bool = False
 
 
 def harmonics(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 9"]:
