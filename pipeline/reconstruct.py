@@ -39,7 +39,7 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import FINE_LEVELS, Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import usable_views
-from pipeline.texture.chart_colours import chart_colours, find_charts, with_true_colours, without_chart_plates
+from pipeline.texture.chart_colours import chart_colours, with_true_colours
 from pipeline.texture.delight import DIM_SHARE, delight
 from pipeline.texture.head_texture import find_layout, paint_head
 from pipeline.texture.reduced_layout import reduced_layout
@@ -75,10 +75,8 @@ def reconstruct(
     clock = Clock(report)
     clock("segmentation")
 
-    charts = find_charts(capture) if settings.texture.chart else {}
-
     def segmented(shot: Capture) -> dict[str, Silhouette]:
-        return segment(without_chart_plates(shot, charts), rig, settings.segmentation, report=report)
+        return segment(shot, rig, settings.segmentation, report=report)
 
     found = usable_views(capture, rig, segmented, exchanged=settings.exchanged_pictures)
     digests, capture, silhouettes = capture.digests, found.capture, found.silhouettes
@@ -114,7 +112,7 @@ def reconstruct(
     layout, texture_warnings = find_layout(model, settings)
     around = None if layout is None else layout.around
     dim_share = DIM_SHARE if settings.outputs.delit else None
-    chart, chart_warnings = chart_colours(capture, charts, rig) if settings.texture.chart else (None, [])
+    chart, chart_warnings = chart_colours(capture, rig) if settings.texture.chart else (None, [])
     shown = capture if chart is None else with_true_colours(capture, chart)
     given = (mesh, normals, shown, silhouettes, rig, depths, settings.texture)
     coloured = texture(*given, around=around, dim_share=dim_share)

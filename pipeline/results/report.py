@@ -14,11 +14,15 @@ from pipeline.results.expression import Posable
 from pipeline.results.reconstruction import CameraFigures, Reconstruction
 from pipeline.settings import document_from_settings
 from pipeline.templates.header import TemplateHeader
+from pipeline.texture.chart_colours import ChartColours
 from pipeline.texture.light import HARMONICS, Light
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
 
 FORMAT = "eigenhead-report/1"
+
+
+ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 1 in each channel"
 
 
 class ViewReport(TypedDict):
@@ -177,6 +181,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
             "vertices": len(result.views),
             "filled": filled,
             "gains": result.gains,
+            "chart": None if result.chart is None else _chart(result.chart),
             "light": None if result.albedo is None else _light(result.albedo.light),
         },
         "bust": None if result.bust is None else _bust(result.bust),
@@ -190,12 +195,20 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
     return _plain(document)
 
 
+def _chart(chart: ChartColours) -> dict[str, object]:
+    return {
+        "cameras": {name: {"matrix": each.matrix, "off": each.off} for name, each in chart.cameras.items()},
+        "frame": "world",
+        "normal": chart.normal_world,
+    }
+
+
 def _light(light: Light) -> dict[str, object]:
     return {
         "frame": "world",
         "harmonics": HARMONICS,
         "coefficients": light.coefficients.T,  # a row a channel: red, green, blue
-        "convention": "the mean over the sphere is 1 in each channel",
+        "convention": ON_CHART if light.on_chart else MEAN_ONE,
         "residual": light.residual,
     }
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from pipeline.imaging.chart_plates import empty_plates
 from pipeline.imaging.masks import dilated, eroded, spread
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import CHANNEL_SUM, Background, coarse_size, estimate_background
@@ -71,7 +72,7 @@ def decide(
     """One image against its clean plates."""
     size = coarse_size(image.shape, settings.coarse_columns)
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    background = estimate_background(image, coarse, plates, settings)
+    background = estimate_background(image, coarse, empty_plates(plates), settings)
     chi2, variance = _against_plate(coarse, background, image.shape[1] / size[0], settings)
     odds = np.clip(0.5 * chi2 - settings.evidence, -MOST_ODDS, MOST_ODDS)
     left, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)

@@ -6,7 +6,7 @@ chart faced, so that the light taken off a head is the light that fell on the ch
 mean of those that did: the balance of the views levels the rest.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.diagnostics import ReportWarning
-from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal, find_chart
+from pipeline.imaging.chart_plates import charts_in
+from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal
 from pipeline.parallel_for import thread_count
 from pipeline.texture.light import BAND_FACTORS, Light, harmonics
 from rig.capture import Capture
@@ -26,9 +27,6 @@ CODES = 4095
 LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 ENCODED = np.rint(255 * srgb_from_linear(np.arange(CODES + 1) / CODES)).astype(np.uint8)
 
-Charts = Mapping[int, Chart]
-"""By the identity of the plate's pixels, which they keep when a capture's files are given to other cameras."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartColours:
@@ -38,35 +36,21 @@ class ChartColours:
     normal_world: Float[np.ndarray, " 3"]
 
 
-def find_charts(capture: Capture) -> Charts:
-    """The charts in all clean plates."""
-    plates = [plate for _, plate in _plates(capture)]
+def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
+    """What the charts in all clean plates say of the cameras; a warning where none is found."""
     with ThreadPoolExecutor(thread_count()) as pool:
-        found = pool.map(find_chart, plates)
-        return {id(plate): chart for plate, chart in zip(plates, found, strict=True) if chart is not None}
+        charts = pool.map(charts_in, [capture.backgrounds.get(name, ()) for name in rig.names])
+        return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
 
 
-def without_chart_plates(capture: Capture, charts: Charts) -> Capture:
-    """The capture whose plates show no chart, where a camera has such a plate: the others are the empty studio's."""
-    bare = {
-        name: tuple(plate for plate in plates if id(plate) not in charts) or plates
-        for name, plates in capture.backgrounds.items()
-    }
-    return replace(capture, backgrounds=bare)
-
-
-def chart_colours(capture: Capture, charts: Charts, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """What the charts say of the cameras; a warning where none is found."""
-    seen: dict[str, list[Chart]] = {}
-    for name, plate in _plates(capture):
-        if id(plate) in charts and name in rig:
-            seen.setdefault(name, []).append(charts[id(plate)])
-    found = {name: chart_correction(of_camera) for name, of_camera in sorted(seen.items())}
+def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
+    """The same of charts that were found, by camera."""
+    found = {name: chart_correction(own) for name, own in charts.items() if own}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:
         why = "no clean plate shows a colour chart of 24 patches that is large enough, sharp and not overexposed"
         return None, [ReportWarning("no-chart", f"{why}: colours are the cameras' own")]
-    normals = [chart_normal(chart, rig[name]) for name in cameras for chart in seen[name]]
+    normals = [chart_normal(chart, rig[name]) for name in cameras for chart in charts[name]]
     mean = np.mean(normals, axis=0)
     return ChartColours(cameras, mean / np.linalg.norm(mean)), []
 
@@ -94,9 +78,3 @@ def levelled_by_chart(light: Light, normal_world: Float[np.ndarray, " 3"]) -> Li
     """The light as strong, and of the colour, as it fell on the chart: there white is white."""
     on_chart = (harmonics(normal_world[None]) * BAND_FACTORS) @ light.coefficients
     return replace(light, coefficients=light.coefficients / on_chart[0], on_chart=True)
-
-
-def _plates(capture: Capture) -> Iterator[tuple[str, UInt8[np.ndarray, "h w 3"]]]:
-    for name, plates in capture.backgrounds.items():
-        for plate in plates:
-            yield name, plate

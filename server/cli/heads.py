@@ -89,6 +89,7 @@ def reconstruct(
     delight: Annotated[
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
     ] = False,
+    chart: Annotated[bool, typer.Option("--chart", help="True colours, by a chart in the clean plates.")] = False,
     obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
     atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     normal_map: Annotated[
@@ -116,10 +117,10 @@ def reconstruct(
     switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
     switches |= {"neutral": neutral, "morphs": morphs}
     outputs: dict[str, object] = {name: True for name, asked in switches.items() if asked}
-    outputs |= {"surface": surface} if surface else {}
-    outputs |= {"template": template} if template else {}
-    outputs |= {"formats": formats.split(",")} if formats else {}
-    document = settings_document(settings, method=method, front=front, detail=detail, outputs=outputs or None)
+    words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
+    outputs |= {name: word for name, word in words.items() if word}
+    given = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
+    document = settings_document(settings, method=method, front=front, detail=detail, **given)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
     for warning in written["warnings"]:

@@ -29,4 +29,6 @@ def test_albedos_of_three_lights_differ_by_at_most_half(tmp_path: Path) -> None:
         found = light(load_model(), renderer=renderer, report=lambda stage, share: None, folder=tmp_path)
     assert found["figures"]["ratio"] < 0.5
     assert found["figures"]["ratio_level"] < 0.5
+    assert found["figures"]["chart_ratio"] < 0.4
+    assert found["figures"]["chart_albedo"] < 0.8 * found["figures"]["albedo"]
     assert (tmp_path / "light-00.png").is_file()
