@@ -17,6 +17,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.studio.scene.layout import default_layout
+from tests.pipeline.imaging.test_colour_chart import photograph, placed
 
 MATRIX = np.array([[1.4, -0.1, 0.0], [-0.05, 1.1, 0.02], [0.0, -0.1, 1.6]])
 
@@ -61,10 +62,21 @@ def test_a_chart_corrects_its_camera_and_the_mean_the_others() -> None:
     assert shown[one][0, 0, 0] > shown[one][0, 0, 1]
 
 
+def test_the_charts_of_all_plates_are_looked_for() -> None:
+    rig, wall = default_layout(), photograph(placed(0.01, 0.0), np.eye(3))
+    plates = {"cam04": (wall,), "cam05": (wall, photograph(placed(200, 5), np.diag([0.5, 0.8, 0.8])))}
+    colours, warnings = chart_colours(Capture(images={}, backgrounds=plates), rig)
+    assert colours is not None
+    assert not warnings
+    assert set(colours.cameras) == {"cam05"}
+    np.testing.assert_allclose(colours.cameras["cam05"].matrix, np.diag([2.0, 1.25, 1.25]), atol=0.03)
+
+
 def test_without_a_chart_there_is_a_warning() -> None:
     colours, warnings = chart_colours(Capture(images={}, backgrounds={"cam05": (grey(1),)}), default_layout())
     assert colours is None
     assert [warning.code for warning in warnings] == ["no-chart"]
+    assert warnings[0].message.startswith("no clean plate shows a colour chart of 24 patches")
 
 
 def test_light_is_levelled_to_what_falls_on_the_chart() -> None:
