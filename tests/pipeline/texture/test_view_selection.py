@@ -12,7 +12,7 @@ from pipeline.texture.inpaint import neighbours
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.seam_levelling import level_views
 from pipeline.texture.view_selection import add_alike, select_views
-from pipeline.texture.view_selection_kernels import propagate
+from pipeline.texture.view_selection_kernels import RING_SHARE, differences, fill_slots, propagate
 from tests.support.scenes import ellipsoid
 
 SETTINGS = SelectionSettings()
@@ -79,6 +79,96 @@ def test_a_view_that_the_others_contradict_or_whose_camera_was_raised_much_is_no
     for off in (-25.0, 25.0):  # a shadow, a highlight
         codes[0] = 100.0 + off
         assert (select_views(weights, codes, codes, agreed, np.ones((3, 3)), around, SETTINGS)[0] != 0).all()
+
+
+Scene = tuple[Neighbourhood, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def random_scene(seed: int, count: int = 40, views: int = 7, noise: float = 0.06) -> Scene:
+    """A chain of vertices that most views see, some of which disagree."""
+    rng = np.random.default_rng(seed)
+    weights = rng.uniform(0.05, 0.5, (views, count)) * (rng.random((views, count)) > 0.2)
+    weights[0] = np.maximum(weights[0], 0.05)
+    agreed = rng.uniform(20, 200, (count, 3))
+    codes = agreed + rng.normal(0, noise, (views, count, 3)) * agreed * rng.choice([0.3, 1.5], (views, 1, 1))
+    gains = 2.0 ** rng.normal(0, 0.2, (views, 3))
+    weights, codes, agreed = (array.astype(np.float32) for array in (weights, codes, agreed))
+    return chain(count), weights, codes, agreed, gains
+
+
+def written_out(scene: Scene, levelled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cost, quality and disagreement of each view (v, k): what the best view sees better, a bounded share of
+    disagreement, and raised cameras."""
+    _, weights, codes, agreed, gains = scene
+    views, count = weights.shape
+    cost, quality, off = np.full((count, views), np.inf), np.zeros((count, views)), np.zeros((count, views))
+    for v, k in np.argwhere(weights.T > 0):
+        beside = [w for w in (v - 1, v + 1) if 0 <= w < count]
+        least = min([weights[k, v], *weights[k, beside]])
+        quality[v, k] = (1 - RING_SHARE) * weights[k, v] + RING_SHARE * least
+        ordinary = 0.06 * agreed[v] + 2.0
+        off[v, k] = max(np.sqrt(np.mean(((c[k, v] - agreed[v]) / ordinary) ** 2)) for c in (codes, levelled))
+    for v, k in np.argwhere(weights.T > 0):
+        square = off[v, k] ** 2
+        raised = abs(np.log2(gains[k].mean()))
+        cost[v, k] = 1 - quality[v, k] / quality[v].max() + 2.0 * square / (1 + square) + raised
+    return cost, quality, off
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_a_cost_of_seams_the_cheapest_view_is_chosen(seed: int) -> None:
+    scene = random_scene(seed)
+    around, weights, codes, agreed, gains = scene
+    levelled = (0.5 * (codes + agreed)).astype(np.float32)
+    settings = SelectionSettings(smoothness=0.0)
+    labels, views, told = select_views(weights, codes, levelled, agreed, gains, around, settings)
+    cost, quality, _ = written_out(scene, levelled)
+    for v in range(40):
+        order = np.argsort(cost[v])
+        count = min(6, np.count_nonzero(np.isfinite(cost[v])))
+        assert labels[v] == order[0]
+        assert views[v, :count].tolist() == order[:count].tolist()
+        np.testing.assert_allclose(told[v, :count], quality[v, order[:count]], rtol=1e-5)
+        assert (views[v, count:] == -1).all()
+        assert (told[v, count:] == 0).all()
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.06, 0.4])
+@pytest.mark.parametrize("seed", range(4))
+def test_seams_cost_more_where_views_differ(seed: int, noise: float) -> None:
+    """The best of all labels of a short chain, seams included."""
+    scene = random_scene(seed, 6, 3, noise)
+    around, weights, codes, agreed, gains = scene
+    labels, _, _ = select_views(weights, codes, codes, agreed, gains, around, SelectionSettings(smoothness=0.3))
+    cost, quality, off = written_out(scene, codes)
+    unlike = np.minimum((quality * off).sum(axis=1) / quality.sum(axis=1), 3.0)
+    seams = 0.3 * (0.3 + 0.5 * (unlike[:-1] + unlike[1:]))
+
+    def total(chosen: tuple[int, ...]) -> float:
+        return float(cost[np.arange(6), chosen].sum() + seams[np.diff(chosen) != 0].sum())
+
+    best = min(product(range(3), repeat=6), key=total)
+    assert total(tuple(labels.tolist())) == pytest.approx(total(best), abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_shares_fall_with_quality_and_with_what_is_more_than_noise(seed: int) -> None:
+    around, weights, codes, agreed, gains = random_scene(seed)
+    detail = (codes - agreed).astype(np.float32)
+    labels, views, quality = select_views(weights, codes, codes, agreed, gains, around, SETTINGS)
+    labels[5] = -1
+    off = differences(labels, views, detail, weights, around.starts, around.indices)
+    others = [off[v, c] for v, c in np.ndindex(off.shape) if off[v, c] >= 0 and views[v, c] != labels[v]]
+    noise = np.median(others)
+    shares = np.zeros(off.shape, np.float32)
+    for v, c in np.ndindex(off.shape):
+        if off[v, c] >= 0 and labels[v] >= 0:
+            past = max(off[v, c] / (4.0 * noise) - 1.0, 0.0)
+            shares[v, c] = quality[v, c] / quality[v].max() * np.exp(-past)
+    wanted = fill_slots(labels, views, shares, 4)
+    found = add_alike(labels, views, quality, detail, weights, around, SETTINGS)
+    np.testing.assert_array_equal(found[0], wanted[0])
+    np.testing.assert_allclose(found[1], wanted[1], rtol=1e-4)
 
 
 def test_a_vertex_that_no_view_sees_has_no_label() -> None:
