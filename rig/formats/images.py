@@ -58,14 +58,20 @@ def is_picture(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
-def write_image(path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], quality: int = 95) -> None:
-    """Writes RGB or grey pixels as the format of the suffix."""
+def write_image(
+    path: Path,
+    image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"],
+    quality: int = 95,
+    *,
+    parents: bool = True,
+) -> None:
+    """Writes RGB or grey pixels as the format of the suffix; ``parents`` makes the folder, too."""
     image = np.ascontiguousarray(image)
     pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if path.suffix == ".jpg" else PNG_OPTIONS
     done, data = cv2.imencode(path.suffix, pixels, options)
     assert done
-    write_atomically(path, data.tobytes())
+    write_atomically(path, data.tobytes(), parents=parents)
 
 
 def read_image(path: Path) -> ImageRgb:

@@ -12,7 +12,6 @@ from jaxtyping import Float, UInt8
 
 from pipeline.imaging.cpu_raster import picture
 from rig.camera import Camera, Intrinsics
-from rig.formats.images import write_image
 from rig.formats.ply import read_head_ply
 from rig.geometry import look_at
 from rig.mesh import Mesh, vertex_normals
@@ -24,16 +23,11 @@ DIRECTION = (0.26, 0.06, 0.96)
 AMBIENT = 1.6
 LIGHTS = ((0.6, 0.8, 1.2, 1.6), (-1.2, 0.3, 0.7, 0.7), (0.2, 0.9, -1.2, 0.8))  # whence, and how strong
 GROUND = (16, 19, 24)  # .view3d in theme.css
-QUALITY = 88
 GAMMA = 2.2  # near enough to sRGB's curve for a picture that is there for half a second
 
 
-def write_first_view(result: Path, target: Path) -> None:
-    """Raises InputError where there is no head."""
-    write_image(target, first_view(result), quality=QUALITY)
-
-
 def first_view(result: Path) -> UInt8[np.ndarray, "s s 3"]:
+    """Raises InputError where there is no head."""
     head, _ = read_head_ply(result / "head.ply")
     mesh = Mesh(placed(result).apply(head.vertices), head.faces, head.colours)
     return drawn(mesh)

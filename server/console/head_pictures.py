@@ -11,15 +11,17 @@ from typing import Literal
 import numpy as np
 
 from rig.errors import EigenheadError
+from rig.formats.images import write_image
 from rig.formats.ply import write_ply
 from rig.mesh import Mesh
-from server.console.first_view import write_first_view
-from server.console.portrait import write_portrait
-from server.errors import Conflict
+from server.console.first_view import first_view
+from server.console.portrait import portrait
+from server.errors import Conflict, NotFound
 from server.services.service import Service
 
 HeadPicture = Literal["portrait.jpg", "first-view.jpg"]
-WRITERS = {"portrait.jpg": write_portrait, "first-view.jpg": write_first_view}
+DRAWN = {"portrait.jpg": portrait, "first-view.jpg": first_view}
+QUALITY = 87
 
 _drawing = threading.Lock()
 
@@ -33,13 +35,16 @@ def result_folder(service: Service, job_id: str) -> Path:
 
 
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
-    """Raises Conflict where the job has no result, InputError or FileNotFoundError where that has no head."""
+    """Raises Conflict where the job has no result, NotFound or InputError where that has no head (any more)."""
     result = result_folder(service, job_id)
     kept = result.parent / name
     if not kept.is_file():
         with _drawing:
             if not kept.is_file():
-                WRITERS[name](result, kept)
+                try:  # the folder of a job that is erased meanwhile is not made anew: the face would stay
+                    write_image(kept, DRAWN[name](result), quality=QUALITY, parents=False)
+                except FileNotFoundError as error:
+                    raise NotFound("head of the job", job_id) from error
     return kept
 
 
@@ -54,7 +59,7 @@ def warm_up() -> None:
     """The first picture of a service loads what reads and draws it: a second that nobody should wait for at a head."""
     corners = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
     corner = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
-    with TemporaryDirectory() as folder:
+    with suppress(OSError), TemporaryDirectory() as folder:  # on a full disk the first head waits
         result = Path(folder)
         grey, none = np.full((4, 3), 128, np.uint8), np.zeros(4)
         write_ply(
@@ -65,4 +70,4 @@ def warm_up() -> None:
             quality=none.astype(np.float32),
             views=none.astype(np.uint8),
         )
-        write_first_view(result, result / "first-view.jpg")
+        first_view(result)

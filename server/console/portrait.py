@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipeline.results.clay import clay
-from rig.formats.images import write_image
 from rig.formats.mesh_file import read_mesh
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
@@ -16,7 +15,6 @@ from server.console.comparison import ply_property
 PANEL = (240, 300)  # width, height
 PAPER = (23, 27, 33)
 AZIMUTH_DEG = 22.0
-QUALITY = 86
 DARKEST = 0.55
 MARGIN = 1.12  # of the head's box, for hair
 
@@ -43,7 +41,3 @@ def placed(result: Path) -> RigidTransform:
         return RigidTransform(np.eye(3), np.zeros(3))
     shift = np.array(place["translation"]) * place["scale"]
     return RigidTransform(np.array(place["rotation"]), shift).inverse()
-
-
-def write_portrait(result: Path, target: Path) -> None:
-    write_image(target, portrait(result), quality=QUALITY)
