@@ -44,7 +44,7 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
                 try:  # the folder of a job that is erased meanwhile is not made anew: the face would stay
                     write_image(kept, DRAWN[name](result), quality=QUALITY, parents=False)
                 except FileNotFoundError as error:
-                    raise NotFound("head of the job", job_id) from error
+                    raise NotFound("job", job_id) from error
     return kept
 
 
