@@ -48,8 +48,9 @@ def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[Char
     found = {name: chart_correction(own) for name, own in charts.items() if own}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:
-        why = "no clean plate shows a colour chart of 24 patches that is large enough, sharp and not overexposed"
-        return None, [ReportWarning("no-chart", f"{why}: colours are the cameras' own")]
+        why = "no clean plate shows a ColorChecker Classic that can be read, so that colours are the cameras' own"
+        what = "put a picture with the chart, nearer, sharper or turned out of a lamp's reflection, into"
+        return None, [ReportWarning("no-chart", f"{why}: {what} background/<camera>/")]
     normals = [chart_normal(chart, rig[name]) for name in cameras for chart in charts[name]]
     mean = np.mean(normals, axis=0)
     return ChartColours(cameras, mean / np.linalg.norm(mean)), []

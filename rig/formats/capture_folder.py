@@ -275,8 +275,7 @@ def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
 
 def _plate_files(folder: Path, stem: str, faults: list[str]) -> list[Path]:
     single = _image_file(folder, stem, faults)
-    several = listed_pictures(folder / stem)[:PLATES_MOST]
-    return [single] if single is not None else several
+    return [*([single] if single is not None else []), *listed_pictures(folder / stem)][:PLATES_MOST]
 
 
 def listed_pictures(folder: Path) -> list[Path]:

@@ -162,7 +162,8 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
         )
         ((count,),) = _rows(connection, alive)
         ((keys,),) = _rows(connection, "SELECT count(*) FROM eigenhead_api_keys")
-    return True, f"{settings.place}, {count} workers alive, {keys} API keys"
+    workers = f"{count} worker{'s' * (count != 1)} seen in the last {settings.silent_s:.0f} s"
+    return True, f"{settings.place}, {workers}, {keys} API key{'s' * (keys != 1)}"
 
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:

@@ -180,6 +180,17 @@ def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str
     assert words in caught.value.faults[0]
 
 
+def test_a_plate_and_a_folder_of_plates_go_together(folder: Path) -> None:
+    """A picture with a colour chart is put beside the plate that is there already."""
+    name = read_capture(folder)[1].names[0]
+    single = next(path for path in (folder / "background").iterdir() if path.stem == name)
+    (folder / "background" / name).mkdir()
+    write_image(folder / "background" / name / "chart.png", 255 - read_image(single))
+    plates = read_capture(folder)[0].backgrounds[name]
+    assert len(plates) == 2
+    np.testing.assert_array_equal(plates[0], 255 - plates[1])
+
+
 def test_names_may_differ_in_case_and_a_camera_may_be_called_as_its_picture(folder: Path) -> None:
     (folder / "images" / "a.png").rename(folder / "images" / "A.PNG")
     (folder / "background" / "a.png").rename(folder / "background" / "A.png")

@@ -35,7 +35,7 @@ def test_it_reads_a_database_without_touching_the_folder(examine: Callable[..., 
     Keys(engine).add("console", ("read",))
     engine.dispose()
     before = sorted(tmp_path.iterdir())
-    assert f"{tmp_path}, 0 workers alive, 1 API keys" in examine(data=tmp_path)["database"]["detail"]
+    assert f"{tmp_path}, 0 workers seen in the last 15 s, 1 API key" in examine(data=tmp_path)["database"]["detail"]
     assert sorted(tmp_path.iterdir()) == before
     (tmp_path / "eigenhead.sqlite").write_bytes(b"no database" * 1000)
     assert not examine(data=tmp_path)["database"]["ok"]
