@@ -89,7 +89,7 @@ def reconstruct(
     delight: Annotated[
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
     ] = False,
-    chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in the clean plates.")] = False,
+    chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,
     obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
     atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     normal_map: Annotated[

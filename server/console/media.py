@@ -14,7 +14,7 @@ from fastapi import Depends, Request, Response
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from nicegui import app as pages
 
-from rig.errors import EigenheadError
+from rig.errors import EigenheadError, InputError
 from rig.formats.images import open_picture, read_image, write_image
 from server.console import comparison
 from server.console.head_pictures import head_picture, result_folder
@@ -156,8 +156,11 @@ def portrait(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/first-view.jpg")
 def first_view(who: Reader, job_id: str) -> Response:
-    """The head as the page Result shows it first."""
-    return FileResponse(head_picture(who[0], job_id, "first-view.jpg"), headers=FOREVER)
+    """The head as the page Result shows it first; nothing of a head.ply that is not ours: the page does without."""
+    try:
+        return FileResponse(head_picture(who[0], job_id, "first-view.jpg"), headers=FOREVER)
+    except InputError:
+        return Response(status_code=204)
 
 
 @pages.get("/console/jobs/{job_id}/cameras")

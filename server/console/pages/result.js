@@ -37,7 +37,7 @@ export default spoken({
   mixins: [besideIt, exports3d, views3d],
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", drawn: false, digits: 1 }),
+  data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], camerasKnown: false, strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", drawn: false, digits: 1 }),
   computed: {
     job() { return this.state.job; },
     surfaces() { return SURFACES.filter(([name]) => this.job?.files[`${name}.glb`]); },
@@ -79,7 +79,7 @@ export default spoken({
           <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">{{ say('median {median} mm, 95 % below {p95} mm', { median: fixed(scale.median, 2), p95: fixed(scale.p95, 2) }) }}</span></p>
           <template v-if="split"><p class="small cut" id="left-head" style="position: absolute; left: .9rem; top: 3.4rem; max-width: 45%">{{ headName(job) }}</p><p class="small cut" id="right-head" style="position: absolute; left: 50%; top: 3.4rem; max-width: 45%">{{ headName(others.find(r => r.id === mateId) || job) }}</p></template>
           <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts"><li v-for="[name, colour] in parts" :key="name"><i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ say(name) }}</li></ul>
-          <div v-if="job && loaded && !through" class="views" role="group" aria-label="Views"><button v-for="[name, title] in sides" :key="name" class="b small" :data-side="name" :aria-pressed="side === name" @click="lookFrom(name)">{{ say(title) }}</button><button v-if="canFill" class="b small" id="full" :aria-pressed="full" @click="fill">Full screen <kbd>F</kbd></button></div>
+          <div v-if="surfaces.length && !through" class="views" role="group" aria-label="Views"><button v-for="[name, title] in sides" :key="name" class="b small" :data-side="name" :aria-pressed="side === name" @click="lookFrom(name)">{{ say(title) }}</button><button v-if="canFill" class="b small" id="full" :aria-pressed="full" @click="fill">Full screen <kbd>F</kbd></button></div>
           <p v-if="measuring" id="measured" class="told" role="status">{{ points.length === 0 ? say('Click the first point') : points.length === 1 ? say('Click the second point') : '' }}<strong v-if="distance" class="mono">{{ say('{distance} mm, straight', { distance: fixed(distance, 1) }) }}</strong></p>
           <p v-if="loading || fault" :class="['small', { fault }]" style="position: absolute; right: .9rem; bottom: 3.4rem" role="status">{{ say(fault || 'Loading ...') }}</p>
           <span v-for="(pin, i) in pins" :key="i" class="pin small mono" :style="{ left: pin.x + 'px', top: pin.y + 'px', visibility: pin.shown ? 'visible' : 'hidden' }">{{ i ? 'B' : 'A' }}</span>
@@ -90,14 +90,14 @@ export default spoken({
             <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? headName(r) : say('ANOTHER PERSON? {head}', { head: headName(r) }) }}</option></select></label>
               <label v-if="other && other !== 'truth'" class="check small"><input type="checkbox" v-model="beside" id="beside">side by side, turned together</label>
               <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">{{ say('offer {count} head of other subjects, too | offer {count} heads of other subjects, too', { count: elsewhere }) }}</label>
-              <label v-if="cameras.length" class="field">Look through<select v-model="through" id="through"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
+              <label v-if="cameras.length || !camerasKnown" class="field">Look through<select v-model="through" id="through" :disabled="!cameras.length"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
               <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
             <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="fileName + '.zip'">All files (.zip)</a></div>
             <div class="line wrap"><button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours" @click="savePicture">Picture (PNG)</button><template v-if="video"><button class="b" id="turntable" :disabled="!!through || loading" :title="say(through ? 'Not through a camera' : 'One turn, as the view shows the head')" @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? say('Turntable (video)') : say('Stop, {share} %', { share: Math.round(100 * turning) }) }}</button><select v-model.number="turnS" aria-label="Seconds of the turn"><option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option></select></template></div>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
             <h2 class="third">Measurements, mm</h2>
-            <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">&plusmn;</th><th class="num">other</th><th class="num">difference</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ say(m.name.replaceAll('_', ' ')) }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>
+            <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">other</th><th class="num" title="this less other">&Delta;</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ say(m.name.replaceAll('_', ' ')) }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td v-if="!theirs" class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>
             <h2 class="third">Fit</h2>
             <table class="small"><tbody><tr><td title="Of cameras in which hair and clothes hide less than a quarter of the head's rim">{{ say('contour residual, {count} clear view | contour residual, {count} clear views', { count: job.clear_views }) }}</td><td class="num">{{ fixed(job.contour_px, 2) }} px</td></tr><tr><td>standard deviation, median</td><td class="num">{{ fixed(job.quality.median, 2) }} mm</td></tr><tr><td>model</td><td class="num">{{ job.model_name }}</td></tr><tr><td>solver</td><td class="num">{{ say(job.method) }}</td></tr><tr><td>level of detail</td><td class="num">{{ say(job.level) }}</td></tr><tr><td>time</td><td class="num">{{ span(job.seconds) }}</td></tr></tbody></table>
             <a class="small" href="/jobs">Residuals and overlays are with the job</a>
@@ -152,9 +152,10 @@ export default spoken({
       this.draw();
     },
     async readCameras(id) {
-      this.cameras = []; this.through = "";
+      this.cameras = []; this.camerasKnown = false; this.through = "";
       const answer = await fetch(`/console/jobs/${id}/cameras`);
       if (answer.ok && id === this.job?.id) this.cameras = await answer.json();
+      this.camerasKnown = true;
     },
     same(r) { return r.capture_id === this.job?.capture_id || (!!r.session && r.session === this.job?.session) || (!!r.subject && r.subject === this.job?.subject); },
     headName(r) {
@@ -266,7 +267,7 @@ export default spoken({
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", this.heat(values, this.repeated, most));
       this.digits = most < 1 ? 2 : 1;
-      this.scale = { title, most, p95, beyond: p95 > most, median: stop(values, 0.5) };
+      this.scale = { title, most, p95, beyond: stop(values, 1) > most, median: stop(values, 0.5) };
     },
     press(event) { this.pressed = [event.clientX, event.clientY]; },
     pick(event) {

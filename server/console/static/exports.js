@@ -1,8 +1,10 @@
 // What the 3D view shows as a picture, and a whole turn of it as a video, with the legend of colours that stand for
 // numbers. A page that mixes it in has renderOnce(), camera, controls, renderer, scale, gradientStops, job and fileName.
+import { say } from "/console/static/language.js";
 import { fixed } from "/console/static/words.js";
 
 const FRAMES_A_SECOND = 30;
+const FEW_A_SECOND = 8; // pictures: fewer are no smooth turn
 const LAST_MS = 120; // until the last picture has reached the recorder
 const BITS_A_SECOND = 12e6;
 const GROUND = "#101318";
@@ -51,17 +53,19 @@ export const exports3d = {
       const stopped = new Promise((done) => { recorder.onstop = done; });
       this.turning = 0; this.controls.enabled = false; recorder.start();
       const began = performance.now();
+      let pictures = 0;
       const step = (now) => {
         if (this.turning === null) return recorder.stop(); // somebody stopped it
         this.turning = Math.min(1, Math.max(0, now - began) / 1000 / this.turnS);
         this.camera.position.copy(offset).applyAxisAngle(axis, 2 * Math.PI * this.turning).add(this.controls.target); this.camera.lookAt(this.controls.target);
-        this.compose(paper, GROUND);
+        this.compose(paper, GROUND); pictures += 1;
         if (this.turning < 1) requestAnimationFrame(step); else setTimeout(() => recorder.stop(), LAST_MS);
       };
       requestAnimationFrame(step);
       await stopped;
       stream.getTracks().forEach((track) => track.stop());
       const whole = this.turning === 1;
+      if (whole && pictures < FEW_A_SECOND * this.turnS) this.fault = say("This machine draws slowly: the turn has {count} pictures.", { count: pictures });
       this.turning = null; this.controls.enabled = true;
       this.camera.position.copy(start); this.controls.update(); this.draw();
       if (whole) save(new Blob(parts, { type: this.video }), `${this.fileName}.${this.video.includes("mp4") ? "mp4" : "webm"}`);

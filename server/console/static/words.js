@@ -2,8 +2,9 @@
 import { decimal, locale, say } from "/console/static/language.js";
 
 export function typing(event) {
-  const target = event.target;
-  return target.isContentEditable || /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName) || event.ctrlKey || event.metaKey || event.altKey;
+  const target = event.target, ticked = /^(checkbox|radio)$/.test(target.type); // which take the space bar alone
+  const taken = ticked ? event.key === " " : /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName);
+  return target.isContentEditable || taken || event.ctrlKey || event.metaKey || event.altKey;
 }
 
 export function clock(moment) {
