@@ -83,7 +83,8 @@ def read_rig_file(path: Path) -> Rig:
         return read_xmp(path.parent)
     readers = {".toml": read_toml, ".xml": read_metashape, ".csv": read_csv, ".yml": read_yaml, ".yaml": read_yaml}
     if path.suffix not in readers:
-        raise InputError(path.name, [f"is no rig's file; known are those of {', '.join(FORMATS[:-1])}"])
+        told = f"is no rig's file by its name's ending (.json, {', '.join(readers)}, .txt, .bin, .xmp)"
+        raise InputError(path.name, [f"{told}; known are those of {', '.join(FORMATS[:-1])}"])
     return readers[path.suffix](path)
 
 

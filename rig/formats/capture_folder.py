@@ -14,7 +14,7 @@ be called whose EXIF has the serial number of a camera (``rig.formats.serials``)
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from difflib import SequenceMatcher
@@ -126,6 +126,8 @@ def read_shot(
     """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``. ``filed``:
     files that do not have their camera's name, as ``by_other_names`` finds them."""
     jobs: list[tuple[str, str, Path]] = []
+    pictureless: list[str] = []
+    plateless: list[str] = []
     pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
     for camera in rig:
         image = _image_file(pictures, camera.name, faults) or _only_picture(pictures / camera.name, faults)
@@ -134,13 +136,19 @@ def read_shot(
         plates = _plate_files(folder / "background", camera.name, faults)
         plates = plates or [path for name, path in filed.get("background", {}).items() if name == camera.name]
         if image is None:
-            faults.append(f"{_inside(folder, pictures)}{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)")
+            pictureless.append(
+                f"{_inside(folder, pictures)}{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)"
+            )
         if not plates and mask is None and not alone:
-            faults.append(
+            plateless.append(
                 f"background/{camera.name}.png is missing: a clean plate, or masks/{camera.name}.png, is needed"
             )
         found = [("images", image), ("masks", mask), *(("background", plate) for plate in plates)]
         jobs += [(kind, camera.name, path) for kind, path in found if path is not None]
+    for lacking, place in ((pictureless, pictures), (plateless, folder / "background")):
+        strangers = [path.name for path in listed_pictures(place)] if len(lacking) == len(rig) > 1 else []
+        alike = len(strangers) < max(len(lacking), 2)
+        faults += lacking if alike else [_no_name_alike(rig, _inside(folder, place), strangers)]
     with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
         decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig, pixels_most=pixels_most), jobs))
     images: dict[str, np.ndarray] = {}
@@ -165,6 +173,13 @@ def read_shot(
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
         features = work_features(features, rig, work_rig(rig, pixels_most))
     return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
+
+
+def _no_name_alike(rig: Rig, place: str, strangers: Sequence[str]) -> str:
+    """One cause, said once."""
+    cameras, found = f"{rig.names[0]} to {rig.names[-1]}", f"{strangers[0]} to {strangers[-1]}"
+    where = place or "the folder"
+    return f"no camera has a picture in {where}: the cameras are called {cameras}, the pictures {found}; rename either"
 
 
 def picture_folder(folder: Path) -> Path:

@@ -180,6 +180,18 @@ def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str
     assert words in caught.value.faults[0]
 
 
+def test_names_that_are_all_others_are_one_fault(folder: Path) -> None:
+    names = read_capture(folder)[1].names
+    for number, path in enumerate(sorted((folder / "images").iterdir())):
+        path.rename(path.with_name(f"IMG_{number:04}{path.suffix}"))
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    (fault,) = caught.value.faults
+    assert fault.startswith("no camera has a picture in images/: ")
+    assert f"{names[0]} to {names[-1]}" in fault
+    assert "IMG_0000.png to IMG_" in fault
+
+
 def test_a_plate_and_a_folder_of_plates_go_together(folder: Path) -> None:
     """A picture with a colour chart is put beside the plate that is there already."""
     name = read_capture(folder)[1].names[0]
