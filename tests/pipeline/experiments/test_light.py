@@ -24,6 +24,7 @@ def test_levelled_images_differ_by_no_overall_colour() -> None:
 
 @pytest.mark.slow
 @pytest.mark.gl
+@pytest.mark.timeout(1200)  # eight whole jobs, beside another test
 def test_albedos_of_three_lights_differ_by_at_most_half(tmp_path: Path) -> None:
     with Renderer.create() as renderer:
         found = light(load_model(), renderer=renderer, report=lambda stage, share: None, folder=tmp_path)
