@@ -13,7 +13,7 @@ Plate = UInt8[np.ndarray, "h w 3"]
 
 CELLS = (64, 48)  # of a plate, compared
 DIFFERENT = 24.0  # levels, mean of a cell: black, white and coloured patches differ by more, light that drifts by less
-LEAST_CELLS = 4  # a chart of 50 px in a thousand has 7
+LEAST_CELLS = 4  # a chart of 50 px in a thousand has 6
 
 
 def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:

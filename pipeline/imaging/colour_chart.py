@@ -16,11 +16,11 @@ from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
 
 ROWS, COLUMNS = 4, 6
-WIDTHS_PX = (1024, 2048)  # of the picture, as it is searched: finds charts of 90 px and more there, then of 50 to 70
+WIDTHS_PX = (1024, 2048)  # of the picture, as it is searched: finds charts of 90 px and more there, then smaller ones
 INNER = 0.5  # of a patch's sides: its rim is blurred, and its frame black
 CLIPPED = 0.97  # linear: what a sensor no longer tells
 LEAST_PATCHES = 18  # that are not clipped, for nine numbers
-MOST_OFF = 0.06  # rms of what the correction leaves of the patches: colours that are no chart's leave 0.1 and more
+MOST_OFF = 0.06  # rms of what the correction leaves of the patches: its own colours in another order leave 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

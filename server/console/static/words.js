@@ -2,7 +2,7 @@
 import { decimal, locale, say } from "/console/static/language.js";
 
 export function typing(event) {
-  const target = event.target, ticked = /^(checkbox|radio)$/.test(target.type); // which take the space bar alone
+  const target = event.target, ticked = target.type === "checkbox"; // which takes the space bar alone
   const taken = ticked ? event.key === " " : /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName);
   return target.isContentEditable || taken || event.ctrlKey || event.metaKey || event.altKey;
 }

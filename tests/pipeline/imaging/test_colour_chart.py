@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.imaging import colour_chart
 from pipeline.imaging.colour_chart import Chart, chart_correction, chart_normal, find_chart, true_colours
 from rig.camera import Camera, Intrinsics
 from rig.colour_space import srgb_from_linear
@@ -59,10 +60,13 @@ def test_pictures_without_a_chart_have_none() -> None:
         assert find_chart(picture.astype(np.uint8)) is None
 
 
-def test_a_chart_of_other_colours_is_none() -> None:
-    """Two channels exchanged: a matrix could take it back, but it would be no camera's."""
-    mixed = np.random.default_rng(3).permutation(true_colours())
-    assert chart_correction([Chart(np.zeros((24, 2)), mixed)]) is None
+def test_a_chart_of_other_colours_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The patches in any other order are far from what a matrix takes back."""
+    mixed = [np.random.default_rng(seed).permutation(true_colours()) for seed in range(20)]
+    charts = [Chart(np.zeros((24, 2)), colours) for colours in mixed]
+    assert all(chart_correction([chart]) is None for chart in charts)
+    monkeypatch.setattr(colour_chart, "MOST_OFF", 1.0)
+    assert min(found.off for found in map(chart_correction, [[chart] for chart in charts]) if found) > 0.2
 
 
 def test_an_overexposed_chart_tells_nothing() -> None:
