@@ -79,9 +79,11 @@ export default spoken({
           <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">{{ say('median {median} mm, 95 % below {p95} mm', { median: fixed(scale.median, 2), p95: fixed(scale.p95, 2) }) }}</span></p>
           <template v-if="split"><p class="small cut" id="left-head" style="position: absolute; left: .9rem; top: 3.4rem; max-width: 45%">{{ headName(job) }}</p><p class="small cut" id="right-head" style="position: absolute; left: 50%; top: 3.4rem; max-width: 45%">{{ headName(others.find(r => r.id === mateId) || job) }}</p></template>
           <ul v-if="colouring === 'parts' && surface === 'bust' && !other" class="legend small" aria-label="Parts"><li v-for="[name, colour] in parts" :key="name"><i :style="{ background: 'rgb(' + colour.map(v => Math.round(255 * v)) + ')' }"></i>{{ say(name) }}</li></ul>
-          <div v-if="surfaces.length && !through" class="views" role="group" aria-label="Views"><button v-for="[name, title] in sides" :key="name" class="b small" :data-side="name" :aria-pressed="side === name" @click="lookFrom(name)">{{ say(title) }}</button><button v-if="canFill" class="b small" id="full" :aria-pressed="full" @click="fill">Full screen <kbd>F</kbd></button></div>
-          <p v-if="measuring" id="measured" class="told" role="status">{{ points.length === 0 ? say('Click the first point') : points.length === 1 ? say('Click the second point') : '' }}<strong v-if="distance" class="mono">{{ say('{distance} mm, straight', { distance: fixed(distance, 1) }) }}</strong></p>
-          <p v-if="loading || fault" :class="['small', { fault }]" style="position: absolute; right: .9rem; bottom: 3.4rem" role="status">{{ say(fault || 'Loading ...') }}</p>
+          <div class="below">
+            <p v-if="loading || fault" :class="['told', 'small', { fault }]" role="status">{{ say(fault || 'Loading ...') }}</p>
+            <p v-if="measuring" id="measured" class="told" role="status">{{ points.length === 0 ? say('Click the first point') : points.length === 1 ? say('Click the second point') : '' }}<strong v-if="distance" class="mono">{{ say('{distance} mm, straight', { distance: fixed(distance, 1) }) }}</strong></p>
+            <div v-if="surfaces.length && !through" class="views" role="group" aria-label="Views"><button v-for="[name, title] in sides" :key="name" class="b small" :data-side="name" :aria-pressed="side === name" @click="lookFrom(name)">{{ say(title) }}</button><button v-if="canFill" class="b small" id="full" :aria-pressed="full" @click="fill">Full screen <kbd>F</kbd></button></div>
+          </div>
           <span v-for="(pin, i) in pins" :key="i" class="pin small mono" :style="{ left: pin.x + 'px', top: pin.y + 'px', visibility: pin.shown ? 'visible' : 'hidden' }">{{ i ? 'B' : 'A' }}</span>
         </div>
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="About the head">
