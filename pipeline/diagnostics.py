@@ -10,6 +10,7 @@ WARNING_CODES = (
     "contour-implausible",
     "eyes-closed",
     "features",
+    "file-unread",
     "mask-contradicted",
     "mask-doubtful",
     "mask-loose",

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from types import MappingProxyType
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -14,6 +14,13 @@ Filed = TypeVar("Filed")
 
 
 Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
+
+
+class Remark(NamedTuple):
+    """What a reader noticed and did not mind: one of the codes of a result's warnings, and a sentence."""
+
+    code: str
+    message: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +33,7 @@ class Capture:
     masks: Mapping[str, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
     features: Features = field(default_factory=dict)
     digests: Mapping[str, str] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
 
 def refiled(

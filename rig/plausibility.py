@@ -84,7 +84,8 @@ def _spread_faults(rig: Rig) -> list[str]:
     if spread < LEAST_SPREAD_MM:
         return [
             f"the cameras stand within {spread:.3g} mm of each other: their translations look like metres, "
-            "and millimetres are wanted; multiply them by 1000"
+            "and millimetres are wanted; multiply them by 1000, or, of a scene without a scale, by what a known length "
+            "in it tells"
         ]
     frame = frame_mm(rig)
     unit = next((unit for unit in UNITS if frame * unit >= FRAME_LEAST_MM), None)

@@ -67,7 +67,7 @@ def usable_views(
     if sum(silhouette.quality.usable for silhouette in own.silhouettes.values()) < VIEWS_LEAST:
         raise TooFewViews(own.silhouettes)
     silhouettes, moved = without_moved_cameras(own.silhouettes, rig)
-    remarks = [ReportWarning("unknown-key", remark) for remark in capture.remarks]
+    remarks = [ReportWarning(remark.code, remark.message) for remark in capture.remarks]
     warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *remarks)
     return UsableViews(own.capture, silhouettes, own.pictures, warnings)
 

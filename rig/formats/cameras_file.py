@@ -9,7 +9,7 @@ nerfstudio (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and Real
 scale is free and taken as millimetres; aniposelib's, nerfstudio's and OpenCV's are told by the size of the rig.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rig.errors import InputError
@@ -43,32 +43,51 @@ NO_RIG = (
     "OpenCV)"
 )
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
+HEAD_BYTES = 1 << 16  # of an XMP file that other programs wrote to, the names of their formats come first
 
 
 def find_rig_file(folder: Path) -> Path | None:
-    """The file in ``folder`` that holds the rig, for ``read_rig_file``; None if there is none.
+    """The file in ``folder`` that holds the rig, for ``read_rig_file``; None if there is none."""
+    return next(rig_files(folder), None)
+
+
+def rig_files(folder: Path) -> Iterator[Path]:
+    """The files in ``folder`` that may hold the rig, one a program; the first is the one that is read.
 
     In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
     ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
     any other YAML file of OpenCV's with a ``K_<camera>``; an XML file of Metashape's; RealityCapture's XMP files,
     beside the pictures or at the top, or its CSV.
     """
-    if (folder / "cameras.json").is_file():
-        return folder / "cameras.json"
-    for inner in COLMAP_FOLDERS:
-        for suffix in (".bin", ".txt"):
-            path = folder / inner / f"cameras{suffix}"
-            if path.is_file():
-                return path
-    if (folder / "camera_array.toml").is_file():
-        return folder / "camera_array.toml"
-    aniposelib = (path for path in sorted(folder.glob("*.toml")) if looks_like_aniposelib(path))
-    named = (folder / name for name in ("transforms.json", "intri.yml") if (folder / name).is_file())
-    opencv = (path for path in sorted([*folder.glob("*.yml"), *folder.glob("*.yaml")]) if b"\nK_" in _head(path))
+    names = ("cameras.json", *(f"{inner}/cameras{end}" for inner in COLMAP_FOLDERS for end in (".bin", ".txt")))
+    own, *colmap = (folder / name for name in names)
+    caliscope, nerfstudio, easymocap = (folder / n for n in ("camera_array.toml", "transforms.json", "intri.yml"))
+    aniposelib = (path for path in sorted(folder.glob("*.toml")) if path != caliscope and looks_like_aniposelib(path))
+    yaml = sorted({*folder.glob("*.yml"), *folder.glob("*.yaml")} - {easymocap})
+    opencv = (path for path in yaml if b"\nK_" in _head(path))
     metashape = (path for path in sorted(folder.glob("*.xml")) if b"<chunk" in _head(path))
-    sidecars = (path for place in ("images", ".") for path in sorted((folder / place).glob("*.xmp")))
+    sidecars = (
+        path
+        for place in ("images", ".")
+        for path in sorted((folder / place).glob("*.xmp"))
+        if b"capturingreality" in _head(path)
+    )
     tables = (path for path in sorted(folder.glob("*.csv")) if _head(path).startswith(",".join(COLUMNS[:8]).encode()))
-    return next((path for found in (aniposelib, named, opencv, metashape, sidecars, tables) for path in found), None)
+    for found in (
+        [own],
+        colmap,
+        [caliscope],
+        aniposelib,
+        [nerfstudio],
+        [easymocap],
+        opencv,
+        metashape,
+        sidecars,
+        tables,
+    ):
+        first = next((path for path in found if path.is_file()), None)
+        if first is not None:
+            yield first
 
 
 def read_rig_file(path: Path) -> Rig:
@@ -108,6 +127,6 @@ def _head(path: Path) -> bytes:
     """The first bytes of a file that may be one of ours; none where it cannot be read."""
     try:
         with path.open("rb") as file:
-            return file.read(4096).removeprefix(b"\xef\xbb\xbf")
+            return file.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
     except OSError:
         return b""

@@ -25,9 +25,9 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
-from rig.capture import Capture, Features
+from rig.capture import Capture, Features, Remark
 from rig.errors import InputError
-from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
+from rig.formats.cameras_file import NO_RIG, read_rig_file, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import decode_image_file, is_picture, picture_size, write_image
@@ -48,9 +48,10 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     that names every fault in it."""
     faults: list[str] = []
     folder = capture_root(folder)
-    rig_file = find_rig_file(folder)
-    if rig_file is None:
+    rigs = [*rig_files(folder)]
+    if not rigs:
         raise InputError(folder.name, [NO_RIG])
+    rig_file = rigs[0]
     try:
         rig = read_rig_file(rig_file)
     except InputError as error:
@@ -64,7 +65,21 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
-    return replace(capture, digests=ordered, remarks=unread_keys(rig_file)), work_rig(rig, pixels_most)
+    remarks = [Remark("unknown-key", told) for told in unread_keys(rig_file)]
+    remarks += _unread_files(folder, rigs)
+    return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
+
+
+def _unread_files(folder: Path, rigs: Sequence[Path]) -> list[Remark]:
+    """Cameras of another program, and a length for cameras that are known: files that do nothing here."""
+    read, *others = (path.relative_to(folder).as_posix() for path in rigs)
+    told = [f"{other} is not read: the cameras come from {read}" for other in others]
+    if (folder / "scale.json").is_file() and not (folder / "calibration.json").is_file():  # whose cameras it scaled
+        told.append(
+            f"scale.json is not read: the cameras of {read} are taken as millimetres; without that file the cameras "
+            "are found from the photographs, and scaled"
+        )
+    return [Remark("file-unread", message) for message in told]
 
 
 def capture_root(folder: Path) -> Path:

@@ -152,6 +152,7 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[
     from pipeline.settings import OutputSettings
     from pipeline.silhouettes.segment import segment
     from pipeline.silhouettes.usable_views import usable_views
+    from pipeline.texture.chart_colours import chart_colours
 
     shot, rig = read_capture(folder, pixels_most=WORK_PIXELS)
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
@@ -160,7 +161,8 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[
         return segment(capture, rig, chosen.segmentation, report=report)
 
     views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures)
-    return [Warned(code=warning.code, message=warning.message) for warning in views.warnings]
+    warnings = [*views.warnings, *(chart_colours(shot, rig)[1] if chosen.texture.chart else ())]
+    return [Warned(code=warning.code, message=warning.message) for warning in warnings]
 
 
 def lines(found: Checked) -> list[str]:

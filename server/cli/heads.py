@@ -134,6 +134,7 @@ def reconstruct(
 def check(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
+    chart: Annotated[bool, typer.Option("--chart", help="Look for the colour chart in the clean plates.")] = False,
     json_out: Json = False,
 ) -> None:
     """Say what is wrong with a capture, without a fit.
@@ -143,7 +144,8 @@ def check(
     from server.cli.reconstruct_local import settings_document
 
     with progress_bar() as report:
-        found = checked(capture, settings_document(settings), report=report)
+        document = settings_document(settings, texture={"chart": True} if chart else None)
+        found = checked(capture, document, report=report)
     answer(found, json_out, lines(found))
     if found["faults"]:
         raise typer.Exit(2)

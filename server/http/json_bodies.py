@@ -47,7 +47,11 @@ class JsonBodies:
         return next((route for route in self._routes if route.matches(scope)[0] is Match.FULL), None)
 
     async def _read(self, request: Request) -> list[Message]:
-        """The messages of the body, to its end or to where the client went away. Raises a 413 problem."""
+        """The messages of the body, to its end or to where the client went away. Raises a 413 problem, and 415 for a
+        form, which is an archive at the wrong address."""
+        if request.headers.get("content-type", "").casefold().startswith("multipart/"):
+            detail = "Send application/json here; an archive goes to POST /v1/captures/uploads."
+            raise Problem(415, "unsupported-media-type", detail)
         announced = request.headers.get("content-length", "")
         self._check(int(announced) if announced.isascii() and announced.isdigit() else 0)
         messages: list[Message] = []

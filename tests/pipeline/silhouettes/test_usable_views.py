@@ -8,7 +8,7 @@ import pytest
 from pipeline.eigenheads.model import load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.silhouettes.usable_views import TooFewViews, UsableViews, usable_views
-from rig.capture import Capture
+from rig.capture import Capture, Remark
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -34,7 +34,7 @@ def judged(rig: Rig, silhouettes: dict[str, Silhouette], capture: Capture | None
 
 def test_good_views_all_take_part_and_remarks_of_the_reader_are_passed_on(seen: Seen) -> None:
     rig, silhouettes = seen
-    found = judged(rig, silhouettes, Capture({}, remarks=("the key x is not read",)))
+    found = judged(rig, silhouettes, Capture({}, remarks=(Remark("unknown-key", "the key x is not read"),)))
     assert all(silhouette.quality.usable for silhouette in found.silhouettes.values())
     assert [(warning.code, warning.message) for warning in found.warnings] == [("unknown-key", "the key x is not read")]
 

@@ -11,6 +11,7 @@ from pipeline.eigenheads.model import load_model
 from rig.capture import Capture, refiled
 from rig.errors import WrongVariable
 from rig.formats.archive import pack_folder
+from rig.formats.cameras_file import write_rig_file
 from rig.formats.capture_folder import write_capture
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -88,6 +89,33 @@ def test_a_key_that_nobody_reads_is_a_warning(masked: tuple[Capture, Rig], tmp_p
     found = found_in(tmp_path / "shot")
     assert [warning["code"] for warning in found["warnings"]] == ["unknown-key"]
     assert "warning  unknown-key: cameras.json: the key 'units' is not read" in "\n".join(lines(found))
+
+
+@pytest.mark.gl
+def test_cameras_and_a_scale_that_nobody_reads_are_warnings(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
+    capture, rig = masked
+    folder = tmp_path / "shot"
+    write_capture(folder, capture, rig)
+    write_rig_file(rig, folder / "transforms.json", "nerfstudio")
+    write_rig_file(rig, folder / "sparse" / "0", "colmap")
+    (folder / "scale.json").write_text('{"cameras": ["cam00", "cam01"], "distance_mm": 400.0}')
+    (folder / "images" / "cam00.xmp").write_text(
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"></x:xmpmeta>'
+    )  # a raw developer's
+    told = [(w["code"], w["message"].split(":")[0]) for w in found_in(folder)["warnings"]]
+    names = ("sparse/0/cameras.bin", "transforms.json", "scale.json")
+    assert told == [("file-unread", f"{name} is not read") for name in names]
+    (folder / "calibration.json").write_text("{}")  # which says that the scale was read, and found these cameras
+    assert len(found_in(folder)["warnings"]) == 2
+
+
+@pytest.mark.gl
+def test_a_chart_that_no_plate_shows_is_a_warning_where_one_is_wanted(
+    masked: tuple[Capture, Rig], tmp_path: Path
+) -> None:
+    write_capture(tmp_path / "shot", *masked)
+    assert not found_in(tmp_path / "shot")["warnings"]
+    assert [w["code"] for w in found_in(tmp_path / "shot", texture={"chart": True})["warnings"]] == ["no-chart"]
 
 
 def photographs(folder: Path) -> Path:

@@ -35,12 +35,20 @@ class Door:
     key: str
 
     def ask(
-        self, path: str, body: bytes, *, key: str | None = None, announced: int | None = None
+        self,
+        path: str,
+        body: bytes,
+        *,
+        key: str | None = None,
+        announced: int | None = None,
+        kind: str = "application/json",
     ) -> tuple[int, bytes, int]:
         """The status and body of the answer, and how many bytes were read for it. The client never goes away."""
-        return asyncio.run(self._ask(path, body, key, announced))
+        return asyncio.run(self._ask(path, body, key, announced, kind))
 
-    async def _ask(self, path: str, body: bytes, key: str | None, announced: int | None) -> tuple[int, bytes, int]:
+    async def _ask(
+        self, path: str, body: bytes, key: str | None, announced: int | None, kind: str
+    ) -> tuple[int, bytes, int]:
         pieces = [body[start : start + PIECE] for start in range(0, len(body), PIECE)] or [b""]
         sent: list[Message] = []
         read = 0
@@ -56,7 +64,7 @@ class Door:
         async def send(message: Message) -> None:
             sent.append(message)
 
-        headers = [(b"host", b"127.0.0.1"), (b"content-type", b"application/json")]
+        headers = [(b"host", b"127.0.0.1"), (b"content-type", kind.encode())]
         headers += [] if key is None else [(b"authorization", f"Bearer {key}".encode())]
         headers += [] if announced is None else [(b"content-length", str(announced).encode())]
         scope: dict[str, Any] = {"type": "http", "http_version": "1.1", "method": "POST", "path": path}
@@ -106,6 +114,15 @@ def test_no_more_is_read_than_a_json_body_may_have(door: Door, announced: int | 
     status, body, read = door.ask("/notes", note_of(100 * MOST), key=door.key, announced=announced)
     assert (status, json.loads(body)["type"]) == (413, "urn:eigenhead:problem:body-too-large")
     assert read <= read_most
+
+
+@pytest.mark.parametrize("kind", ["multipart/form-data; boundary=x", "Multipart/Mixed"])
+def test_a_form_is_told_where_archives_go_before_a_byte_is_read(door: Door, kind: str) -> None:
+    status, body, read = door.ask("/notes", bytes(100 * MOST), key=door.key, announced=100 * MOST, kind=kind)
+    assert (status, read) == (415, 0)
+    assert "POST /v1/captures/uploads" in json.loads(body)["detail"]
+    assert door.ask("/notes", bytes(100 * MOST), kind=kind)[0] == 401  # nobody is told nothing
+    assert door.ask("/streams", bytes(3 * PIECE), kind=kind)[0] == 200
 
 
 @pytest.mark.parametrize("length", [20, PIECE, MOST - 1, MOST])
