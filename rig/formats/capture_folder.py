@@ -287,12 +287,11 @@ def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> str:
 
 
 def stray_faults(folder: Path, rig: Rig) -> list[str]:
-    """Pictures, masks and clean plates that belong to no camera of the rig."""
+    """Pictures, masks and clean plates that belong to no camera of the rig, whose cameras the first names."""
     files = [path for kind in ("images", "masks", "background") for path in listed_pictures(folder / kind)]
+    strays = [path.relative_to(folder).as_posix() for path in files if path.stem not in rig]
     return [
-        f"{path.relative_to(folder).as_posix()} has no camera: the rig has {', '.join(rig.names)}"
-        for path in files
-        if path.stem not in rig
+        f"{name} has no camera{'' if i else ': the rig has ' + ', '.join(rig.names)}" for i, name in enumerate(strays)
     ]
 
 

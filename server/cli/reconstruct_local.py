@@ -32,7 +32,8 @@ def settings_document(path: Path | None, **given: str | Mapping[str, object] | N
     if path is not None:
         try:
             text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
-            document = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+            braced = path.suffix == ".json" or (path.suffix != ".toml" and text.lstrip().startswith("{"))
+            document = json.loads(text) if braced else tomllib.loads(text)
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(path.name, [f"cannot be read ({error})"]) from error
         if not isinstance(document, dict):

@@ -31,7 +31,10 @@ def serve(
 
     settings = service_settings(data=data, host=host, port=port, rig=rig, console=console)
     set_up(settings.log_json)
-    run_service(settings, worker=worker, ready=lambda url: print(f"eigenhead listens on {url}", file=sys.stderr))
+    known_as = f", and is known as {settings.public_url}" if settings.public_url else ""
+    run_service(
+        settings, worker=worker, ready=lambda url: print(f"eigenhead listens on {url}{known_as}", file=sys.stderr)
+    )
 
 
 @app.command(epilog="Example: EIGENHEAD_DATABASE_URL=postgresql://db/eigenhead eigenhead worker --data /mnt/heads")

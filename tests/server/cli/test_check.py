@@ -145,11 +145,16 @@ def test_a_picture_of_no_camera_is_a_warning_as_a_reconstruction_passes_it_over(
     masked: tuple[Capture, Rig], tmp_path: Path
 ) -> None:
     write_capture(tmp_path / "shot", *masked)
-    (tmp_path / "shot" / "images" / "foo.png").write_bytes(b"")
+    for name in ("foo.png", "goo.png"):
+        (tmp_path / "shot" / "images" / name).write_bytes(b"")
     found = found_in(tmp_path / "shot", front="cam03")
     assert (found["faults"], found["front"]) == ([], "cam03")
     assert [(w["code"], w["message"].split(":")[0]) for w in found["warnings"]] == [
-        ("picture-unread", "images/foo.png has no camera")
+        ("picture-unread", "images/foo.png has no camera"),
+        (
+            "picture-unread",
+            "images/goo.png has no camera; a reconstruction from here passes it over, the service refuses it",
+        ),
     ]
 
 

@@ -23,6 +23,15 @@ def test_a_file_that_holds_no_settings_is_named(tmp_path: Path, name: str, text:
         settings_document(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("settings", ' {"front": "cam01"}'), ("settings", 'front = "cam01"'), ("a.conf", '[outputs]\nsurface = "head"')],
+)
+def test_a_file_without_an_ending_is_told_by_what_it_holds(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    assert settings_document(tmp_path / name) in ({"front": "cam01"}, {"outputs": {"surface": "head"}})
+
+
 def test_options_add_to_the_tables_of_the_file(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('front = "cam00"\n[outputs]\nsurface = "head"\n')
     found = settings_document(tmp_path / "a.toml", front="cam01", outputs={"formats": ["ply"]}, detail=None)
