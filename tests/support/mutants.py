@@ -47,6 +47,8 @@ def copy_of_checkout(folder: Path, module: str, tests: list[str]) -> None:
         "pytest_add_cli_args_test_selection": tests,
         "pytest_add_cli_args": ["-p", "no:cacheprovider", "--hypothesis-profile", "mutants"],
         "also_copy": beside,
+        # A process that has drawn cannot be forked: its child would wait for OpenGL's threads for ever.
+        "process_isolation": "forkserver",
     }
     lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items())
     with (folder / "pyproject.toml").open("a", encoding="utf-8") as project:

@@ -62,6 +62,20 @@ def test_it_is_eq_5_of_numpy_and_an_independent_rasteriser(model: HeadModel, rig
     assert cost > 100.0
 
 
+def test_unweighted_it_counts_the_pixels_that_differ_as_eq_4(model: HeadModel, rig: Rig, renderer: Renderer) -> None:
+    rng = np.random.default_rng(1)
+    seen, z = views(model, rig, renderer, rng.standard_normal(10)), 0.5 * rng.standard_normal(10)
+    with SilhouetteObjective(
+        model, POSE, seen, rig, renderer=renderer, level="p99", scale=0.25, start=z, speaking="all", weighted=False
+    ) as objective:
+        cost = objective(z)
+    with renderer.silhouette_set(rig, model.levels["p99"].faces, 0.25) as drawn:
+        masks = drawn.masks(POSE.apply(model.vertices(z, "p99")))
+    wanted = {name: mask_at_scale(seen[name].distance, 0.25) for name in masks}
+    assert cost == sum(int((wanted[name] != mask).sum()) for name, mask in masks.items())
+    assert cost > 100.0
+
+
 def test_a_lid_over_the_neck_changes_no_pixel_that_may_speak(model: HeadModel, rig: Rig, renderer: Renderer) -> None:
     """The same cost as from every triangle of the open mesh, by an independent rasteriser; abs=3: see above."""
     rng = np.random.default_rng(2)
@@ -91,6 +105,30 @@ def test_a_lid_closes_holes_outside_the_face_alone(model: HeadModel) -> None:
     assert lidded(level.faces, np.ones(level.count, bool)) is level.faces
 
 
+def test_every_hole_gets_its_lid() -> None:
+    """A prism of five sides, open at both ends."""
+    low, high = np.arange(5), np.arange(5, 10)
+    after = np.roll(low, -1)
+    walls = np.concatenate([np.stack([low, after, high], 1), np.stack([after, after + 5, high], 1)])
+    shut = lidded(walls, np.zeros(10, bool))
+    assert is_closed(shut)
+    assert len(shut) == len(walls) + 2 * 3
+    assert shut.dtype == walls.dtype
+    only_above = np.arange(10) >= 5
+    assert lidded(walls, only_above) is walls
+
+
+def test_a_contour_through_pixels_centres_falls_as_a_chessboard() -> None:
+    rows, columns = np.mgrid[:6, :8]
+    np.testing.assert_array_equal(mask_at_scale(np.zeros((6, 8), np.float32), 1.0), (rows + columns) % 2 == 1)
+
+
+def test_a_larger_pixel_averages_all_that_it_covers() -> None:
+    distance = np.ones((8, 8), np.float32)
+    distance[0, 0] = -100.0
+    np.testing.assert_array_equal(mask_at_scale(distance, 0.25), [[True, False], [False, False]])
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.25])
 def test_a_smaller_mask_has_the_same_contour(scale: float) -> None:
     rng = np.random.default_rng(0)
@@ -118,6 +156,37 @@ def test_pixels_belong_to_the_nearest_stretch_of_the_outline() -> None:
     speaks = face_pixels(mask, pixels, region)
     assert speaks[10:50, :38].all()
     assert not speaks[10:50, 42:].any()
+
+
+def outlined(*vertices: tuple[float, float, bool]) -> np.ndarray:
+    """What may speak of a mask that reaches from the left edge of the picture to its right one."""
+    mask = np.zeros((60, 80), bool)
+    mask[10:50] = True
+    pixels = np.array([(column, row) for column, row, _ in vertices])
+    return face_pixels(mask, pixels, np.array([face for _, _, face in vertices]))
+
+
+def test_vertices_outside_the_picture_have_no_say_and_those_on_its_edge_have() -> None:
+    """The face is at the first column, and what lies beyond the picture would name the last one."""
+    beyond = [(-1.0, 10.0, True), (80.0, 10.0, True), (40.0, -1.0, True), (40.0, 60.0, True), (np.nan, np.nan, True)]
+    speaks = outlined((0.0, 10.0, True), (79.0, 10.0, False), *beyond)
+    assert speaks[:, :39].all()
+    assert not speaks[:, 41:].any()
+    mask = np.zeros((60, 80), bool)
+    mask[:, 20:] = True
+    assert face_pixels(mask, np.array([[20.0, 0.0]]), np.array([True])).all()
+
+
+def test_a_stretch_belongs_to_the_face_where_most_of_its_vertices_do() -> None:
+    face, other = (40.0, 10.0, True), (40.0, 10.0, False)
+    assert outlined(face, face, other).all()
+    assert not outlined(face, other).any()
+    assert not outlined(face, other, other).any()
+
+
+def test_nothing_speaks_where_no_vertex_is_near_the_outline() -> None:
+    speaks = outlined((40.0, 30.0, True))
+    assert (speaks.shape, speaks.dtype, speaks.any()) == ((60, 80), bool, False)
 
 
 def test_what_the_model_cannot_make_has_no_pull(model: HeadModel, rig: Rig, renderer: Renderer) -> None:
