@@ -48,6 +48,7 @@ def test_points_that_contradict_are_told_before_they_are_saved(
             page.keyboard.press("Shift+ArrowUp")
     first = page.locator("[data-point]").first
     expect(first).to_contain_text("contradicts")
+    page.wait_for_timeout(2000)  # the last of the keys may still be on its way, and a reload would lose it
     page.reload()
     expect(first).to_contain_text("2 views", timeout=30_000)  # not saved, and still there
     page.locator("#save").click()
