@@ -290,9 +290,8 @@ def stray_faults(folder: Path, rig: Rig) -> list[str]:
     """Pictures, masks and clean plates that belong to no camera of the rig, whose cameras the first names."""
     files = [path for kind in ("images", "masks", "background") for path in listed_pictures(folder / kind)]
     strays = [path.relative_to(folder).as_posix() for path in files if path.stem not in rig]
-    return [
-        f"{name} has no camera{'' if i else ': the rig has ' + ', '.join(rig.names)}" for i, name in enumerate(strays)
-    ]
+    told = [f"{name} has no camera" for name in strays]
+    return [f"{strays[0]} has no camera: the rig has {', '.join(rig.names)}", *told[1:]] if told else []
 
 
 def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
