@@ -41,14 +41,13 @@ def test_points_that_contradict_are_told_before_they_are_saved(
     capture = uploaded_capture(service, tmp_path)
     v = visit(browser, service.url)
     page = v.go(f"/features/{capture}")
-    for number, up in enumerate((0, 5)):
+    for number, up in enumerate((0, 3)):  # a reload may lose the last keys: 2, 4 and 6 px contradict, 8 px do not
         page.locator("svg[data-view]").nth(number).focus()
         page.keyboard.press("Enter")
         for _ in range(up):
             page.keyboard.press("Shift+ArrowUp")
     first = page.locator("[data-point]").first
     expect(first).to_contain_text("contradicts")
-    page.wait_for_timeout(2000)  # the last of the keys may still be on its way, and a reload would lose it
     page.reload()
     expect(first).to_contain_text("2 views", timeout=30_000)  # not saved, and still there
     page.locator("#save").click()
