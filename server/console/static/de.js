@@ -886,6 +886,8 @@ export default {
   "{1} is {2} x {3} pixels, but its camera is {4} x {5}": "{1} hat {2} x {3} Pixel, die Kamera aber {4} x {5}",
   "{1}: it was turned by 90 degrees; turn it back": "{1}: um 90 Grad gedreht; zurückdrehen",
   "{1}/ holds {2} pictures; a capture is one shot: leave one of them": "{1}/ enthält {2} Bilder; eine Aufnahme ist ein Augenblick: nur eines lassen",
+  "{1} is not read: the cameras come from {2}": "{1} wird nicht gelesen: Die Kameras kommen aus {2}",
+  "scale.json is not read: the cameras of {1} are taken as millimetres; without that file the cameras are found from the photographs, and scaled": "scale.json wird nicht gelesen: Die Kameras aus {1} gelten als Millimeter; ohne jene Datei werden die Kameras aus den Fotos gefunden und skaliert",
   "{1} has no camera": "{1} hat keine Kamera",
   "{1} has no camera: the rig has {2}": "{1} hat keine Kamera: Das Rig hat {2}",
   "{1}/ holds {2}: which one is meant?": "{1}/ enthält {2}: Welches ist gemeint?",
