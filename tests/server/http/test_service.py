@@ -37,8 +37,8 @@ def test_requests_that_make_no_sense_are_4xx_problems(http: httpx.Client, archiv
         assert response.json()["type"].startswith("urn:eigenhead:problem:")
         assert response.json()["detail"]
     assert "takes GET, POST, and not PUT" in http.put("/v1/jobs").json()["detail"]
-    archive = http.post("/v1/captures", files={"file": b"x"})
-    assert (archive.status_code, "POST /v1/captures/uploads" in archive.json()["detail"]) == (415, True)
+    misplaced = http.post("/v1/captures", files={"file": b"x"})
+    assert (misplaced.status_code, "POST /v1/captures/uploads" in misplaced.json()["detail"]) == (415, True)
     form = http.post("/v1/captures", data={"label": "x"})
     assert form.json()["errors"] == ["body: is no JSON object; send one, as application/json"]
 
