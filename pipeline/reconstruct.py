@@ -16,6 +16,10 @@ from pipeline.dense.surface.skin import part_of
 from pipeline.dense.window_bias import WindowBias
 from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.model import HeadModel
+from pipeline.evidence.camera_metrics import camera_figures, start_masks
+from pipeline.evidence.expression import LEAST_SIGMA, READ_SIGMA, found_expressions, posable_head, shut_eyes
+from pipeline.evidence.measurements import landmarks, measurements
+from pipeline.evidence.plausibility import plausibility_warnings, refuse
 from pipeline.first_fit import align, basis, fit_head, fitted_mesh, front_camera
 from pipeline.fitting.expression_evidence import makes_face
 from pipeline.fitting.fine.blink import blinks_of, with_lids
@@ -31,10 +35,6 @@ from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.bust import Bust, make_bust
-from pipeline.results.camera_metrics import camera_figures, start_masks
-from pipeline.results.expression import LEAST_SIGMA, READ_SIGMA, found_expressions, posable_head, shut_eyes
-from pipeline.results.measurements import landmarks, measurements
-from pipeline.results.plausibility import plausibility_warnings, refuse
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import FINE_LEVELS, Settings
 from pipeline.silhouettes.segment import segment

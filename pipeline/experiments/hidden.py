@@ -25,6 +25,8 @@ from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.evidence import measurements
+from pipeline.evidence.measurements import DISTANCES, Landmark, Measurement
 from pipeline.experiments import markdown
 from pipeline.experiments.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from pipeline.experiments.outcome import Outcome, Row
@@ -35,8 +37,6 @@ from pipeline.fitting.photo import refine as photo_refine
 from pipeline.imaging.cpu_raster import camera_depths, depth_map
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.reconstruct import reconstruct
-from pipeline.results import measurements
-from pipeline.results.measurements import DISTANCES, Landmark, Measurement
 from pipeline.settings import OutputSettings, Settings
 from pipeline.silhouettes.segment import segment
 from rig.camera import Camera, Intrinsics

@@ -1,1 +1,1 @@
-"""What a reconstruction is, what is measured on it, and the folder that it is written to."""
+"""What a reconstruction is, and the folder that it is written to."""

@@ -12,38 +12,18 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.dense.parts import PartMap
 from pipeline.diagnostics import Detail, ReportWarning
+from pipeline.evidence.camera_metrics import CameraFigures
+from pipeline.evidence.expression import Found, Posable
+from pipeline.evidence.measurements import Landmark, Measurement
 from pipeline.fitting.fit import Fit
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.bust import Bust
-from pipeline.results.expression import Found, Posable
-from pipeline.results.measurements import Landmark, Measurement
 from pipeline.settings import Settings
 from pipeline.texture.chart_colours import ChartColours
 from pipeline.texture.delight import Albedo
 from pipeline.texture.reduced_layout import ReducedLayout
 from pipeline.texture.uv_unwrap import Atlas
 from rig.mesh import Mesh
-
-
-@dataclass(frozen=True, slots=True)
-class CameraFigures:
-    """How well the fitted head explains one camera.
-
-    ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none trimmed; ``excluded_share`` is the
-    part of them (0 to 1) that the fit did not believe. ``xor_cost`` is eq. (5) of the fitted head, ``xor_cost_start``
-    of the head that the fit started from. ``outside_rms_px`` counts only how far the head reaches beyond the mask: what
-    lies inside it may be hidden by hair, hands or shoulders. A figure that a view cannot have (no rim sample in it) is
-    None.
-    """
-
-    used: bool
-    iou: float | None
-    contour_rms_px: float | None
-    xor_cost: float | None
-    xor_cost_start: float | None = None
-    excluded_share: float | None = None
-    samples: int = 0
-    outside_rms_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,10 +8,11 @@ from typing import Any, TypedDict
 import numpy as np
 
 from pipeline.dense.part_votes import PART_NAMES
+from pipeline.evidence.camera_metrics import CameraFigures
+from pipeline.evidence.expression import Posable
 from pipeline.imaging.silhouette import ViewQuality
 from pipeline.results.bust import Bust
-from pipeline.results.expression import Posable
-from pipeline.results.reconstruction import CameraFigures, Reconstruction
+from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import document_from_settings
 from pipeline.templates.header import TemplateHeader
 from pipeline.texture.chart_colours import ChartColours

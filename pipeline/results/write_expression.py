@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.results.expression import Posable
+from pipeline.evidence.expression import Posable
 from pipeline.results.reconstruction import Reconstruction
 from rig.atomic_write import write_atomically
 from rig.formats.glb import glb_bytes

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.eigenheads.regions import REGIONS
-from pipeline.results.measurements import DISTANCES
+from pipeline.evidence.measurements import DISTANCES
 from pipeline.verification.best_fit import BestFit, best_fit, counted
 from pipeline.verification.limits import Check, Limits, checks
 from pipeline.verification.measured import Measured

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.evidence.measurements import Landmark, Measurement
 from pipeline.experiments.detail import Known
 from pipeline.experiments.hidden import as_markdown, figures, landmark_figures, reached_from_outside, skin_figures
-from pipeline.results.measurements import Landmark, Measurement
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.studio.scene.layout import default_layout

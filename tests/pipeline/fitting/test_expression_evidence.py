@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.evidence.expression import Found
 from pipeline.reconstruct import reconstruct
-from pipeline.results.expression import Found
 from pipeline.settings import OutputSettings, Settings
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout

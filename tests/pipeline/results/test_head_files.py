@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from pipeline.eigenheads.model import load_model
-from pipeline.results.expression import posable_head
+from pipeline.evidence.expression import posable_head
 from pipeline.results.head_files import write_head
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction

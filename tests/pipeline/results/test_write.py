@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from pipeline.diagnostics import ReportWarning
+from pipeline.evidence.camera_metrics import CameraFigures
+from pipeline.evidence.measurements import Landmark, Measurement
 from pipeline.fitting.fit import Fit
 from pipeline.imaging.cpu_raster import depth_map
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
-from pipeline.results.measurements import Landmark, Measurement
 from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, PART_COLOURS, TINT, overlay
-from pipeline.results.reconstruction import CameraFigures, Reconstruction
+from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from rig.capture import Capture

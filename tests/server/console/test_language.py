@@ -13,7 +13,7 @@ import pytest
 from nicegui.translations import translations
 
 from calibration.quality import verdict as calibration_verdict
-from pipeline.results.measurements import DISTANCES
+from pipeline.evidence.measurements import DISTANCES
 from rig.acquisition import shot, verdict
 from server.console.theme import PAGES
 from server.services.jobs import FINISHED

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
+from pipeline.evidence.expression import READ_SIGMA, found_expressions, neutral_mesh, posable_head, shut_eyes
 from pipeline.fitting.fine.blink import with_lids
 from pipeline.fitting.fit import Fit
-from pipeline.results.expression import READ_SIGMA, found_expressions, neutral_mesh, posable_head, shut_eyes
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 

@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.eigenheads.gaussian_process import SCALES
 from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.evidence.measurements import DISTANCES, landmarks, measurements
 from pipeline.fitting.fit import Fit
-from pipeline.results.measurements import DISTANCES, landmarks, measurements
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 

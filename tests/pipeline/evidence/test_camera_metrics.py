@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import load_model
+from pipeline.evidence.camera_metrics import camera_figures, start_masks
 from pipeline.fitting.fit import Fit
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.results.camera_metrics import camera_figures, start_masks
 from rig.geometry import Similarity
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

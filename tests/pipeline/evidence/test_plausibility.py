@@ -10,9 +10,9 @@ import pytest
 import pipeline
 from pipeline.diagnostics import WARNING_CODES, ReportWarning
 from pipeline.eigenheads.model import load_model
+from pipeline.evidence.camera_metrics import CameraFigures
+from pipeline.evidence.plausibility import ImplausibleResult, plausibility_warnings, refuse, size_of
 from pipeline.fitting.fit import Fit
-from pipeline.results.plausibility import ImplausibleResult, plausibility_warnings, refuse, size_of
-from pipeline.results.reconstruction import CameraFigures
 from pipeline.settings import Settings, settings_from_document
 from rig.errors import InputError
 from rig.geometry import Similarity

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,7 +16,6 @@ from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
 from pipeline.parallel_for import thread_count
-from pipeline.results.reconstruction import CameraFigures
 from rig.camera import Camera
 from rig.geometry import Similarity
 from rig.mesh import Mesh
@@ -26,6 +26,27 @@ START_LEVEL = "p95"  # of the head before the fit, which is centimetres off: dra
 ZONE_MARGIN_PX = 4  # how far the face's zone reaches beyond its own hull, so that a face that is too large shows
 
 Masks = Mapping[str, Bool[np.ndarray, "h w"]]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFigures:
+    """How well the fitted head explains one camera.
+
+    ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none trimmed; ``excluded_share`` is the
+    part of them (0 to 1) that the fit did not believe. ``xor_cost`` is eq. (5) of the fitted head, ``xor_cost_start``
+    of the head that the fit started from. ``outside_rms_px`` counts only how far the head reaches beyond the mask: what
+    lies inside it may be hidden by hair, hands or shoulders. A figure that a view cannot have (no rim sample in it) is
+    None.
+    """
+
+    used: bool
+    iou: float | None
+    contour_rms_px: float | None
+    xor_cost: float | None
+    xor_cost_start: float | None = None
+    excluded_share: float | None = None
+    samples: int = 0
+    outside_rms_px: float | None = None
 
 
 def camera_figures(

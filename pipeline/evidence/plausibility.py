@@ -16,8 +16,8 @@ from scipy.special import chdtrc
 
 from pipeline.diagnostics import ReportWarning
 from pipeline.eigenheads.model import HeadModel
+from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.fitting.fit import Fit
-from pipeline.results.reconstruction import CameraFigures
 from rig.errors import EigenheadError
 
 COEFFICIENT_MOST = 4.6  # standard deviations of the largest; the same rig scaled by 0.88 gives 4.6, by 1.12 gives 6.8
