@@ -24,7 +24,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
-from pipeline.clock import Clock
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.subdivision import vertex_areas
@@ -32,16 +31,19 @@ from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.records import Records, Row
 from pipeline.experiments.span import weighted_quantile
 from pipeline.experiments.visible_surface import read_visible
-from pipeline.first_fit import align, basis, fit_head, front_camera
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.fitting.rim import find_rim, make_topology, pack_views
 from pipeline.imaging.cpu_raster import camera_depths, depth_maps
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
 from pipeline.multiview.visual_hull import visual_hull
+from pipeline.reconstruct import fit_shape
 from pipeline.settings import Settings, document_from_settings
 from pipeline.silhouettes.segment import segment
-from pipeline.silhouettes.usable_views import without_moved_cameras
+from pipeline.stages.alignment import align_head
+from pipeline.stages.context import ReconstructionContext, discard_progress
+from pipeline.stages.recorder import Recorder
+from pipeline.stages.views import find_views
 from pipeline.texture.vertex_colours import texture
 from rig.camera import Camera
 from rig.capture import Capture
@@ -189,20 +191,18 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
 def every_level(
     capture: Capture, rig: Rig, model: HeadModel, levels: tuple[Level, ...], renderer: Renderer
 ) -> dict[Level, Fitted]:
-    """``reconstruct``'s own steps, masks and alignment made once for all levels."""
-    settings = Settings()
-    silhouettes = segment(capture, rig, settings.segmentation, report=_silent)
-    silhouettes, _ = without_moved_cameras(silhouettes, rig)
-    wide = basis(model, settings)
-    start, _ = align(wide, capture, silhouettes, rig, settings, front_camera(rig, settings), _silent)
-    found = {}
+    """Fits every level of detail, masks and alignment made once for all of them."""
+    context = ReconstructionContext(capture, rig, model, Settings(), renderer)
+    run = Recorder(discard_progress)
+    views = run(find_views, context)
+    alignment = run(align_head, context, views)
+    fitted = {}
     for level in levels:
-        asked = replace(settings, detail=level)
         began = time.perf_counter()
-        given = (basis(model, asked), start, capture, silhouettes, rig, asked, renderer)
-        fit, deep, detail, _ = fit_head(*given, Clock(_silent))
-        found[level] = Fitted(fit, deep, detail.level, time.perf_counter() - began)
-    return found
+        at_level = replace(context, settings=replace(context.settings, detail=level))
+        _, head = fit_shape(run, at_level, views, alignment)
+        fitted[level] = Fitted(head.fit, head.model, head.detail.level, time.perf_counter() - began)
+    return fitted
 
 
 def _silent(stage: str, fraction: float) -> None:

@@ -24,6 +24,7 @@ from pipeline.fitting import expression_evidence
 from pipeline.fitting.fine import expression_reading
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
@@ -94,7 +95,7 @@ def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> 
 
 def _delivered(model: HeadModel, shot: SimulatedCapture, renderer: Renderer) -> Row:
     settings = replace(Settings(), outputs=OutputSettings(surface="head"))
-    found = reconstruct(shot.capture, shot.rig, model, settings, renderer=renderer, report=lambda stage, fraction: None)
+    found = reconstruct(ReconstructionContext(shot.capture, shot.rig, model, settings, renderer))
     face, scene = model.levels["full"].face_region, shot.scene
     known = Known(scene.name, shot.capture, shot.rig, scene.head, face, scene.visible)
     apart = np.linalg.norm(found.mesh_world.vertices - scene.head.vertices, axis=1)[face]
@@ -102,7 +103,7 @@ def _delivered(model: HeadModel, shot: SimulatedCapture, renderer: Renderer) -> 
         **surface_error(known, found.mesh_world),
         "vertex_mm": float(np.median(apart)),
         "fit_s": found.seconds["fit"],
-        "weights": {each.name: each.weight for each in found.expression},
+        "weights": {each.name: each.weight for each in found.evidence.expression},
     }
 
 

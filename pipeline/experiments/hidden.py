@@ -39,6 +39,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
 from pipeline.silhouettes.segment import segment
+from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
 from rig.geometry import look_at
@@ -113,7 +114,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
     subject = known()
     silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=_silent)
 
-    def segmented(capture: Capture, *given: object, report: Report) -> dict[str, Silhouette]:
+    def segmented(capture: Capture, *_: object, report: Report) -> dict[str, Silhouette]:
         """The same for every level; pictures that were put right are segmented anew."""
         again = capture is not subject.capture
         return segment(capture, subject.rig, Settings().segmentation, report=report) if again else silhouettes
@@ -121,12 +122,13 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
     found: Row = {}
     for level in LEVELS:
         settings = Settings(detail=level, outputs=OutputSettings(surface="head"))
-        given = (subject.capture, subject.rig, model, settings)
-        done = reconstruct(*given, renderer=renderer, report=_silent, segment=segmented)
+        done = reconstruct(
+            ReconstructionContext(subject.capture, subject.rig, model, settings, renderer, segment=segmented)
+        )
         found[level] = {
-            "reached": done.detail.level,
-            **skin_figures(subject, done.mesh_world, done.quality_mm, head_regions(model)),
-            **landmark_figures(subject.landmarks, done.landmarks, done.measurements),
+            "reached": done.refined.detail.level,
+            **skin_figures(subject, done.mesh_world, done.refined.deviation_mm, head_regions(model)),
+            **landmark_figures(subject.landmarks, done.evidence.landmarks, done.evidence.measurements),
         }
     return found
 

@@ -31,6 +31,7 @@ from pipeline.imaging.masks import box_around
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from pipeline.texture import chart_colours, decision, delight
 from pipeline.texture import light as fitted_light
 from pipeline.texture.delight import Albedo
@@ -122,7 +123,10 @@ def differences(model: HeadModel, found: Mapping[str, Reconstruction], again: Re
     """Of textures and albedos, in the mean over the pairs of lights; ``again`` is the first light's second shot."""
     every = [*found.values(), again]
     layout = albedo_of(every[0]).atlas.layout
-    seen = np.asarray(np.all([head.views > 0 for head in every], axis=0)) & model.levels["full"].face_region
+    seen = (
+        np.asarray(np.all([head.texturing.vertices.views > 0 for head in every], axis=0))
+        & model.levels["full"].face_region
+    )
     face = face_texels(layout, seen)
     textures = {name: texels(_texture(head), face) for name, head in found.items()}
     albedos = {name: texels(albedo_of(head).atlas.image, face) for name, head in found.items()}
@@ -161,7 +165,7 @@ def lit_head(
     capture = shoot(scene, noise)
     if settings.texture.chart:
         capture = with_chart_plates(capture, scene, lamps, noise)
-    return reconstruct(capture, rig, model, settings, renderer=renderer, report=lambda stage, share: None)
+    return reconstruct(ReconstructionContext(capture, rig, model, settings, renderer))
 
 
 def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], rng: np.random.Generator) -> Capture:
@@ -211,16 +215,16 @@ def _difference(one: UInt8[np.ndarray, "n 3"], other: UInt8[np.ndarray, "n 3"]) 
 
 
 def _texture(head: Reconstruction) -> Image:
-    if head.atlas is None:
+    if head.texturing.atlas is None:
         raise EigenheadError("a capture of the studio has no texture")
-    return head.atlas.image
+    return head.texturing.atlas.image
 
 
 def albedo_of(head: Reconstruction) -> Albedo:
     """Raises EigenheadError where there is none."""
-    if head.albedo is None:
+    if head.texturing.albedo is None:
         raise EigenheadError("a capture of the studio has no albedo: " + "; ".join(w.message for w in head.warnings))
-    return head.albedo
+    return head.texturing.albedo
 
 
 def sheet(found: Mapping[str, Reconstruction], rig: Rig) -> Image:

@@ -25,6 +25,7 @@ from pipeline.experiments.visible_surface import score_visible
 from pipeline.reconstruct import reconstruct
 from pipeline.results.clay import clay
 from pipeline.settings import Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera
 from rig.capture import Capture, ImageRgb
 from rig.errors import EigenheadError
@@ -73,7 +74,7 @@ def planted(
 def planted_row(known: Known, model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
     """One job: what it was refused for, or what came of it."""
     try:
-        found = reconstruct(known.capture, known.rig, model, Settings(), renderer=renderer, report=_silent)
+        found = reconstruct(ReconstructionContext(known.capture, known.rig, model, Settings(), renderer))
     except EigenheadError as error:
         return {"refused": 1.0, "why": f"{type(error).__name__}: {error}"}
     warnings = sorted({warning.code for warning in found.warnings})
@@ -85,7 +86,7 @@ def planted_row(known: Known, model: HeadModel, renderer: Renderer, picture: Pat
     seen = seen_of(found.bust.surface)
     off = KDTree(known.visible.points).query(seen.vertices[np.unique(seen.faces)])[0]
     if picture is not None:
-        in_head = found.fit.world_from_head.inverse()
+        in_head = found.head.fit.world_from_head.inverse()
         views = [(bust, "bust.ply"), (found.mesh_world, "head.ply")]
         clays = [labelled(clay(Mesh(in_head.apply(m.vertices), m.faces), azimuth_deg=30.0), name) for m, name in views]
         write_image(picture, np.hstack(clays))

@@ -24,6 +24,7 @@ from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
+from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
@@ -86,7 +87,7 @@ def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings:
     chosen = replace(settings, front=given.front if given.front in used else None)
     shot = Capture({name: given.capture.images[name] for name in rig.names})
     started = time.perf_counter()
-    done = reconstruct(shot, rig, model, chosen, renderer=renderer, report=report, segment=ready)
+    done = reconstruct(ReconstructionContext(shot, rig, model, chosen, renderer, report, segment=ready))
     seconds = time.perf_counter() - started
     mesh, colours = surface_of(done)
     held_out = [given.rig[name] for name in near if name not in used]
@@ -134,7 +135,7 @@ def views_in_front(rig: Rig, front: str | None) -> list[str]:
 def surface_of(done: Reconstruction) -> tuple[Mesh, UInt8[np.ndarray, "v 3"]]:
     """The bust, or the head where the photographs told none."""
     if done.bust is None:
-        return done.mesh_world, done.colours
+        return done.mesh_world, done.texturing.vertices.colours
     return done.bust.mesh_world, done.bust.colours
 
 

@@ -29,6 +29,7 @@ from pipeline.experiments.records import CONTOUR, Records, Row, key_of
 from pipeline.experiments.subjects import off_by
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from pipeline.verification import repeatability
 from pipeline.verification.repeatability import scatter
 from rig.capture import Capture
@@ -140,9 +141,9 @@ def moved(rng: np.random.Generator) -> tuple[Lamp, ...]:
 
 def reconstructed(scene: Scene, capture: Capture, model: HeadModel, renderer: Renderer) -> Shot:
     settings = Settings(outputs=OutputSettings(surface="head"))
-    done = reconstruct(capture, scene.rig, model, settings, renderer=renderer, report=lambda stage, fraction: None)
+    done = reconstruct(ReconstructionContext(capture, scene.rig, model, settings, renderer))
     codes = frozenset(warning.code for warning in done.warnings)
-    return Shot(done.mesh_world.vertices, done.quality_mm, scene.head, scene.photographed, codes)
+    return Shot(done.mesh_world.vertices, done.refined.deviation_mm, scene.head, scene.photographed, codes)
 
 
 def judged(model: HeadModel, shots: list[Shot]) -> Row:

@@ -37,6 +37,7 @@ from pipeline.multiview.visual_hull import visual_hull
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
+from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
@@ -129,7 +130,7 @@ def peer_row(known: Known, make: Callable[[], tuple[Mesh, float]]) -> Row:
 
 def ours(shown: Shown) -> tuple[Mesh, float]:
     before, known = time.process_time(), shown.known
-    found = reconstruct(known.capture, known.rig, shown.model, Settings(), renderer=shown.renderer, report=_silent)
+    found = reconstruct(ReconstructionContext(known.capture, known.rig, shown.model, Settings(), shown.renderer))
     if found.bust is None:
         raise PeerFailed("eigenhead", "no bust")
     return found.bust.mesh_world, time.process_time() - before

@@ -31,6 +31,7 @@ from pipeline.reconstruct import reconstruct
 from pipeline.results.head_files import encoded
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from pipeline.texture.head_texture import paint_head
 from pipeline.texture.model_layout import model_layout
 from pipeline.texture.paper_blend import paper_texture
@@ -106,19 +107,20 @@ def row_of(
     rig = known.rig.subset(name for name in known.rig.names if name != kept.name)
     images = {name: image for name, image in known.capture.images.items() if name != kept.name}
     capture = replace(known.capture, images=images)
-    found = reconstruct(capture, rig, model, settings, renderer=renderer, report=lambda stage, share: None)
-    if found.atlas is None:
+    found = reconstruct(ReconstructionContext(capture, rig, model, settings, renderer))
+    atlas, silhouettes = found.texturing.atlas, found.views.silhouettes
+    if atlas is None:
         raise EigenheadError(f"{known.name}: no texture")
-    photograph, mesh, layout = known.capture.images[kept.name], found.mesh_world, found.atlas.layout
+    photograph, mesh, layout = known.capture.images[kept.name], found.mesh_world, atlas.layout
     face = face_pixels(kept, mesh, model.levels["full"].face_region)
     depths = depth_maps(rig, mesh)
-    blend = paper_texture(layout, mesh, capture, found.silhouettes, rig, depths, found.atlas.image)
+    blend = paper_texture(layout, mesh, capture, silhouettes, rig, depths, atlas.image)
     drawn = {
-        "texture": drawn_texture(kept, mesh, layout, found.atlas.image),
-        "vertices": _drawn(kept, mesh.vertices, mesh.faces, found.colours.astype(np.float32)),
+        "texture": drawn_texture(kept, mesh, layout, atlas.image),
+        "vertices": _drawn(kept, mesh.vertices, mesh.faces, found.texturing.vertices.colours.astype(np.float32)),
         "paper": drawn_texture(kept, mesh, layout, blend),
     }
-    row: Row = {"camera": kept.name, "size": len(found.atlas.image)}
+    row: Row = {"camera": kept.name, "size": len(atlas.image)}
     for name, image in drawn.items():
         row |= {f"{name}_{key}": value for key, value in errors(image, photograph, face).items()}
     row |= {
@@ -140,11 +142,20 @@ def kept_back(rig: Rig, number: int) -> Camera:
 def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig, settings: Settings) -> Row:
     """Wall and processor seconds of vertex colours alone, and of all that the texture adds, its JPEG included."""
     mesh, layout = found.mesh_world, model_layout(model)
-    given = (mesh, found.normals, capture, found.silhouettes, rig, depth_maps(rig, mesh), settings.texture)
+    coloured_by = partial(
+        colour,
+        mesh,
+        found.texturing.normals,
+        capture,
+        found.views.silhouettes,
+        rig,
+        depth_maps(rig, mesh),
+        settings.texture,
+    )
     times = [(time.perf_counter(), time.process_time())]
-    colour(*given)
+    coloured_by()
     times.append((time.perf_counter(), time.process_time()))
-    coloured = colour(*given, around=layout.around)
+    coloured = coloured_by(around=layout.around)
     atlas = paint_head(layout, mesh, coloured, model.levels["full"].face_region, settings)
     if atlas is not None:
         encoded(atlas, "jpeg")

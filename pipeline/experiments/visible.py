@@ -31,6 +31,7 @@ from pipeline.experiments.visible_surface import score_visible
 from pipeline.reconstruct import reconstruct
 from pipeline.results.clay import clay
 from pipeline.settings import Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.mesh import Mesh
@@ -97,13 +98,13 @@ def visible(
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
     """One subject by the default job."""
     subject, before = known(), time.process_time()
-    found = reconstruct(subject.capture, subject.rig, model, Settings(), renderer=renderer, report=_silent)
+    found = reconstruct(ReconstructionContext(subject.capture, subject.rig, model, Settings(), renderer))
     seconds = time.process_time() - before
     if found.bust is None:
         raise EigenheadError(f"{subject.name}: no bust ({'; '.join(str(warning) for warning in found.warnings)})")
     bust = found.bust.surface
     if picture is not None:
-        in_head = found.fit.world_from_head.inverse()
+        in_head = found.head.fit.world_from_head.inverse()
         meshes = {"truth": splats(subject.visible), "bust.ply": bust.mesh_world, "head.ply": found.mesh_world}
         write_image(
             picture, _row(subject.name, {k: Mesh(in_head.apply(m.vertices), m.faces) for k, m in meshes.items()})

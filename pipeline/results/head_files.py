@@ -44,24 +44,24 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         result: what is written.
         head: its mesh in the head frame, mm.
     """
-    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.written, result.atlas
+    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.written, result.texturing.atlas
     named = atlas is not None and outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
     write_ply(
         folder / "head.ply",
         result.mesh_world,
-        normals=result.normals,
-        colours=result.colours,
-        quality=result.quality_mm.astype(np.float32),
-        views=result.views,
+        normals=result.texturing.normals,
+        colours=result.texturing.vertices.colours,
+        quality=result.refined.deviation_mm.astype(np.float32),
+        views=result.texturing.vertices.views,
         corner_uv=corner_uv,
         comments=[*ply_comments(result), *(["TextureFile head.png"] if named else [])],
     )
     if atlas is not None and (named or "obj" in formats):
         write_atomically(folder / "head.png", encoded(atlas, "png"))
-    if result.albedo is not None:
-        write_atomically(folder / "texture" / "albedo.png", encoded(result.albedo.atlas, "png"))
-    normals = result.normals @ result.fit.world_from_head.rotation
+    if result.texturing.albedo is not None:
+        write_atomically(folder / "texture" / "albedo.png", encoded(result.texturing.albedo.atlas, "png"))
+    normals = result.texturing.normals @ result.head.fit.world_from_head.rotation
     if "glb" in formats:
         write_atomically(folder / "head.glb", _glb(result, head, normals))
     if "obj" in formats:
@@ -80,15 +80,15 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
 
 
 def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
-    atlas, extras, outputs = result.atlas, asset_extras(result), result.settings.outputs
+    atlas, extras, outputs = result.texturing.atlas, asset_extras(result), result.settings.outputs
     if atlas is None:
-        return glb_bytes(head, normals=normals, colours=result.colours, extras=extras)
+        return glb_bytes(head, normals=normals, colours=result.texturing.vertices.colours, extras=extras)
     kind = outputs.image
     source = atlas.layout.source
-    if outputs.skin == "albedo" and result.albedo is not None:
-        atlas = result.albedo.atlas
-    if result.reduced is not None:
-        mapped = normal_mapped(head.vertices, normals, atlas.layout, result.reduced)
+    if outputs.skin == "albedo" and result.texturing.albedo is not None:
+        atlas = result.texturing.albedo.atlas
+    if result.texturing.reduced is not None:
+        mapped = normal_mapped(head.vertices, normals, atlas.layout, result.texturing.reduced)
         extras["rows_of_ply"] = mapped.rows.tolist()
         skin = Skin(mapped.uv, encoded(atlas, kind), ENCODINGS[kind][1], png(mapped.image), mapped.tangents)
         return glb_bytes(mapped.mesh, normals=mapped.normals, skin=skin, extras=extras)
@@ -99,14 +99,14 @@ def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
 
 
 def _write_obj(folder: Path, result: Reconstruction) -> None:
-    mesh, atlas = result.mesh_world, result.atlas
+    mesh, atlas = result.mesh_world, result.texturing.atlas
     if atlas is None:
-        coloured = Mesh(mesh.vertices, mesh.faces, result.colours)
+        coloured = Mesh(mesh.vertices, mesh.faces, result.texturing.vertices.colours)
         write_atomically(folder / "head.obj", obj_bytes(coloured))
         return
     layout = atlas.layout
     data = textured_obj_bytes(
-        mesh, normals=result.normals, uv=layout.uv, faces_uv=layout.faces, library="head.mtl"
+        mesh, normals=result.texturing.normals, uv=layout.uv, faces_uv=layout.faces, library="head.mtl"
     )  # fmt: skip
     write_atomically(folder / "head.mtl", mtl_bytes("head.png"))
     write_atomically(folder / "head.obj", data)

@@ -6,14 +6,18 @@ from importlib.metadata import version
 from typing import Any, TypedDict
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.dense.part_votes import PART_NAMES
+from pipeline.diagnostics import ReportWarning
 from pipeline.evidence.camera_metrics import CameraFigures
-from pipeline.evidence.expression import Posable
-from pipeline.imaging.silhouette import ViewQuality
-from pipeline.results.bust import Bust
+from pipeline.evidence.expression import Found, Posable
+from pipeline.imaging.silhouette import Silhouette, ViewQuality
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import document_from_settings
+from pipeline.stages.bust import Bust
+from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.texturing import Texturing
 from pipeline.templates.header import TemplateHeader
 from pipeline.texture.chart_colours import ChartColours
 from pipeline.texture.light import HARMONICS, Light
@@ -125,6 +129,16 @@ class BustReport(TypedDict):
     filled: int
 
 
+class TextureReport(TypedDict):
+    """``filled``: vertices that no photograph coloured; ``gains``: linear RGB, by camera."""
+
+    vertices: int
+    filled: int
+    gains: dict[str, object]
+    chart: dict[str, object] | None
+    light: dict[str, object] | None
+
+
 class Report(TypedDict):
     """``report.json``."""
 
@@ -144,7 +158,7 @@ class Report(TypedDict):
     landmarks: dict[str, Placed]
     measurements: dict[str, Measured]
     quality: dict[str, float | None]
-    texture: dict[str, object]
+    texture: TextureReport
     bust: BustReport | None
     evaluations: int
     stopped_because: str
@@ -155,67 +169,101 @@ class Report(TypedDict):
 
 
 def report_document(result: Reconstruction, template: TemplateHeader | None = None) -> Report:
-    """The decoded report: JSON types only, every number finite (what is not known is null). ``template``: the one in
-    whose order the head was written, too."""
-    filled = int(np.count_nonzero(result.views == 0))
-    document = {
+    """Returns the decoded report: JSON types only, every number finite (what is not known is null).
+
+    ``template``: the one in whose order the head was written, too.
+    """
+    head, evidence, refined = result.head, result.evidence, result.refined
+    return {
         "format": FORMAT,
         "version": version("eigenhead"),
         "model": {"name": result.model_name, "sha256": result.model_sha256},
-        "method": result.fit.method,
-        "detail": {"level": result.detail.level, "reason": result.detail.reason},
-        "front": result.front,
-        "cameras": {name: _camera(result, name, figures) for name, figures in result.cameras.items()},
-        "pictures": dict(result.pictures),  # by camera, the name under which its own is filed
-        "coefficients": np.delete(result.fit.coefficients, np.asarray(result.posed, int)),
-        "expression": [
-            {"name": each.name, "words": each.words, "weight": each.weight, "std": each.std}
-            for each in result.expression
-        ],
-        "morphs": None if result.posable is None else _morphs(result.posable),
-        "template": None if template is None else _template(template),
-        "world_from_head": similarity_document(result.fit.world_from_head),
-        "landmarks": {k: {"position": p.position_mm, "std": p.std_mm} for k, p in result.landmarks.items()},
-        "measurements": {k: {"value": m.value_mm, "std": m.std_mm} for k, m in result.measurements.items()},
-        "quality": {"median": np.median(result.quality_mm), "max": result.quality_mm.max()},
-        "texture": {
-            "vertices": len(result.views),
-            "filled": filled,
-            "gains": result.gains,
-            "chart": None if result.chart is None else _chart(result.chart),
-            "light": None if result.albedo is None else _light(result.albedo.light),
+        "method": head.fit.method,
+        "detail": {"level": refined.detail.level, "reason": refined.detail.reason},
+        "front": result.alignment.front,
+        "cameras": {
+            name: _camera(figures, head.fit.camera_shift.get(name), result.views.silhouettes.get(name))
+            for name, figures in evidence.cameras.items()
         },
+        "pictures": dict(result.views.assignment),
+        "coefficients": _shape_coefficients(head),
+        "expression": [_expression(found) for found in evidence.expression],
+        "morphs": None if evidence.posable is None else _morphs(evidence.posable),
+        "template": None if template is None else _template(template),
+        "world_from_head": similarity_document(head.fit.world_from_head),
+        "landmarks": {
+            name: {"position": _numbers(mark.position_mm), "std": _optional_numbers(mark.std_mm)}
+            for name, mark in evidence.landmarks.items()
+        },
+        "measurements": {
+            name: {"value": length.value_mm, "std": _finite(length.std_mm)}
+            for name, length in evidence.measurements.items()
+        },
+        "quality": {"median": _finite(np.median(refined.deviation_mm)), "max": _finite(refined.deviation_mm.max())},
+        "texture": _texture(result.texturing),
         "bust": None if result.bust is None else _bust(result.bust),
-        "evaluations": result.fit.evaluations,
-        "stopped_because": result.fit.stopped_because,
+        "evaluations": head.fit.evaluations,
+        "stopped_because": head.fit.stopped_because,
         "seconds": {"total": sum(result.seconds.values())} | dict(result.seconds),
         "settings": document_from_settings(result.settings),
         "inputs": dict(result.digests),
-        "warnings": [{"code": w.code, "message": w.message} for w in result.warnings],
-    }
-    return _plain(document)
-
-
-def _chart(chart: ChartColours) -> dict[str, object]:
-    return {
-        "cameras": {name: {"matrix": each.matrix, "off": each.off} for name, each in chart.cameras.items()},
-        "frame": "world",
-        "normal": chart.normal_world,
+        "warnings": [_warning(warning) for warning in result.warnings],
     }
 
 
-def _light(light: Light) -> dict[str, object]:
+def _camera(
+    figures: CameraFigures, shift: Float[np.ndarray, " 6"] | None, silhouette: Silhouette | None
+) -> CameraReport:
     return {
-        "frame": "world",
-        "harmonics": HARMONICS,
-        "coefficients": light.coefficients.T,  # a row a channel: red, green, blue
-        "convention": ON_CHART if light.on_chart else MEAN_ONE,
-        "residual": light.residual,
+        "used": figures.used,
+        "iou": _finite(figures.iou),
+        "contour_rms_px": _finite(figures.contour_rms_px),
+        "excluded_share": _finite(figures.excluded_share),
+        "samples": figures.samples,
+        "xor_cost": _finite(figures.xor_cost),
+        "xor_cost_start": _finite(figures.xor_cost_start),
+        "camera_shift": _optional_numbers(shift),
+        "view": None if silhouette is None else _view(silhouette.quality),
+    }
+
+
+def _view(quality: ViewQuality) -> ViewReport:
+    return {
+        "usable": quality.usable,
+        "contrast": _finite(quality.contrast),
+        "cut_off": list(quality.cut_off),
+        "components": quality.components,
+        "holes": quality.holes,
+        "warnings": list(quality.warnings),
+        "figures": _plain(quality.figures),
+    }
+
+
+def _shape_coefficients(head: HeadFit) -> list[float]:
+    """Returns the fit's coefficients without the weights of expressions, in standard deviations."""
+    return _numbers(np.delete(head.fit.coefficients, np.asarray(head.model.posed, int)))
+
+
+def _expression(found: Found) -> ExpressionReport:
+    return {"name": found.name, "words": found.words, "weight": found.weight, "std": _finite(found.std)}
+
+
+def _morphs(posable: Posable) -> MorphsReport:
+    used = {name: weight for name, weight in posable.weights.items() if weight}
+    return {"weights": used, "without_counterpart": list(posable.missing)}
+
+
+def _template(template: TemplateHeader) -> TemplateReport:
+    return {
+        "name": template.name,
+        "source": template.source,
+        "sha256": template.source_sha256,
+        "registration": dict(template.figures),
     }
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:
-    """The paper's form ``x_world = s (R x_head + t)``: its translation is ours divided by the scale."""
+    """Returns the paper's form ``x_world = s (R x_head + t)``: its translation is ours divided by the scale."""
     translation = transform.translation / transform.scale
     return {
         "scale": transform.scale,
@@ -224,64 +272,71 @@ def similarity_document(transform: Similarity) -> SimilarityReport:
     }
 
 
-def _morphs(posable: Posable) -> dict[str, object]:
-    used = {name: weight for name, weight in posable.weights.items() if weight}
-    return {"weights": used, "without_counterpart": list(posable.missing)}
-
-
-def _template(template: TemplateHeader) -> dict[str, object]:
+def _texture(texturing: Texturing) -> TextureReport:
+    vertices = texturing.vertices
     return {
-        "name": template.name,
-        "source": template.source,
-        "sha256": template.source_sha256,
-        "registration": template.figures,
+        "vertices": len(vertices.views),
+        "filled": int(np.count_nonzero(vertices.views == 0)),
+        "gains": _plain(vertices.gains),
+        "chart": None if texturing.chart is None else _chart(texturing.chart),
+        "light": None if texturing.albedo is None else _light(texturing.albedo.light),
     }
 
 
-def _bust(bust: Bust) -> dict[str, object]:
+def _chart(chart: ChartColours) -> dict[str, object]:
+    document = {
+        "cameras": {name: {"matrix": each.matrix, "off": each.off} for name, each in chart.cameras.items()},
+        "frame": "world",
+        "normal": chart.normal_world,
+    }
+    return _plain(document)
+
+
+def _light(light: Light) -> dict[str, object]:
+    document = {
+        "frame": "world",
+        "harmonics": HARMONICS,
+        "coefficients": light.coefficients.T,  # a row a channel: red, green, blue
+        "convention": ON_CHART if light.on_chart else MEAN_ONE,
+        "residual": light.residual,
+    }
+    return _plain(document)
+
+
+def _bust(bust: Bust) -> BustReport:
     surface = bust.surface
+    median = np.median(surface.deviation_mm[surface.seen])
     return {
         "spacing_mm": bust.spacing_mm,
         "vertices": len(bust.views),
         "faces": len(surface.mesh_world.faces),
-        "seen_share": np.mean(surface.seen),
+        "seen_share": float(np.mean(surface.seen)),
         "closed": len(boundary_edges(surface.mesh_world.faces)) == 0,
-        "parts": {name: np.mean(surface.part == code) for code, name in enumerate(PART_NAMES)},
-        "quality": {"median_seen": np.median(surface.deviation_mm[surface.seen]), "max": surface.deviation_mm.max()},
+        "parts": {name: float(np.mean(surface.part == code)) for code, name in enumerate(PART_NAMES)},
+        "quality": {"median_seen": _finite(median), "max": _finite(surface.deviation_mm.max())},
         "filled": int(np.count_nonzero(bust.views == 0)),
     }
 
 
-def _camera(result: Reconstruction, name: str, figures: CameraFigures) -> dict[str, object]:
-    silhouette = result.silhouettes.get(name)
-    shift = result.fit.camera_shift.get(name)
-    return {
-        "used": figures.used,
-        "iou": figures.iou,
-        "contour_rms_px": figures.contour_rms_px,
-        "excluded_share": figures.excluded_share,
-        "samples": figures.samples,
-        "xor_cost": figures.xor_cost,
-        "xor_cost_start": figures.xor_cost_start,
-        "camera_shift": shift,  # rotation (rad) and translation (mm), left perturbation of camera_from_world
-        "view": None if silhouette is None else _quality(silhouette.quality),
-    }
+def _warning(warning: ReportWarning) -> WarningReport:
+    return {"code": warning.code, "message": warning.message}
 
 
-def _quality(quality: ViewQuality) -> dict[str, object]:
-    return {
-        "usable": quality.usable,
-        "contrast": quality.contrast,
-        "cut_off": list(quality.cut_off),
-        "components": quality.components,
-        "holes": quality.holes,
-        "warnings": list(quality.warnings),
-        "figures": quality.figures,
-    }
+def _finite(value: float | np.floating | None) -> float | None:
+    """Returns None for what is not finite, because JSON has no word for it."""
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def _numbers(values: Float[np.ndarray, " n"]) -> list[float]:
+    return values.astype(float).tolist()
+
+
+def _optional_numbers(values: Float[np.ndarray, " n"] | None) -> list[float] | None:
+    return None if values is None else _numbers(values)
 
 
 def _plain(value: Any) -> Any:
-    """NumPy to JSON types; what is not finite becomes null, because JSON has no word for it."""
+    """Returns JSON types for a document of free form."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.results.bust import Bust
 from pipeline.results.head_files import write_head
 from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
@@ -25,6 +24,7 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.write_expression import write_expression
 from pipeline.results.write_template import write_template
+from pipeline.stages.bust import Bust
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, refiled
@@ -41,13 +41,13 @@ THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and e
 def write_result(folder: Path, result: Reconstruction, capture: Capture, template: Template | None = None) -> None:
     """Writes every file of the result of ``capture``, as it was read, and in the order of ``template``; each under a
     temporary name first. Raises OSError where the disk is full."""
-    capture = refiled(capture, pictures=result.pictures)
-    head = head_mesh(result)
+    capture = refiled(capture, pictures=result.views.assignment)
+    head, posable = head_mesh(result), result.evidence.posable
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
-            *([] if result.posable is None else [pool.submit(write_expression, folder, result, result.posable)]),
+            *([] if posable is None else [pool.submit(write_expression, folder, result, posable)]),
             *([] if template is None else [pool.submit(write_template, folder, result, template)]),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
@@ -59,7 +59,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
 
 
 def _write_bust(folder: Path, result: Reconstruction, bust: Bust) -> None:
-    mesh, place = bust.mesh_world, result.fit.world_from_head
+    mesh, place = bust.mesh_world, result.head.fit.world_from_head
     write_ply(
         folder / "bust.ply",
         mesh,
@@ -84,8 +84,9 @@ def _write_meshes(folder: Path, result: Reconstruction, head: Mesh) -> None:
 def head_mesh(result: Reconstruction) -> Mesh:
     """The result mesh in the head frame, at its true size: the pose is undone, the scale is not, so that the GLB's
     metres are metres."""
-    head_from_world = _head_from_world(result.fit.world_from_head)
-    return Mesh(head_from_world.apply(result.mesh_world.vertices), result.mesh_world.faces, result.colours)
+    head_from_world = _head_from_world(result.head.fit.world_from_head)
+    mesh = result.mesh_world
+    return Mesh(head_from_world.apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)
 
 
 def _head_from_world(place: Similarity) -> RigidTransform:
@@ -93,33 +94,34 @@ def _head_from_world(place: Similarity) -> RigidTransform:
 
 
 def _shown(result: Reconstruction, capture: Capture) -> list[str]:
-    return [name for name in result.silhouettes if name in capture.images and name in result.fitted_masks]
+    fitted = result.evidence.fitted_masks
+    return [name for name in result.views.silhouettes if name in capture.images and name in fitted]
 
 
 def _write_overlay(folder: Path, result: Reconstruction, capture: Capture, name: str) -> None:
-    distance = result.silhouettes[name].distance
-    parts = result.parts[name].probability if name in result.parts else None
-    drawn = overlay(capture.images[name], distance, result.fitted_masks[name], name, parts)
+    distance, labels = result.views.silhouettes[name].distance, result.labels.maps
+    parts = labels[name].probability if name in labels else None
+    drawn = overlay(capture.images[name], distance, result.evidence.fitted_masks[name], name, parts)
     write_image(folder / "overlays" / f"{name}.png", drawn)
 
 
 def _write_overviews(folder: Path, result: Reconstruction, capture: Capture, head: Mesh) -> None:
-    panels = turntable(head, result.colours)
+    panels = turntable(head, result.texturing.vertices.colours)
     write_image(folder / "turntable.png", np.hstack(panels))
     write_image(folder / "contact_sheet.png", _sheet(result, capture, _shown(result, capture), panels))
 
 
 def _sheet(result: Reconstruction, capture: Capture, shown: list[str], panels: list[np.ndarray]) -> np.ndarray:
     """A row a camera: the front one first, then others spread over the rig's order."""
-    others = [name for name in shown if name != result.front]
-    front = [result.front] if result.front in shown else []
+    front = [name for name in shown if name == result.alignment.front]
+    others = [name for name in shown if name != result.alignment.front]
     spread = np.linspace(0, len(others) - 1, min(SHEET_ROWS - len(front), len(others))).round().astype(int)
     views = np.linspace(len(panels) - 1, 0, SHEET_ROWS).round().astype(int)
     rows = []
     for name, view in zip(front + [others[i] for i in spread], views, strict=False):
-        image, observed = capture.images[name], result.silhouettes[name].mask
-        start = result.start_masks.get(name)
+        image, observed = capture.images[name], result.views.silhouettes[name].mask
+        start = result.evidence.start_masks.get(name)
         before = [] if start is None else [("before the fit", difference(image, observed, start))]
-        after = ("after the fit", difference(image, observed, result.fitted_masks[name]))
+        after = ("after the fit", difference(image, observed, result.evidence.fitted_masks[name]))
         rows.append([(name, image), *before, after, ("", panels[view])])
     return contact_sheet(rows or [[("", panel) for panel in panels]])

@@ -15,10 +15,14 @@ from rig.mesh import Mesh
 
 def write_expression(folder: Path, result: Reconstruction, posable: Posable) -> None:
     """The files that the settings ask for; colours are the photographed head's, vertex by vertex."""
-    place, outputs = result.fit.world_from_head, result.settings.outputs
+    place, outputs = result.head.fit.world_from_head, result.settings.outputs
     head_from_world = RigidTransform(place.rotation, place.translation).inverse()
-    neutral = Mesh(head_from_world.apply(posable.neutral_world.vertices), posable.neutral_world.faces, result.colours)
-    glb = glb_bytes(neutral, normals=neutral.normals(), colours=np.asarray(result.colours))
+    neutral = Mesh(
+        head_from_world.apply(posable.neutral_world.vertices),
+        posable.neutral_world.faces,
+        result.texturing.vertices.colours,
+    )
+    glb = glb_bytes(neutral, normals=neutral.normals(), colours=np.asarray(result.texturing.vertices.colours))
     if outputs.neutral:
         write_atomically(folder / "neutral.glb", glb)
     if outputs.morphs:

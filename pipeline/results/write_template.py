@@ -28,7 +28,9 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
     """Writes the files. Raises OSError."""
     head, carrier, name = result.mesh_world, template.carrier, f"head-{template.name}"
     vertices = carrier.on(head.vertices, head.faces)
-    textures = {} if result.atlas is None else template_textures(result.atlas, template.mesh, carrier)
+    textures = (
+        {} if result.texturing.atlas is None else template_textures(result.texturing.atlas, template.mesh, carrier)
+    )
     suffix, _, options = ENCODINGS["png" if result.settings.outputs.image == "png" else "jpeg"]
     files = {tile: f"{name}{_tile_suffix(tile)}{suffix}" for tile in textures}
     for tile, image in textures.items():
@@ -61,7 +63,7 @@ def _tile_suffix(tile: Tile) -> str:
 
 def _colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
     attached = template.carrier.attachment
-    corners = result.colours[result.mesh_world.faces[attached.triangles]].astype(float)
+    corners = result.texturing.vertices.colours[result.mesh_world.faces[attached.triangles]].astype(float)
     out = np.full((len(template.carrier.rest), 3), NO_SKIN, np.uint8)
     out[template.carrier.skin] = np.clip(np.rint(np.einsum("nk,nkc->nc", attached.weights, corners)), 0, 255)
     return out

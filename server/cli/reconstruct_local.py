@@ -75,6 +75,7 @@ def _reconstruct_folder(
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
+    from pipeline.stages.context import ReconstructionContext
     from pipeline.templates.load import load_template
     from rig.render.renderer import Renderer
     from server.tasks.stage_durations import StageDurations
@@ -91,7 +92,7 @@ def _reconstruct_folder(
     template = load_template(chosen.outputs.template, head_model)
     with Renderer.create() as renderer:
         segment = partial(keep_masks, kept)
-        done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=segment)
+        done = reconstruct(ReconstructionContext(shot, rig, head_model, chosen, renderer, tell, segment))
     done = replace(done, warnings=(*prepared.warnings, *done.warnings))
     tell("write", 0.0)
     write_result(out, done, shot, template)

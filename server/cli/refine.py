@@ -9,11 +9,13 @@ from calibration.silhouette_refinement.refine import TooFewCaptures, refine
 from calibration.silhouette_refinement.report import RefinementRun
 from calibration.silhouette_refinement.rims import Heads
 from pipeline.eigenheads.model import load_model, with_modes
-from pipeline.first_fit import align
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import without_moved_cameras
+from pipeline.stages.alignment import align_to_views
+from pipeline.stages.context import discard_progress
+from pipeline.stages.views import Views
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture
@@ -49,11 +51,13 @@ def refine_locally(
         faults = _differences(own, rig, same_poses=calibration is None)
         if faults:
             raise InputError(path.name, [*faults, "the captures must be of one rig, calibrated once"])
-        found = segment(capture, rig, settings.segmentation, report=_silent)
+        found = segment(capture, rig, settings.segmentation, report=discard_progress)
         kept, warnings = without_moved_cameras(found, rig)
         seen.append(kept)
         if head is not None:
-            starts.append(align(head, capture, kept, rig, settings, rig.front_camera(), _silent)[0])
+            views = Views(capture, kept, {})
+            alignment = align_to_views(head, views, rig, settings, progress=discard_progress).product
+            starts.append(alignment.world_from_head)
         for name in (name for name in kept if warnings and kept[name] is not found[name]):
             moved.setdefault(name, []).append(path.name)
     assert rig is not None

@@ -51,6 +51,7 @@ def reconstruct_capture(
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
     from pipeline.settings import settings_from_document
+    from pipeline.stages.context import ReconstructionContext
     from pipeline.templates.load import load_template
     from rig.formats.capture_folder import read_capture
     from rig.formats.work_size import WORK_PIXELS
@@ -72,7 +73,7 @@ def reconstruct_capture(
         if stage != DONE:  # the files are still to be written
             report(stage, fraction)
 
-    done = reconstruct(shot, rig, head_model, chosen, renderer=renderer, report=tell, segment=once)
+    done = reconstruct(ReconstructionContext(shot, rig, head_model, chosen, renderer, tell, once))
     report("write", 0.0)
     told = calibration_warnings(Path(capture)) or ()
     done = replace(done, warnings=(*told, *done.warnings))

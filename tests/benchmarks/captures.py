@@ -16,6 +16,7 @@ from pipeline.eigenheads.model import load_model
 from pipeline.experiments.detail import read_known, surface_error
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.render.renderer import Renderer
 from tests.support.noisy_captures import noisier
 
@@ -36,7 +37,7 @@ def main() -> None:
             capture = noisier(known.capture, arguments.noise) if arguments.noise else known.capture
             for level in arguments.levels:
                 settings = replace(Settings(), detail=level, outputs=OutputSettings(surface="head"))
-                head = reconstruct(capture, known.rig, model, settings, renderer=renderer, report=lambda *_: None)
+                head = reconstruct(ReconstructionContext(capture, known.rig, model, settings, renderer))
                 for name, value in surface_error(known, head.mesh_world).items():
                     found[f"{known.name}_{level}_{name}"] = round(value, 4)
     if arguments.json:

@@ -25,6 +25,7 @@ from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.reconstruct import reconstruct
 from pipeline.results.write import write_result
 from pipeline.settings import Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.formats.capture_folder import read_capture
 from rig.render.renderer import Renderer
 
@@ -71,7 +72,7 @@ def one_round(
     meter = Meter(steps)
     meter.enter("read")
     capture, rig = read_capture(capture_folder)
-    result = reconstruct(capture, rig, model, settings, renderer=renderer, report=meter)
+    result = reconstruct(ReconstructionContext(capture, rig, model, settings, renderer, meter))
     meter.enter("write")
     write_result(out, result, capture)
     meter.enter("")

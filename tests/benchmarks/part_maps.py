@@ -25,6 +25,7 @@ from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import PartSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.formats.capture_folder import read_capture
@@ -102,17 +103,17 @@ def measure(
     capture: Capture, rig: Rig, truth: dict[str, UInt8[np.ndarray, "h w"]], model: HeadModel, renderer: Renderer
 ) -> dict[str, float]:
     """Recall and precision by part, over the pixels whose truth is known and that the masks hold."""
-    done = reconstruct(capture, rig, model, Settings(), renderer=renderer, report=lambda stage, share: None)
-    landmarks = {name: point.position_mm for name, point in done.landmarks.items()}
+    done = reconstruct(ReconstructionContext(capture, rig, model, Settings(), renderer))
+    landmarks = {name: point.position_mm for name, point in done.evidence.landmarks.items()}
     region = model.levels["full"].face_region
-    given = capture.images, done.silhouettes, rig, done.mesh_world, region, landmarks, PartSettings()
+    given = capture.images, done.views.silhouettes, rig, done.mesh_world, region, landmarks, PartSettings()
     started = time.process_time()
     maps = classify_parts(*given, report=lambda stage, share: None)
     seconds = time.process_time() - started
     counts = np.zeros((4, 4))
     for name, found in maps.items():
         own = np.where(found.probability.max(axis=2) > 0.5, 1 + found.probability.argmax(axis=2), 0)
-        true = np.where(done.silhouettes[name].mask, truth[name], 0)
+        true = np.where(done.views.silhouettes[name].mask, truth[name], 0)
         counts += np.bincount((4 * true.astype(int) + own).ravel(), minlength=16).reshape(4, 4)
     counts = counts[1:]
     row = {

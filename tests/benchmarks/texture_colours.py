@@ -27,6 +27,7 @@ from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import Settings, TextureSettings
+from pipeline.stages.context import ReconstructionContext
 from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -80,8 +81,8 @@ def measure(seed: int, model: HeadModel, settings: Settings, renderer: Renderer)
     for name, exposures in (("even", np.ones(len(apart))), ("uneven", apart)):
         lit = exposed(scene, exposures)
         capture = shoot(lit, np.random.default_rng([seed, 2]))
-        result = reconstruct(capture, scene.rig, model, settings, renderer=renderer, report=lambda *_: None)
-        whole = (result.mesh_world, result.silhouettes)
+        result = reconstruct(ReconstructionContext(capture, scene.rig, model, settings, renderer))
+        whole = (result.mesh_world, result.views.silhouettes)
         truth = (scene.head, {key: silhouette_from_mask(view.mask) for key, view in scene.views.items()})
         for label, (mesh, silhouettes) in (("true_head", truth), ("whole", whole)):
             figures = compared(lit, capture, mesh, silhouettes, settings.texture)

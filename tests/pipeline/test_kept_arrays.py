@@ -149,9 +149,9 @@ def test_a_file_that_nobody_used_for_a_month_goes_and_one_in_use_stays(folder: P
 KEPT = """
 from pipeline.eigenheads.model import load_model
 from pipeline.fitting.photo.refine import finer
-from pipeline.first_fit import basis
+from pipeline.eigenheads.model_basis import model_basis
 from pipeline.settings import Settings
-model = basis(load_model(), Settings())
+model = model_basis(load_model(), Settings())
 fine, patches, at_centres = finer(model, Settings().photo)
 print(hash((model.modes.tobytes(), fine.modes.tobytes(), fine.sigma.tobytes(), patches.member.tobytes(),
             patches.agreement.tobytes(), at_centres.tobytes())), at_centres.flags.writeable)

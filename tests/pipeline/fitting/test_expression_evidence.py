@@ -9,6 +9,7 @@ from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.evidence.expression import Found
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate
@@ -25,8 +26,7 @@ def told(model: HeadModel, weights: dict[str, float], renderer: Renderer) -> tup
     rng = np.random.default_rng(32)
     shot = simulate(subject, default_layout(), PRESET, rng, renderer=renderer)
     settings = replace(Settings(), detail="photo", outputs=OutputSettings(surface="head"))
-    given = (shot.capture, shot.rig, model, settings)
-    return reconstruct(*given, renderer=renderer, report=lambda stage, fraction: None).expression
+    return reconstruct(ReconstructionContext(shot.capture, shot.rig, model, settings, renderer)).evidence.expression
 
 
 @pytest.mark.slow

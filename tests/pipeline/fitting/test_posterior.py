@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.first_fit import basis
+from pipeline.eigenheads.model_basis import model_basis
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import RELIEF_OF_OUTLINES, vertex_deviation_mm, with_estimated_prior
 from pipeline.settings import Settings
@@ -15,7 +15,7 @@ EIGENHEADS, RELIEF_MM, STRAYS = 60, 0.5, 1.3
 
 @pytest.fixture(scope="module")
 def model() -> HeadModel:
-    return basis(load_model(), Settings(detail="kernel"))
+    return model_basis(load_model(), Settings(detail="kernel"))
 
 
 def known_well(model: HeadModel) -> Fit:

@@ -9,17 +9,27 @@ import pytest
 import trimesh
 
 from pipeline.dense.window_bias import WindowBias
+from pipeline.diagnostics import Detail
+from pipeline.eigenheads.model import load_model
+from pipeline.fitting.fine.depth_bias import points_on_face
+from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
-from pipeline.results.bust import Bust, make_bust
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import BustSettings, OutputSettings, Settings, settings_from_document
+from pipeline.stages.bust import Bust, fuse_bust
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.depth import Depth
+from pipeline.stages.refined_head import RefinedHead
+from pipeline.stages.views import Views
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.errors import InputError
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from rig.render.renderer import Renderer
 from tests.support.ellipsoid_depths import Ellipsoid, look, pinhole_fan, scene
+from tests.support.made_up_results import made_up_result
 from tests.support.scenes import pattern, pixel_grid
 
 BALL = Ellipsoid((0, 0, 0), (60, 60, 60))
@@ -28,7 +38,7 @@ PLACE = Similarity(1.25, rotation_from_vector(np.array([0.1, -0.3, 0.05])), np.a
 
 
 @pytest.fixture(scope="module")
-def photographed() -> tuple[Bust, Capture, dict]:
+def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     """A ball whose colours are known at every point, and its bust."""
     made = scene([BALL], pinhole_fan())
     images = {}
@@ -41,34 +51,31 @@ def photographed() -> tuple[Bust, Capture, dict]:
         images[camera.name] = np.rint(255 * srgb_from_linear(light)).astype(np.uint8).reshape(*depth.shape, 3)
     sphere = trimesh.creation.icosphere(4, 60.0)
     head, capture = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32)), Capture(images)
-    surface = made.maps, capture, made.silhouettes, made.rig, head, None, WindowBias(), SETTINGS
-    return make_bust(*surface, report=lambda stage, share: None), capture, made.silhouettes
+    context = ReconstructionContext(capture, made.rig, load_model(), SETTINGS, renderer)
+    nothing = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
+    bias = WindowBias()
+    depth = Depth(made.maps, None, nothing, points_on_face(nothing, head, np.zeros(0, bool)), bias)
+    refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", "planted"))
+    bust = fuse_bust(context, Views(capture, made.silhouettes, {}), depth, refined, capture).product
+    assert bust is not None
+    return bust, capture, made.silhouettes
 
 
 @pytest.fixture(scope="module")
 def result(photographed) -> Reconstruction:
     bust, _, silhouettes = photographed
     head = bust.mesh_world
-    count = len(head.vertices)
-    return Reconstruction(
-        fit=Fit("contour", np.zeros(2), PLACE, 1, "planted"),
-        model_name="ball",
-        model_sha256="ab" * 32,
-        mesh_world=head,
-        normals=bust.normals,
+    return made_up_result(
+        head,
+        Fit("contour", np.zeros(2), PLACE, 1, "planted"),
         colours=bust.colours,
         views=bust.views,
-        quality_mm=np.full(count, 0.5),
+        deviation_mm=np.full(len(head.vertices), 0.5),
         silhouettes=silhouettes,
-        start_masks={},
         fitted_masks={name: silhouette.mask for name, silhouette in silhouettes.items()},
-        cameras={},
-        landmarks={},
-        measurements={},
+        name="ball",
         front="cam03",
         settings=SETTINGS,
-        digests={},
-        seconds={},
         bust=bust,
     )
 

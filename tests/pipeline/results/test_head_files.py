@@ -29,7 +29,7 @@ from pipeline.texture.uv_unwrap import Atlas
 from rig.errors import InputError
 from rig.formats.ply import read_head_ply
 from rig.mesh import Mesh
-from tests.support.textured_results import textured_result
+from tests.support.made_up_results import textured_result
 
 ALL = ("glb", "ply", "obj", "usdz", "stl", "3mf")
 
@@ -42,6 +42,13 @@ def result() -> Reconstruction:
     image = np.zeros((1024, 1024, 3), np.uint8)
     image[:, :512], image[:, 512:] = (200, 30, 30), (30, 30, 200)
     return textured_result(mesh, Atlas(model_layout(model).layout, image))
+
+
+def with_reduced_layout(result: Reconstruction) -> Reconstruction:
+    texturing = result.texturing
+    assert texturing.atlas is not None
+    reduced = reduced_layout(load_model(), texturing.atlas.layout)
+    return replace(result, texturing=replace(texturing, reduced=reduced))
 
 
 def written(result: Reconstruction, folder: Path, **outputs: object) -> set[str]:
@@ -112,11 +119,11 @@ def test_open_lids_are_closed_by_strips() -> None:
 def test_the_albedo_is_written_and_the_glb_shows_it_where_that_is_asked_for(
     result: Reconstruction, tmp_path: Path
 ) -> None:
-    assert result.atlas is not None
+    assert result.texturing.atlas is not None
     image = np.full((1024, 1024, 3), (40, 180, 90), np.uint8)
     coefficients = np.arange(27.0).reshape(9, 3)
-    albedo = Albedo(Atlas(result.atlas.layout, image), Light(coefficients, 0.05))
-    delit = replace(result, albedo=albedo)
+    albedo = Albedo(Atlas(result.texturing.atlas.layout, image), Light(coefficients, 0.05))
+    delit = replace(result, texturing=replace(result.texturing, albedo=albedo))
     pictures = {}
     for name, skin in (("photograph", "photograph"), ("albedo", "albedo")):
         (tmp_path / name).mkdir()
@@ -150,8 +157,8 @@ def test_wrong_outputs_are_named() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # the layout is reduced once, in half a minute of a free core
 def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(result: Reconstruction, tmp_path: Path) -> None:
-    assert result.atlas is not None
-    mapped = replace(result, reduced=reduced_layout(load_model(), result.atlas.layout))
+    assert result.texturing.atlas is not None
+    mapped = with_reduced_layout(result)
     written(mapped, tmp_path)
     document, payload = opened_glb(tmp_path / "head.glb")
     primitive, head = document["meshes"][0]["primitives"][0], head_mesh(mapped)
@@ -170,13 +177,13 @@ def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(result: Reconstr
 def test_the_khronos_validator_has_nothing_to_say(
     kind: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path
 ) -> None:
-    assert result.atlas is not None
+    assert result.texturing.atlas is not None
     name = "head.glb"
     if kind == "normal map":
-        written(replace(result, reduced=reduced_layout(load_model(), result.atlas.layout)), tmp_path, image="webp")
+        written(with_reduced_layout(result), tmp_path, image="webp")
     elif kind == "morphs":
         model, name = load_model(), "posed.glb"
-        posable = posable_head(model, result.fit.world_from_head, result.mesh_world, ())
+        posable = posable_head(model, result.head.fit.world_from_head, result.mesh_world, ())
         chosen = replace(result, settings=Settings(outputs=OutputSettings(morphs=True, neutral=True)))
         write_expression(tmp_path, chosen, posable)
         assert validated(tmp_path / "neutral.glb", gltf_validator) == (0, 0, [])

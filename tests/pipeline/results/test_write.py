@@ -23,6 +23,7 @@ from rig.formats.images import read_image
 from rig.formats.mesh_file import read_mesh
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from tests.support.made_up_results import made_up_result
 from tests.support.scenes import ellipsoid, fan, pattern
 from tests.support.shared_data import shared
 
@@ -46,24 +47,21 @@ def scene() -> tuple[Reconstruction, Capture]:
     silhouettes = {name: silhouette_from_mask(mask) for name, mask in masks.items()}
     silhouettes["cam03"] = replace(silhouettes["cam03"], quality=ViewQuality(usable=False, contrast=float("inf")))
     fit = Fit("contour", np.array([0.5, -1.0]), PLACE, 42, "the cost no longer falls")
-    result = Reconstruction(
-        fit=fit,
-        model_name="ellipsoid",
-        model_sha256="ab" * 32,
-        mesh_world=world,
-        normals=world.normals(),
+    result = made_up_result(
+        world,
+        fit,
         colours=colours,
         views=np.r_[np.zeros(5, np.uint8), np.full(len(head.vertices) - 5, 3, np.uint8)],
-        quality_mm=np.linspace(0.1, 2.0, len(head.vertices)),
+        deviation_mm=np.linspace(0.1, 2.0, len(head.vertices)),
         silhouettes=silhouettes,
         start_masks=shifted,
         fitted_masks=masks,
         cameras=figures,
         landmarks={"pronasale": Landmark(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))},
         measurements={"nose_length": Measurement(52.0, float("nan"))},
+        name="ellipsoid",
         front="cam03",
         settings=Settings(outputs=OutputSettings(obj=True)),
-        digests={"images/cam00.png": "cd" * 32},
         seconds={"segmentation": 0.5, "fitting": 1.5},
         warnings=(ReportWarning("view_left_out", "cam03 is left out"),),
     )
@@ -101,8 +99,8 @@ def test_ply_holds_the_world_mesh_with_its_colours_quality_and_views(folder: Pat
         "property float quality", "property uchar views", "property list uchar int vertex_indices",
     ]  # fmt: skip
     np.testing.assert_allclose(np.stack([vertices[n] for n in "xyz"], 1), result.mesh_world.vertices, atol=1e-4)
-    np.testing.assert_array_equal(np.stack([vertices[n] for n in "rgb"], 1), result.colours)
-    np.testing.assert_allclose(vertices["q"], result.quality_mm, rtol=1e-6)
+    np.testing.assert_array_equal(np.stack([vertices[n] for n in "rgb"], 1), result.texturing.vertices.colours)
+    np.testing.assert_allclose(vertices["q"], result.refined.deviation_mm, rtol=1e-6)
     assert (vertices["views"][:6] == [0, 0, 0, 0, 0, 3]).all()
     comments = " ".join(line for line in header if line.startswith("comment"))
     for word in ("unit mm", "frame world", "model ellipsoid", "ab" * 32, "inputs", "settings", "version"):
@@ -141,7 +139,7 @@ def test_glb_is_the_head_frame_in_metres_with_linear_colours(folder: Path, scene
     start = 20 + size + 8 + view["byteOffset"]
     stored = np.frombuffer(data, "<u2", 4 * len(head.vertices), start).reshape(-1, 4)
     # 2.2 is sRGB's well-known approximation, within 0.01 of the exact curve.
-    np.testing.assert_allclose(stored[:, :3] / 65535, (result.colours / 255.0) ** 2.2, atol=0.01)
+    np.testing.assert_allclose(stored[:, :3] / 65535, (result.texturing.vertices.colours / 255.0) ** 2.2, atol=0.01)
     normal_view = document["bufferViews"][document["accessors"][attributes["NORMAL"]]["bufferView"]]
     normals = np.frombuffer(data, "<f4", 3 * len(head.vertices), 20 + size + 8 + normal_view["byteOffset"]).reshape(
         -1, 3

@@ -21,7 +21,7 @@ from pipeline.texture.uv_unwrap import Atlas
 from rig.errors import InputError
 from rig.formats.polygon_obj import PolygonMesh, read_polygons
 from rig.mesh import Mesh
-from tests.support.textured_results import PLACE, textured_result
+from tests.support.made_up_results import PLACE, textured_result
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,69 @@
+"""All that the cameras see as one closed surface, in the photographs' colours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.dense.surface.fusion import BustSurface, fuse
+from pipeline.dense.surface.signed_distance import NoSurface
+from pipeline.dense.surface.skin import part_of
+from pipeline.diagnostics import ReportWarning
+from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.depth import Depth
+from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.refined_head import RefinedHead
+from pipeline.stages.views import Views
+from pipeline.texture.vertex_colours import texture
+from rig.capture import Capture
+from rig.mesh import Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bust:
+    """A closed surface of all that the cameras see, with its colours (sRGB). ``views`` are the images that coloured a
+    vertex, 0 = filled from its neighbours."""
+
+    surface: BustSurface
+    normals: Float[np.ndarray, "v 3"]
+    colours: UInt8[np.ndarray, "v 3"]
+    views: UInt8[np.ndarray, " v"]
+    spacing_mm: float
+
+    @property
+    def mesh_world(self) -> Mesh:
+        return self.surface.mesh_world
+
+
+@stage("bust")
+def fuse_bust(
+    context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, coloured: Capture
+) -> Staged[Bust | None]:
+    """Fuses the depth maps to one closed mesh in the colours of ``coloured``, hidden by its own parts where these stand
+    before each other.
+
+    Returns None where the settings do not ask for it, and None with the warning ``no-bust`` where fewer than three
+    views know any depth.
+    """
+    settings, rig, displaced = context.settings, context.rig, refined.displaced
+    if settings.outputs.surface == "head":
+        return Staged(None)
+    try:
+        surface = fuse(
+            depth.maps,
+            views.silhouettes,
+            rig,
+            refined.mesh_world,
+            depth.votes,
+            depth.window_bias,
+            settings.bust,
+            head_skin_world=None if displaced is None else part_of(refined.mesh_world, displaced.observed),
+            report=context.progress,
+        )
+    except NoSurface as reason:
+        return Staged(None, [ReportWarning("no-bust", str(reason))])
+    mesh = surface.mesh_world
+    normals, depths = mesh.normals(), depth_maps(rig, mesh)
+    colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings.texture)
+    return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm), surface.warnings)

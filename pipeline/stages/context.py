@@ -1,0 +1,51 @@
+"""What every stage of one reconstruction may read."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+from pipeline.eigenheads.model import HeadModel
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.settings import Settings
+from pipeline.silhouettes.segment import segment
+from rig.capture import Capture
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+
+Progress = Callable[[str, float], None]
+Segment = Callable[..., dict[str, Silhouette]]
+
+
+def discard_progress(stage: str, fraction: float) -> None:
+    """Does nothing: the progress of work that nobody waits for."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReconstructionContext:
+    """One capture with all that decides its reconstruction, and the resources that the caller owns.
+
+    Attributes:
+        capture: the shot as it was read.
+        rig: the cameras as calibrated.
+        model: the head model with all its modes.
+        settings: of this reconstruction.
+        renderer: an OpenGL context of the calling thread.
+        progress: called with a stage's name and the share of it that is done; may raise Cancelled.
+        segment: finds the silhouettes of a capture; a caller that caches them passes its own.
+    """
+
+    capture: Capture
+    rig: Rig
+    model: HeadModel
+    settings: Settings
+    renderer: Renderer
+    progress: Progress = discard_progress
+    segment: Segment = field(default=segment)
+
+    def within_stage(self, name: str) -> "ReconstructionContext":
+        """Returns the context whose progress is reported under ``name``, whatever a part of that stage calls itself."""
+        return replace(self, progress=partial(_report_as, self.progress, name))
+
+
+def _report_as(progress: Progress, stage: str, _: str, fraction: float) -> None:
+    progress(stage, fraction)

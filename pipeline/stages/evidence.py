@@ -1,0 +1,112 @@
+"""What the delivered head is worth: how it explains every camera, what it measures, which face it makes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.evidence.camera_metrics import CameraFigures, camera_figures, start_masks
+from pipeline.evidence.expression import (
+    LEAST_SIGMA,
+    READ_SIGMA,
+    Found,
+    Posable,
+    found_expressions,
+    posable_head,
+    shut_eyes,
+)
+from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
+from pipeline.evidence.plausibility import plausibility_warnings
+from pipeline.fitting.expression_evidence import makes_face
+from pipeline.fitting.fine.blink import blinks_of, with_lids
+from pipeline.fitting.fine.expression_reading import with_read_expression
+from pipeline.fitting.fine.refine import Displaced
+from pipeline.fitting.fit import Fit
+from pipeline.stages.alignment import Alignment
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.refined_head import RefinedHead
+from pipeline.stages.texturing import Texturing
+from pipeline.stages.views import Views
+
+Masks = Mapping[str, Bool[np.ndarray, "h w"]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Figures of the delivered head. Mappings by camera have every camera of the rig."""
+
+    start_masks: Masks  # of the head that the fit started from
+    fitted_masks: Masks
+    cameras: Mapping[str, CameraFigures]
+    landmarks: Mapping[str, Landmark]  # world frame
+    measurements: Mapping[str, Measurement]
+    expression: tuple[Found, ...]  # the face that the head makes, the strongest part first
+    posable: Posable | None  # where the settings ask for it
+
+
+@stage("evidence")
+def judge_head(
+    context: ReconstructionContext,
+    views: Views,
+    alignment: Alignment,
+    head: HeadFit,
+    refined: RefinedHead,
+    texturing: Texturing,
+) -> Staged[Evidence]:
+    """Measures the delivered head, and warns of what heads, rigs and masks cannot be."""
+    fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
+    before = start_masks(model, alignment.world_from_head, rig)
+    fitted = {name: np.isfinite(depth) for name, depth in texturing.depths.items()}
+    cameras = camera_figures(model, fit, views.silhouettes, rig, fitted, before)
+    widths_px = {camera.name: camera.intrinsics.width for camera in rig}
+    made, min_sigma, closed_eyes = fit, LEAST_SIGMA, frozenset[str]()
+    if refined.displaced is not None:
+        made, min_sigma = fit_with_read_face(context, head, refined.displaced)
+        closed_eyes = refined.displaced.closed_eyes
+    expression = found_expressions(model, made, min_sigma)
+    posed = outputs.neutral or outputs.morphs
+    evidence = Evidence(
+        before,
+        fitted,
+        cameras,
+        landmarks(model, fit, refined.mesh_world.vertices),
+        measurements(model, fit, refined.mesh_world.vertices),
+        expression,
+        posable_head(model, fit.world_from_head, refined.mesh_world, expression) if posed else None,
+    )
+    warnings = plausibility_warnings(fit, model, cameras, widths_px)
+    return Staged(evidence, [*warnings, *eye_warnings(shut_eyes(model, made) | closed_eyes)])
+
+
+def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced: Displaced) -> tuple[Fit, float]:
+    """Returns the fit with the expression that the deformed head makes, and of how many deviations a weight must be.
+
+    The surface is read where the fit found a made face at all; lids wherever points about the eye decided them.
+    """
+    fit, model, settings = head.fit, head.model, context.settings.fitting
+    rows = blinks_of(model)
+    lids = {side: share for side, share in displaced.lids.items() if share != float(fit.coefficients[rows[side]])}
+    if not makes_face(fit.coefficients, model.posed):
+        return with_lids(fit, model, lids), LEAST_SIGMA
+    read = with_read_expression(
+        fit,
+        model,
+        context.model,
+        displaced.vertices,
+        displaced.observed,
+        eigenheads=min(settings.modes, len(context.model.modes)),
+        median=settings.expression_median,
+    )
+    return with_lids(read, model, lids), LEAST_SIGMA if read is fit else READ_SIGMA
+
+
+def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:
+    """Warns of closed eyes: they are no fault, but most studios want another shot."""
+    if not closed:
+        return []
+    which = "both eyes are" if len(closed) == 2 else f"the {min(closed)} eye is"
+    return [ReportWarning("eyes-closed", f"{which} closed: no white and no iris in the photographs, or lids that meet")]

@@ -1,0 +1,106 @@
+"""Section 4.4 by the solver that the settings name, and what photographs add to it.
+
+Two stages, since what the pixels show is decided in between: ``fit_outlines``, and ``fit_head`` that goes on from it.
+"""
+
+from dataclasses import dataclass
+
+from pipeline.diagnostics import Detail
+from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.model_basis import basis_of, model_basis
+from pipeline.fitting.contour import Solved, finish, solve_contour
+from pipeline.fitting.expression_evidence import with_expression_evidence
+from pipeline.fitting.fit import Fit
+from pipeline.fitting.photo.refine import refine_with_photographs
+from pipeline.fitting.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
+from pipeline.fitting.simplex.hierarchy import fit_simplex
+from pipeline.fitting.span_misfit import with_span_misfit
+from pipeline.settings import PHOTO_LEVELS
+from pipeline.stages.alignment import Alignment
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.part_labels import PartLabels
+from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.views import Views
+from rig.mesh import Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutlineFit:
+    """A head fitted to the outlines alone: the simplex's fit, or the contour solver's state, from which it goes on."""
+
+    solution: Solved | Fit
+    model: HeadModel  # with the modes that the solution has
+    mesh_world: Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadFit:
+    """A fit with its posterior, the model with the modes that it has, and how deep it went."""
+
+    fit: Fit
+    model: HeadModel
+    detail: Detail
+
+    @property
+    def mesh_world(self) -> Mesh:
+        """The fitted head, full level, mm."""
+        return fitted_mesh(self.model, self.fit)
+
+
+def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
+    """Returns the fit's head, full level, world frame, mm."""
+    return Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), model.levels["full"].faces)
+
+
+@stage("fit")
+def fit_outlines(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[OutlineFit]:
+    """Fits shape and pose to the silhouettes, by the simplex or on the rim."""
+    settings, rig = context.settings, context.rig
+    model, features = model_basis(context.model, settings), views.capture.features
+    solved = solve_contour(
+        model,
+        alignment.world_from_head,
+        views.silhouettes,
+        rig,
+        settings.fitting,
+        features=features,
+        report=context.progress,
+    )
+    if settings.method == "simplex":
+        # The simplex never moves the pose, and what seven points leave (3 degrees, 5 mm) would all become shape.
+        fit = fit_simplex(
+            model,
+            solved.state.world_from_head,
+            views.silhouettes,
+            rig,
+            settings.fitting,
+            renderer=context.renderer,
+            report=context.progress,
+        )
+        return Staged(OutlineFit(fit, model, fitted_mesh(model, fit)))
+    state, model = solved.state, solved.problem.model
+    vertices_world = state.world_from_head.apply(model.vertices(state.coefficients))
+    return Staged(OutlineFit(solved, model, Mesh(vertices_world, model.levels["full"].faces)))
+
+
+@stage("fit")
+def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels) -> Staged[HeadFit]:
+    """Goes on with what the photographs show inside the outlines, as deep as settings and photographs let it."""
+    settings, model, solved = context.settings, outlines.model, outlines.solution
+    if isinstance(solved, Fit):
+        return Staged(HeadFit(solved, model, Detail("span", "the simplex searches the eigenheads alone")))
+    detail = Detail("span" if settings.detail == "span" else "kernel", "the settings ask for it")
+    if settings.detail in PHOTO_LEVELS:
+        images, hair = views.capture.images, labels.hair_probability()
+        solved, detail = refine_with_photographs(solved, images, settings.photo, hair=hair)
+    eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
+    relief_mm = settings.photo.fine_amplitude_mm
+    if detail.level == "photo":
+        solved = with_expression_evidence(solved, eigenheads)
+    if detail.level == "span":
+        wider = basis_of(model, eigenheads, kernel=True)
+        return Staged(HeadFit(with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail))
+    if detail.level == "kernel":
+        relief_mm *= RELIEF_OF_OUTLINES
+    fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
+    return Staged(HeadFit(fit, model, detail))

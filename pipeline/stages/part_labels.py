@@ -1,0 +1,46 @@
+"""What the pixels show: skin, hair or clothes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from jaxtyping import Float32
+from numpy import ndarray
+
+from pipeline.dense.parts import HAIR, PartMap, classify_parts
+from pipeline.eigenheads.model import HeadModel
+from pipeline.settings import PHOTO_LEVELS
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.views import Views
+from rig.mesh import Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartLabels:
+    """By camera; empty where no stage needs them."""
+
+    maps: Mapping[str, PartMap]
+
+    def hair_probability(self) -> dict[str, Float32[ndarray, "_ _"]]:
+        """Returns how probably each pixel shows hair, by camera."""
+        return {name: part.probability[..., HAIR] for name, part in self.maps.items()}
+
+
+@stage("parts")
+def label_parts(context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh) -> Staged[PartLabels]:
+    """Labels the pixels of every photograph, seeded by a head of ``model``'s topology (mm)."""
+    settings = context.settings
+    if settings.detail not in PHOTO_LEVELS and settings.outputs.surface == "head":
+        return Staged(PartLabels({}))
+    landmarks_world = {name: head_world.vertices[vertex] for name, vertex in model.landmarks.items()}
+    maps = classify_parts(
+        views.capture.images,
+        views.silhouettes,
+        context.rig,
+        head_world,
+        model.levels["full"].face_region,
+        landmarks_world,
+        settings.parts,
+        report=context.progress,
+    )
+    return Staged(PartLabels(maps))

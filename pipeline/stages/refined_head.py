@@ -1,0 +1,65 @@
+"""The fitted head deformed to the dense surface."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.diagnostics import Detail
+from pipeline.fitting.fine.depth_bias import without_window_bias
+from pipeline.fitting.fine.eyelids import look_at_eyes
+from pipeline.fitting.fine.patch_points import patch_search
+from pipeline.fitting.fine.refine import Displaced, refine_to_surface
+from pipeline.fitting.posterior import vertex_deviation_mm
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.depth import Depth, is_refined
+from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.part_labels import PartLabels
+from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.views import Views
+from rig.mesh import Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedHead:
+    """The head as delivered: the fit's, or that deformed to the dense surface.
+
+    ``deviation_mm``: posterior standard deviation of each vertex; ``displaced``: None where the fit's own head is it.
+    """
+
+    mesh_world: Mesh  # full level, mm
+    deviation_mm: Float[np.ndarray, " v"]
+    detail: Detail
+    displaced: Displaced | None = None
+
+
+@stage("fine")
+def refine_head(
+    context: ReconstructionContext, views: Views, head: HeadFit, labels: PartLabels, depth: Depth
+) -> Staged[RefinedHead]:
+    """Deforms the fitted head to the dense surface where that shows enough of the face."""
+    settings, fit, model, mesh = context.settings, head.fit, head.model, head.mesh_world
+    deviation_mm = vertex_deviation_mm(model, fit)
+    as_fitted = RefinedHead(mesh, deviation_mm, head.detail)
+    if not is_refined(head, settings):
+        return Staged(as_fitted)
+    images = views.capture.images
+    distances = {name: views.silhouettes[name].distance for name, used in fit.used.items() if used}
+    displaced = refine_to_surface(
+        fit,
+        model,
+        without_window_bias(depth.points, depth.on_face, depth.window_bias),
+        settings.fine,
+        eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
+        deviation_mm=deviation_mm,
+        eyes=look_at_eyes(model, mesh.vertices, images, context.rig),
+        patches=patch_search(model, fit, images, distances, labels.hair_probability(), context.rig, settings.photo),
+        report=context.progress,
+    )
+    share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), settings.fine.least_share
+    if share < needed:
+        reason = f"the dense surface shows only {share:.0%} of the face, {needed:.0%} are needed"
+        return Staged(RefinedHead(mesh, deviation_mm, Detail("photo", reason)))
+    detail = Detail("fine", f"the dense surface shows {share:.0%} of the face")
+    refined = Mesh(displaced.vertices, mesh.faces)
+    return Staged(RefinedHead(refined, displaced.deviation_mm, detail, displaced))

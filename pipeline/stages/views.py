@@ -1,0 +1,34 @@
+"""Background subtraction (section 5.4), and which views take part."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.silhouettes.usable_views import usable_views
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.recorder import Staged, stage
+from rig.capture import Capture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """The capture with every picture under its own camera, and its silhouettes; those that take no part are not usable.
+
+    ``assignment``: for each camera that was given another's picture, the name under which its own is filed.
+    """
+
+    capture: Capture
+    silhouettes: Mapping[str, Silhouette]
+    assignment: Mapping[str, str]
+
+
+@stage("segmentation")
+def find_views(context: ReconstructionContext) -> Staged[Views]:
+    """Finds the silhouettes of the capture. Raises TooFewViews, ExchangedPictures, WrongRig."""
+    settings, rig = context.settings, context.rig
+
+    def segmented(capture: Capture) -> dict[str, Silhouette]:
+        return context.segment(capture, rig, settings.segmentation, report=context.progress)
+
+    found = usable_views(context.capture, rig, segmented, exchanged=settings.exchanged_pictures)
+    return Staged(Views(found.capture, found.silhouettes, found.pictures), found.warnings)

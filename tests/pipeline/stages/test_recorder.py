@@ -1,0 +1,73 @@
+"""Stages are run in order, under their own names, and leave warnings and seconds behind."""
+
+import time
+
+import pytest
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.eigenheads.model import load_model
+from pipeline.settings import Settings
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.recorder import Recorder, Staged, stage
+from rig.capture import Capture
+from rig.errors import Cancelled
+from rig.render.renderer import Renderer
+from tests.support.scenes import fan
+
+PAUSE_S = 0.02
+DIM = ReportWarning("view", "cam00: dim")
+
+
+@stage("measure")
+def measure(context: ReconstructionContext, number: int) -> Staged[int]:
+    context.progress("what the room beneath calls itself", 0.5)
+    time.sleep(PAUSE_S)
+    return Staged(number + 1, [DIM])
+
+
+@stage("double")
+def double(context: ReconstructionContext, number: int, *, times: int) -> Staged[int]:
+    return Staged(number * times)
+
+
+@pytest.fixture
+def context(renderer: Renderer) -> ReconstructionContext:
+    return ReconstructionContext(Capture({}), fan(), load_model(), Settings(), renderer)
+
+
+def test_products_pass_on_and_progress_has_the_name_of_the_stage(context: ReconstructionContext) -> None:
+    seen: list[tuple[str, float]] = []
+
+    def note(name: str, fraction: float) -> None:
+        seen.append((name, fraction))
+
+    run = Recorder(note)
+    assert run(double, _told_to(context, note), run(measure, _told_to(context, note), 1), times=3) == 6
+    assert seen == [("measure", 0.0), ("measure", 0.5), ("double", 0.0)]
+    assert run.warnings == (DIM,)
+
+
+def test_two_visits_of_a_stage_share_its_seconds(context: ReconstructionContext) -> None:
+    run = Recorder(lambda name, fraction: None)
+    for _ in range(2):
+        run(measure, context, 1)
+    seconds = run.seconds()
+    assert list(seconds) == ["measure", "total"]
+    assert 2 * PAUSE_S <= seconds["measure"] <= seconds["total"]
+
+
+def test_a_cancelled_job_begins_no_stage(context: ReconstructionContext) -> None:
+    def cancel(name: str, fraction: float) -> None:
+        raise Cancelled
+
+    run = Recorder(cancel)
+    with pytest.raises(Cancelled):
+        run(measure, context, 1)
+    assert list(run.seconds()) == ["total"]
+    assert run.warnings == ()
+
+
+def _told_to(context: ReconstructionContext, progress) -> ReconstructionContext:
+    return ReconstructionContext(
+        context.capture, context.rig, context.model, context.settings, context.renderer, progress
+    )

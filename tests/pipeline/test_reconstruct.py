@@ -1,0 +1,69 @@
+"""The order of the stages, a job that is cancelled in any of them, and a result with a warning that is refused."""
+
+from dataclasses import replace
+
+import pytest
+
+from pipeline.eigenheads.model import load_model
+from pipeline.evidence.plausibility import ImplausibleResult
+from pipeline.reconstruct import reconstruct
+from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
+from rig.capture import Remark
+from rig.errors import Cancelled
+from rig.render.renderer import Renderer
+from rig.studio.scene.simulate import SimulatedCapture
+
+STAGES = (
+    "segmentation", "alignment", "fit", "parts", "fit", "depth", "fine", "texture", "bust", "evidence", "done",
+)  # fmt: skip
+SPAN = Settings(detail="span", outputs=OutputSettings(surface="head"))
+
+
+def context_of(half_size_shot: SimulatedCapture, renderer: Renderer) -> ReconstructionContext:
+    return ReconstructionContext(half_size_shot.capture, half_size_shot.rig, load_model(), SPAN, renderer)
+
+
+@pytest.mark.slow
+def test_stages_come_in_the_order_of_the_method(half_size_shot: SimulatedCapture, renderer: Renderer) -> None:
+    visits: list[str] = []
+    fractions: dict[str, list[float]] = {}
+
+    def note(name: str, fraction: float) -> None:
+        if fraction == 0.0 or name == "done":
+            visits.append(name)
+        fractions.setdefault(name, []).append(fraction)
+
+    result = reconstruct(replace(context_of(half_size_shot, renderer), progress=note))
+    began = [name for i, name in enumerate(visits) if i == 0 or visits[i - 1] != name]
+    assert tuple(began) == STAGES
+    assert set(result.seconds) == {*STAGES, "total"} - {"done"}
+    assert all(0.0 <= fraction <= 1.0 for told in fractions.values() for fraction in told)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("visit", range(len(STAGES) - 1), ids=[f"{k}-{name}" for k, name in enumerate(STAGES[:-1])])
+def test_a_job_is_cancelled_in_any_stage(visit: int, half_size_shot: SimulatedCapture, renderer: Renderer) -> None:
+    begun: list[str] = []
+
+    def cancel(name: str, fraction: float) -> None:
+        if not begun or begun[-1] != name:
+            begun.append(name)
+        if len(begun) > visit:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        reconstruct(replace(context_of(half_size_shot, renderer), progress=cancel))
+    assert tuple(begun) == STAGES[: visit + 1]
+
+
+@pytest.mark.slow
+def test_a_warning_that_the_settings_name_refuses_the_result(
+    half_size_shot: SimulatedCapture, renderer: Renderer
+) -> None:
+    context = context_of(half_size_shot, renderer)
+    capture = replace(context.capture, remarks=(Remark("file-unread", "notes.txt is not read"),))
+    noticed = replace(context, capture=capture)
+    assert "file-unread" in [warning.code for warning in reconstruct(noticed).warnings]
+    with pytest.raises(ImplausibleResult, match=r"file-unread: notes\.txt"):
+        reconstruct(replace(noticed, settings=replace(SPAN, fail_on=("file-unread",))))
