@@ -1,0 +1,176 @@
+"""Faces in one picture, with 468 points on each.
+
+Enters: a picture as it was taken, turned as it may be. Leaves: ``FaceDetection``. The finder proposes faces in the
+picture turned by each quarter (it bears 45 degrees either way); a proposal is a face where the landmark network, whose
+crop then follows the points, says so. It looks at the face and at its mirror image, and the points are the means.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.faces.crops import Crop, Pyramid, in_picture, make_pyramid
+from pipeline.faces.networks import EYE_SIZE, FINDER_SIZE, LANDMARK_SIZE, FaceNetworks
+from pipeline.faces.points import (
+    CHIN,
+    FOREHEAD,
+    LEFT_EYE_CORNERS,
+    RIGHT_EYE_CORNERS,
+    mirror_images,
+)
+from rig.capture import ImageRgb
+
+QUARTER_TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+CROP_OF_FACE = 1.5  # side of a crop by the larger side of the points in it
+EYE_CROP_OF_WIDTH = 2.3  # side of an eye's crop by the distance of its corners, as the network was trained
+ROUNDS = 3  # after which points move by less than 1 % of a face
+MIN_PROPOSAL = -1.0  # the finder's score; faces to 65 degrees have 0.3 or more
+MAX_PROPOSALS = 6
+MIN_SCORE = 0.0  # the landmark network's
+SAME_FACE = 0.5  # of the size of a face: as near as the centres of two boxes of one may lie
+SAME_WAY_UP_DEG = 60.0
+MAX_CELLS = 200  # a face lights some thirty
+RIGHT_EYE, LEFT_EYE = 2, 3  # rows of the finder's faces
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceDetection:
+    """A face in a picture (its own, distorted pixels; (0, 0) is the centre of the top-left one).
+
+    ``roll_deg`` is how far the face's upright is turned clockwise in the picture. ``irises_px`` holds centre, left,
+    top, right and bottom of the right eye's iris (the subject's), then of the left one's.
+    """
+
+    landmarks_px: Float[np.ndarray, "468 2"]
+    depth_px: Float[np.ndarray, " 468"]  # away from the camera, from the face's middle; a guess
+    score: float  # of the landmark network: 15 to 55 on faces, below 0 elsewhere
+    box_px: Float[np.ndarray, " 4"]  # left, top, right, bottom of the points
+    roll_deg: float
+    irises_px: Float[np.ndarray, "10 2"] | None = None
+
+    @property
+    def size_px(self) -> float:
+        """The larger side of the points' box, level with the face."""
+        return crop_around(self.landmarks_px).side_px / CROP_OF_FACE
+
+
+def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
+    """Finds the faces in a picture, best first: first the whole is searched, then, without any, nine parts of it."""
+    pyramid = make_pyramid(image)
+    for frames in (_whole(pyramid), _parts(pyramid)):
+        found = _verified(pyramid, _proposals(pyramid, frames, networks), networks)
+        if found:
+            return found
+    return ()
+
+
+def find_face_at(pyramid: Pyramid, crop: Crop, networks: FaceNetworks, *, rounds: int = ROUNDS) -> FaceDetection:
+    """Places the points on the face in a crop, which follows them; the score says whether there was one."""
+    for _ in range(rounds - 1):
+        points, _, _ = _place(pyramid, crop, networks)
+        crop = crop_around(points)
+    straight = _place(pyramid, crop, networks)
+    turned = _place(pyramid, Crop(crop.centre_px, crop.side_px, crop.roll_deg, mirrored=True), networks)
+    points = (straight[0] + turned[0]) / 2
+    box = np.concatenate([points.min(axis=0), points.max(axis=0)])
+    score = max(straight[2], turned[2])
+    return FaceDetection(points, (straight[1] + turned[1]) / 2, score, box, crop_around(points).roll_deg)
+
+
+def crop_around(points_px: Float[np.ndarray, "468 2"]) -> Crop:
+    """The crop that the landmark network wants around points like those that it places."""
+    right = points_px[list(LEFT_EYE_CORNERS)].mean(axis=0) - points_px[list(RIGHT_EYE_CORNERS)].mean(axis=0)
+    down = points_px[CHIN] - points_px[FOREHEAD]
+    across = right + (down[1], -down[0])  # in a profile the eyes say nothing of the roll, chin and forehead do
+    roll = np.arctan2(across[1], across[0])
+    level = np.array([[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]])
+    turned = points_px @ level.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    return Crop((low + high) / 2 @ level, CROP_OF_FACE * float((high - low).max()), float(np.rad2deg(roll)))
+
+
+def _place(
+    pyramid: Pyramid, crop: Crop, networks: FaceNetworks
+) -> tuple[Float[np.ndarray, "468 2"], Float[np.ndarray, " 468"], float]:
+    """Pixels, depths and score of the points in a crop."""
+    points, score = networks.place_landmarks(pyramid.sample(crop, LANDMARK_SIZE))
+    if crop.mirrored:
+        points = points[mirror_images()]
+    pixels = in_picture(points[:, :2], crop.picture_from_crop(LANDMARK_SIZE))
+    return pixels, points[:, 2] * crop.side_px / LANDMARK_SIZE, score
+
+
+def _whole(pyramid: Pyramid) -> list[Crop]:
+    """The picture as one square."""
+    return [Crop((pyramid.size_px - 1) / 2, float(pyramid.size_px.max()), 0.0)]
+
+
+def _parts(pyramid: Pyramid) -> list[Crop]:
+    """Squares of half the picture's longer side that overlap by half, where it has pixels to show in them."""
+    side = float(pyramid.size_px.max()) / 2
+    if side < FINDER_SIZE:
+        return []
+    width, height = pyramid.size_px
+    columns, rows = (np.unique(np.clip(np.arange(3) * side / 2 + side / 2, 0, limit)) for limit in (width, height))
+    return [Crop(np.array([x, y]) - 0.5, side, 0.0) for y in rows for x in columns]
+
+
+def _proposals(pyramid: Pyramid, frames: Sequence[Crop], networks: FaceNetworks) -> list[Crop]:
+    """Crops in which the finder sees a face, best first; of one face a crop for each way up."""
+    seen = [
+        proposal
+        for frame in frames
+        for turn in QUARTER_TURNS_DEG
+        for proposal in _seen(pyramid, Crop(frame.centre_px, frame.side_px, turn), networks)
+    ]
+    chosen: list[Crop] = []
+    for _, crop in sorted(seen, key=lambda proposal: -proposal[0]):
+        if not any(_is_same(crop, other) and _angle_deg(crop, other) < SAME_WAY_UP_DEG for other in chosen):
+            chosen.append(crop)
+    return chosen[:MAX_PROPOSALS]
+
+
+def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tuple[float, Crop]]:
+    """Score and crop of what the finder sees in one square: of each face its best cell."""
+    faces, scores = networks.find(pyramid.sample(frame, FINDER_SIZE))
+    picture_from_crop = frame.picture_from_crop(FINDER_SIZE)
+    centres: list[Float[np.ndarray, " 2"]] = []
+    for cell in np.argsort(-scores, kind="stable")[:MAX_CELLS]:
+        if scores[cell] < MIN_PROPOSAL or len(centres) >= MAX_PROPOSALS:
+            return
+        size = float(faces[cell, 1].max())
+        if size <= 0.0 or any(np.linalg.norm(faces[cell, 0] - centre) < SAME_FACE * size for centre in centres):
+            continue
+        centres.append(faces[cell, 0])
+        eyes = faces[cell, LEFT_EYE] - faces[cell, RIGHT_EYE]
+        roll = frame.roll_deg + float(np.rad2deg(np.arctan2(eyes[1], eyes[0])))
+        centre = in_picture(faces[cell, :1], picture_from_crop)[0]
+        yield float(scores[cell]), Crop(centre, CROP_OF_FACE * size * frame.side_px / FINDER_SIZE, roll)
+
+
+def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
+    """The proposals that are faces, best first, each face once: by the score of a first look, the most likely first."""
+    looks = [_place(pyramid, crop, networks) for crop in proposals]
+    chosen: list[FaceDetection] = []
+    for points, _, _ in sorted(looks, key=lambda look: -look[2]):
+        crop = crop_around(points)
+        if any(_is_same(crop, crop_around(face.landmarks_px)) for face in chosen):
+            continue
+        face = find_face_at(pyramid, crop, networks, rounds=ROUNDS - 1)
+        if face.score >= MIN_SCORE and not any(
+            _is_same(crop_around(face.landmarks_px), crop_around(other.landmarks_px)) for other in chosen
+        ):
+            chosen.append(face)
+    return tuple(sorted(chosen, key=lambda face: -face.score))
+
+
+def _is_same(a: Crop, b: Crop) -> bool:
+    """Whether two crops are of one face, however they are turned."""
+    return bool(np.linalg.norm(a.centre_px - b.centre_px) < SAME_FACE / CROP_OF_FACE * max(a.side_px, b.side_px))
+
+
+def _angle_deg(a: Crop, b: Crop) -> float:
+    """The angle between what is upright in two crops, 0 to 180."""
+    return abs((a.roll_deg - b.roll_deg + 180.0) % 360.0 - 180.0)
