@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.faces.crops import Crop, Pyramid, in_picture, make_pyramid
-from pipeline.faces.networks import EYE_SIZE, FINDER_SIZE, LANDMARK_SIZE, FaceNetworks
+from pipeline.faces.networks import FINDER_SIZE, LANDMARK_SIZE, FaceNetworks
 from pipeline.faces.points import (
     CHIN,
     FOREHEAD,
     LEFT_EYE_CORNERS,
     RIGHT_EYE_CORNERS,
-    mirror_images,
+    point_table,
 )
 from rig.capture import ImageRgb
 
@@ -58,7 +58,11 @@ class FaceDetection:
 
 def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
     """Finds the faces in a picture, best first: first the whole is searched, then, without any, nine parts of it."""
-    pyramid = make_pyramid(image)
+    return find_faces_in(make_pyramid(image), networks)
+
+
+def find_faces_in(pyramid: Pyramid, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
+    """Does what ``find_faces`` does with a picture whose halves are at hand."""
     for frames in (_whole(pyramid), _parts(pyramid)):
         found = _verified(pyramid, _proposals(pyramid, frames, networks), networks)
         if found:
@@ -97,7 +101,7 @@ def _place(
     """Pixels, depths and score of the points in a crop."""
     points, score = networks.place_landmarks(pyramid.sample(crop, LANDMARK_SIZE))
     if crop.mirrored:
-        points = points[mirror_images()]
+        points = points[point_table().mirror_images]
     pixels = in_picture(points[:, :2], crop.picture_from_crop(LANDMARK_SIZE))
     return pixels, points[:, 2] * crop.side_px / LANDMARK_SIZE, score
 

@@ -4,7 +4,7 @@ Enters: one pixel per camera. Leaves: the world point with its covariance. The s
 (linear least squares), and lens distortion is part of the projection, so nothing is undistorted first.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +12,12 @@ from jaxtyping import Float
 
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.terms import Problem, Residuals
-from rig.camera import CameraStack
+from rig.camera import Camera, CameraStack
 from rig.errors import EigenheadError
 from rig.rig import Rig
 
 LIMITS = Limits(steps=50, tolerance=1e-12, tries=6)  # a step of 1e-6 standard deviations
+STEPS = 10  # of many points at once; noisy ones move by less than 1e-6 of their deviation after five
 RAYS_APART_LEAST = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
 
 
@@ -87,6 +88,82 @@ def triangulate(
 def rays_of(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig) -> dict[str, Float[np.ndarray, " 3"]]:
     """The unit direction in the world of each view's ray; taking the lens off it costs most of a triangulation."""
     return {name: rig[name].rays_world(np.asarray(pixel, float)[None])[0] for name, pixel in pixels.items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangulatedPoints:
+    """World points (mm), their covariances (mm^2), and what each view says against them (measured minus projected)."""
+
+    positions_world: Float[np.ndarray, "n 3"]
+    covariances: Float[np.ndarray, "n 3 3"]
+    residuals_px: Float[np.ndarray, "v n 2"]
+
+
+def triangulate_many(
+    pixels: Float[np.ndarray, "v n 2"], cameras: Sequence[Camera], noise_px: Float[np.ndarray, "v n"]
+) -> TriangulatedPoints:
+    """Triangulates many points, each seen by every camera, as ``triangulate`` does one.
+
+    Args:
+        pixels: of each point in each view.
+        cameras: of the views.
+        noise_px: standard deviation of a coordinate of each pixel; infinite where a view says nothing of a point.
+
+    Raises NoPoint where a point's rays are parallel, where it lies behind a camera, or a pixel outside its lens.
+    """
+    rays = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
+    centres = np.stack([camera.centre_world for camera in cameras])
+    points = _nearest_to_rays(rays, centres, noise_px)
+    weights = 1.0 / noise_px[..., None]
+    at_points = _whitened(points, pixels, cameras, weights)
+    if not np.isfinite(at_points[0]).all():
+        raise NoPoint("the rays of a point meet behind a camera")
+    for _ in range(STEPS):
+        residual, slopes = at_points
+        matrix = np.einsum("vnki,vnkj->nij", slopes, slopes)
+        step = np.linalg.solve(matrix, -np.einsum("vnki,vnk->ni", slopes, residual)[..., None])[..., 0]
+        moved = _whitened(points + step, pixels, cameras, weights)
+        better = (moved[0] ** 2).sum(axis=(0, 2)) < (residual**2).sum(axis=(0, 2))
+        if not better.any():
+            break
+        points = np.where(better[:, None], points + step, points)
+        at_points = (
+            np.where(better[None, :, None], moved[0], residual),
+            np.where(better[None, :, None, None], moved[1], slopes),
+        )
+    covariances = np.linalg.inv(np.einsum("vnki,vnkj->nij", at_points[1], at_points[1]))
+    projected = np.stack([camera.project(points) for camera in cameras])
+    return TriangulatedPoints(points, covariances, pixels - projected)
+
+
+def _nearest_to_rays(
+    rays_world: Float[np.ndarray, "v n 3"], centres_world: Float[np.ndarray, "v 3"], noise: Float[np.ndarray, "v n"]
+) -> Float[np.ndarray, "n 3"]:
+    """For each point the one with the least weighted sum of squared distances to its rays."""
+    if not np.isfinite(rays_world).all():
+        raise NoPoint("a pixel lies where the lens model of its camera sees nothing")
+    weights = 1.0 / noise**2
+    weights = weights / weights.sum(axis=0)
+    off_rays = np.eye(3) - rays_world[..., :, None] * rays_world[..., None, :]
+    normal = np.einsum("vn,vnij->nij", weights, off_rays)
+    if np.linalg.eigvalsh(normal)[:, 0].min() < RAYS_APART_LEAST**2:
+        raise NoPoint("the rays of a point are parallel")
+    right = np.einsum("vn,vnij,vj->ni", weights, off_rays, centres_world)
+    return np.linalg.solve(normal, right[..., None])[..., 0]
+
+
+def _whitened(
+    points: Float[np.ndarray, "n 3"],
+    pixels: Float[np.ndarray, "v n 2"],
+    cameras: Sequence[Camera],
+    weights: Float[np.ndarray, "v n 1"],
+) -> tuple[Float[np.ndarray, "v n 2"], Float[np.ndarray, "v n 2 3"]]:
+    """``(projected - measured) / noise`` and its slopes; infinite for points behind a camera, 0 without a weight."""
+    projected, slopes = zip(*(camera.project_with_jacobian(points) for camera in cameras), strict=True)
+    counts = weights > 0.0
+    residual = np.where(counts, weights * (np.stack(projected) - pixels), 0.0)
+    slopes = np.where(counts[..., None], weights[..., None] * np.stack(slopes), 0.0)
+    return np.where(np.isfinite(residual), residual, np.inf), slopes
 
 
 def _start(rays_world: Mapping[str, Float[np.ndarray, " 3"]], rig: Rig) -> Float[np.ndarray, " 3"]:
