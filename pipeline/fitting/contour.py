@@ -22,6 +22,7 @@ from pipeline.fitting.problem import (
     FIRST_CORRELATION_PX,
     POSE,
     ContourProblem,
+    LandmarkObservations,
     RimNoise,
     Stage,
     StageEvidence,
@@ -78,10 +79,11 @@ def solve_contour(
     settings: FittingSettings,
     *,
     features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
+    landmarks: LandmarkObservations | None = None,
     report: Callable[[str, float], None] = lambda stage, fraction: None,
 ) -> Solved:
     """``fit_contour`` without its covariance."""
-    problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {})
+    problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
     state, spent, reason = run_stage(problem, evidence, state, few, lambda f: report("fit", 0.2 * f))

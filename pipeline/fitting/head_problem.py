@@ -1,10 +1,11 @@
-"""The complete problem of one stage at one robust scale: rim, feature points, photographs and priors as terms."""
+"""The complete problem of one stage at one robust scale: rim, feature points, landmarks, photographs and priors as terms."""
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.estimation.terms import Linearised, Problem, Sum, Term
 from pipeline.fitting.feature_term import FeatureTerm
+from pipeline.fitting.landmark_term import LandmarkTerm
 from pipeline.fitting.prior_term import PriorTerm
 from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State
 from pipeline.fitting.rim_term import RimAt, RimTerm
@@ -58,6 +59,8 @@ def _other_terms(problem: ContourProblem, evidence: StageEvidence, stage: Stage)
     terms: list[Term[State]] = []
     if problem.features is not None:
         terms.append(FeatureTerm(problem, problem.features, stage))
+    if problem.landmarks is not None:
+        terms.append(LandmarkTerm(problem.landmarks, stage, len(problem.views.names)))
     if evidence.photographs is not None:
         terms.append(SurfaceTerm(evidence.photographs.surface, stage))
     return [*terms, PriorTerm(problem, stage)]

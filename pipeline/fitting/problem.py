@@ -56,6 +56,20 @@ class Observed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LandmarkObservations:
+    """Places of the face that were found in the world (mm). ``corner`` and ``blend``: vertices of the full level and
+    their weights; ``whiten``: takes a difference (mm) to standard deviations; ``mean`` and ``basis``: the places of the
+    mean head and what the modes do to them, head frame."""
+
+    corner: Int[np.ndarray, "n 3"]
+    blend: Float[np.ndarray, "n 3"]
+    position_world: Float[np.ndarray, "n 3"]
+    whiten: Float[np.ndarray, "n 3 3"]
+    mean: Float[np.ndarray, "n 3"]
+    basis: Float32[np.ndarray, "m n 3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LevelBasis:
     """Mean and modes contiguous by vertex, and what takes them to the level: for a decimated level its own rows (2 MB),
     for the full one the cage's, through the level's operator (the full level's own rows would be 40 to 170 MB)."""
@@ -83,6 +97,7 @@ class ContourProblem:
     camera_information: Float[np.ndarray, "k 6 6"]  # inverse prior covariance
     features: Observed | None
     settings: FittingSettings
+    landmarks: LandmarkObservations | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,6 +159,7 @@ def make_problem(
     settings: FittingSettings,
     features: Mapping[str, Mapping[str, np.ndarray]],
     levels: tuple[str, ...] = ("p95", "full"),
+    landmarks: LandmarkObservations | None = None,
 ) -> ContourProblem:
     """Packs what stays fixed. Raises ValueError if no silhouette is usable."""
     usable = {name: s.distance for name, s in silhouettes.items() if s.quality.usable and name in rig}
@@ -161,6 +177,7 @@ def make_problem(
         camera_information=np.stack(information),
         features=pack_features(model, views.names, features),
         settings=settings,
+        landmarks=landmarks,
     )
 
 
@@ -225,14 +242,29 @@ def landmark_basis(
     return mean, model.basis("full", len(model.modes), vertex)
 
 
+def blended_basis(
+    model: HeadModel, corner: Int[np.ndarray, "n 3"], blend: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
+    """Mean and all modes at places within triangles of the full level."""
+    rows, inverse = np.unique(corner, return_inverse=True)
+    mean, basis = landmark_basis(model, rows)
+    at = inverse.reshape(corner.shape)
+    blended = np.einsum("mnkc,nk->mnc", basis[:, at], blend.astype(np.float32), optimize=True)
+    return (mean[at] * blend[:, :, None]).sum(axis=1), blended
+
+
 def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
     """The same problem with a model of the same mesh that has more modes, solved on ``levels``."""
     features = problem.features
     if features is not None:
         mean, basis = landmark_basis(model, features.vertex)
         features = replace(features, mean=mean, basis=basis)
+    landmarks = problem.landmarks
+    if landmarks is not None:
+        mean, basis = blended_basis(model, landmarks.corner, landmarks.blend)
+        landmarks = replace(landmarks, mean=mean, basis=basis)
     bases = {name: level_basis(model, name) for name in levels}
-    return replace(problem, model=model, bases=bases, features=features)
+    return replace(problem, model=model, bases=bases, features=features, landmarks=landmarks)
 
 
 def start_state(problem: ContourProblem, world_from_head: Similarity) -> State:

@@ -27,6 +27,7 @@ from calibration.silhouette_refinement.tangency_term import PackedTangencies, Ta
 from pipeline.estimation.terms import NormalEquations, Residuals
 from pipeline.fitting.feature_term import FeatureTerm
 from pipeline.fitting.head_problem import apply_step
+from pipeline.fitting.landmark_term import LandmarkTerm, observe_landmarks
 from pipeline.fitting.prior_term import PriorTerm
 from pipeline.fitting.problem import (
     PER_CAMERA,
@@ -197,6 +198,21 @@ def features_of_a_head() -> Case:
     )
 
 
+def landmarks_of_a_head() -> Case:
+    """Places within triangles, found some mm off, with covariances that are no multiples of the identity."""
+    problem, stage, state = head()
+    rng, faces = np.random.default_rng(7), problem.model.levels["full"].faces
+    corner, blend = faces[::40], rng.dirichlet(np.ones(3), len(faces[::40]))
+    found = (problem.model.vertices(np.zeros(0))[corner] * blend[:, :, None]).sum(axis=1)
+    spread = rng.standard_normal((len(corner), 3, 3))
+    covariance = spread @ spread.transpose(0, 2, 1) + np.eye(3)
+    observed = observe_landmarks(problem.model, corner, blend, found + rng.normal(0.0, 2.0, found.shape), covariance)
+    term = LandmarkTerm(observed, stage, len(problem.views.names))
+    return replace(
+        case(term, state, lambda s, step: apply_step(s, step, stage), head_steps(problem, stage)), tolerance=1e-4
+    )
+
+
 def surface_of_a_head() -> Case:
     problem, stage, state = head()
     rng, rows, cameras = np.random.default_rng(6), np.arange(0, 600, 20), 6 * len(problem.views.names)
@@ -227,6 +243,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "square pixels": aspects,
     "rim of a head": rim_of_a_head,
     "feature points of a head": features_of_a_head,
+    "landmarks of a head": landmarks_of_a_head,
     "surface in photographs": surface_of_a_head,
 }
 
