@@ -9,11 +9,12 @@ Row = dict[str, Any]  # of one subject: each experiment has its own quantities
 
 class Outcome(TypedDict):
     """``figures`` is flat: every number that README and docs quote. ``markdown`` and ``pictures`` go to files, the
-    rest is printed."""
+    rest is printed; for people ``lines`` in place of the figures."""
 
     figures: dict[str, float]
     rows: list[Row] | dict[str, list[Row]]
     markdown: NotRequired[str]
+    lines: NotRequired[list[str]]
     pictures: NotRequired[dict[str, np.ndarray]]
     machine: NotRequired[str]
     planned_directions_deg: NotRequired[list[tuple[int, int]]]

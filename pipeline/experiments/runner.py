@@ -2,7 +2,7 @@
 that they leave: rows (so that a stopped run goes on), a Markdown table, pictures."""
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from pipeline.experiments.levels import levels
 from pipeline.experiments.light import light
 from pipeline.experiments.limit import limit
 from pipeline.experiments.outcome import Outcome
+from pipeline.experiments.people import people
 from pipeline.experiments.planted import planted
 from pipeline.experiments.posterior_check import posterior_check
 from pipeline.experiments.repeat import repeat
@@ -65,6 +66,9 @@ class Task:
     simplex: int | None = None
     captures: bool = False
     openmvs: Path | None = None
+    folders: Sequence[Path] = ()
+    only: Sequence[str] = ()
+    detail: str | None = None
 
 
 def run_experiment(
@@ -78,16 +82,21 @@ def run_experiment(
     simplex: int | None = None,
     captures: bool = False,
     openmvs: Path | None = None,
+    folders: Sequence[Path] = (),
+    only: Sequence[str] = (),
+    detail: str | None = None,
 ) -> Outcome:
     """Figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a table and
     pictures are left there. ``simplex``: how many subjects of a table the simplex fits too;
-    ``captures``: whether those of ``shared`` count beside the studio's heads; ``openmvs``: that peer's programs.
+    ``captures``: whether those of ``shared`` count beside the studio's heads; ``openmvs``: that peer's programs;
+    ``folders``, ``only``, ``detail``: of ``people``, its captures, which of its rows, and how deep.
 
     ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
     """
     if name not in EXPERIMENTS:
         raise UnknownExperiment(name)
-    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, simplex, captures, openmvs))
+    own = (simplex, captures, openmvs, folders, only, detail)
+    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, *own))
     pictures = found.pop("pictures", {})
     text = found.pop("markdown", None) or markdown.of_figures(found["figures"])
     if folder is not None:
@@ -198,6 +207,22 @@ def _surfaces(task: Task) -> Outcome:
         )
 
 
+def _people(task: Task) -> Outcome:
+    captures = list(task.folders) or [path.with_suffix("") for path in _truths(task.shared).values()]
+    with Renderer.create() as renderer:
+        return people(
+            task.head,
+            _facekit(task.shared),
+            captures,
+            renderer=renderer,
+            report=task.report,
+            subjects=task.subjects,
+            only=task.only,
+            detail=task.detail,
+            folder=task.folder,
+        )
+
+
 def _templates(task: Task) -> Outcome:
     count = {"draws": task.subjects} if task.subjects else {}
     facekit = _facekit(task.shared)
@@ -230,6 +255,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "detail": _detail,
     "hidden": _hidden,
     "expressions": _expressions,
+    "people": _people,
     "planted": _drawn(planted),
     "visible": _visible,
     "surfaces": _surfaces,

@@ -5,9 +5,13 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Json, answer, progress_bar
+from server.cli.answers import Json, answer, chosen, progress_bar
 
 app = typer.Typer(rich_markup_mode=None)
+
+
+def _detail_levels() -> tuple[str, ...]:
+    return "span", "kernel", "photo", "fine"
 
 
 @app.command(epilog="Example: eigenhead experiments limit --subjects 3 --json")
@@ -16,12 +20,16 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, planted, "
-            "surfaces, texture, light, templates or real."
+            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, people, "
+            "planted, surfaces, texture, light, templates or real."
         ),
     ],
     folders: Annotated[
-        list[Path] | None, typer.Argument(help="real: captures, or photographs alone, of more views than are used.")
+        list[Path] | None,
+        typer.Argument(
+            help="real: captures, or photographs alone, of more views than are used. people: captures with a truth "
+            "beside them, those of --shared by default."
+        ),
     ] = None,
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
     subjects: Annotated[int | None, typer.Option(help="How many, instead of the experiment's own.", min=1)] = None,
@@ -30,6 +38,14 @@ def experiments(
     ] = None,
     captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
     openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="people: rows of this rig (front-3, circle-24), evidence (plates, masks, neither) or subject alone; "
+            "or eyes. May be repeated."
+        ),
+    ] = None,
+    detail: Annotated[str | None, chosen("people: span, kernel, photo or fine (the default).", _detail_levels)] = None,
     front: Annotated[str | None, typer.Option(help="real: the view that the subject faces.")] = None,
     outlines: Annotated[
         Path | None, typer.Option(help="real: outlines drawn by hand, outlines.json.", exists=True, dir_okay=False)
@@ -44,8 +60,10 @@ def experiments(
     if name == "real":
         _experiment_real(folders or [], model, front, outlines, out, json_out)
         return
-    if folders:
-        raise typer.BadParameter("only real takes folders", param_hint="FOLDERS")
+    if folders and name != "people":
+        raise typer.BadParameter("only real and people take folders", param_hint="FOLDERS")
+    if (only or detail) and name != "people":
+        raise typer.BadParameter("only people takes it", param_hint="--only" if only else "--detail")
     from pipeline.experiments.runner import run_experiment
 
     with progress_bar() as report:
@@ -59,8 +77,12 @@ def experiments(
             shared=shared,
             folder=out,
             report=report,
+            folders=folders or (),
+            only=only or (),
+            detail=detail,
         )
-    answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
+    lines = found.pop("lines", [])
+    answer(found, json_out, lines + [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
 
 
 def _experiment_real(

@@ -1,4 +1,5 @@
-"""Where eleven cameras stand: the default rig, and the four arrangements of section 5.3.
+"""Where cameras stand: the default rig, the four arrangements of section 5.3, and rows, circles and mountings of other
+studios.
 
 Azimuth is counted from the front towards the subject's left, elevation upwards. The world's origin is in the middle of
 the head, y up, z towards the front camera.
@@ -48,20 +49,57 @@ def arrangement(name: str) -> Rig:
     return rig_from_directions(ARRANGEMENTS_DEG[name])
 
 
-def rig_from_directions(directions_deg: Sequence[tuple[int | float, int | float]], seed: int = LENS_SEED) -> Rig:
-    """Cameras at (azimuth, elevation) in degrees, each with a lens and a mounting a little of its own."""
+def row_directions(count: int, spacing_mm: float, distance_mm: float) -> tuple[tuple[float, float], ...]:
+    """Computes directions of a level row of cameras before the face, from the subject's right to its left."""
+    offsets = spacing_mm * (np.arange(count) - (count - 1) / 2)
+    return tuple((float(np.degrees(np.arctan2(offset, distance_mm))), 0.0) for offset in offsets)
+
+
+def circle_directions(count: int, elevations_deg: Sequence[float] = (0.0,)) -> tuple[tuple[float, float], ...]:
+    """Computes directions of a full circle, cam00 at the front; the heights take turns."""
+    azimuths = (np.arange(count) * 360.0 / count + 180.0) % 360.0 - 180.0
+    return tuple((float(azimuth), elevations_deg[i % len(elevations_deg)]) for i, azimuth in enumerate(azimuths))
+
+
+def rig_from_directions(
+    directions_deg: Sequence[tuple[int | float, int | float]],
+    seed: int = LENS_SEED,
+    *,
+    distance_mm: float = DISTANCE_MM,
+    rolls_deg: Sequence[float] = (0.0,),
+) -> Rig:
+    """Cameras at (azimuth, elevation) in degrees, each with a lens and a mounting a little of its own.
+
+    Args:
+        directions_deg: one for each camera.
+        seed: of lenses and mountings.
+        distance_mm: from the middle of the head; the focal length keeps the head's size in the picture.
+        rolls_deg: how far each camera is turned about its axis, clockwise seen from behind it; they take turns.
+    """
     rng = np.random.default_rng(seed)
-    return Rig(tuple(_camera(f"cam{i:02}", *direction, rng) for i, direction in enumerate(directions_deg)))
+    return Rig(
+        tuple(
+            _camera(f"cam{i:02}", *direction, rng, distance_mm, rolls_deg[i % len(rolls_deg)])
+            for i, direction in enumerate(directions_deg)
+        )
+    )
 
 
-def _camera(name: str, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Camera:
+def _camera(
+    name: str,
+    azimuth_deg: float,
+    elevation_deg: float,
+    rng: np.random.Generator,
+    distance_mm: float,
+    roll_deg: float,
+) -> Camera:
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     direction = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    centre = DISTANCE_MM * rng.uniform(0.97, 1.03) * direction + rng.normal(0, 12, 3)
+    centre = distance_mm * rng.uniform(0.97, 1.03) * direction + rng.normal(0, 12, 3)
     target = rng.normal(0, 6, 3) + np.array([0.0, 5.0, 0.0])
-    tilt = rng.normal(0, 0.02)  # nobody mounts a camera upright to the degree
+    tilt = rng.normal(0, 0.02) + np.radians(roll_deg)  # nobody mounts a camera upright to the degree
     up = np.array([np.sin(tilt) * np.cos(azimuth), np.cos(tilt), -np.sin(tilt) * np.sin(azimuth)])
-    focal = FOCAL_PX * rng.uniform(0.97, 1.03)
+    focal = FOCAL_PX * distance_mm / DISTANCE_MM * rng.uniform(0.97, 1.03)
     lens = Distortion(*(rng.uniform(-1, 1, 4) * (0.08, 0.02, 8e-4, 8e-4)))
     cx, cy = rng.uniform(-12, 12, 2) + np.array([WIDTH - 1, HEIGHT - 1]) / 2
     intrinsics = Intrinsics(WIDTH, HEIGHT, focal, focal * rng.uniform(0.999, 1.001), cx, cy, lens)
