@@ -87,7 +87,8 @@ def people(
             | records.row(case.name, partial(judge_case, case, model, settings, renderer))
         )
     report("done", 1.0)
-    return {"figures": figures(rows), "rows": rows, "markdown": table(rows), "lines": table(rows).splitlines()}
+    text = f"{table(rows)}\n{summary_table(rows)}"
+    return {"figures": figures(rows), "rows": rows, "markdown": text, "lines": text.splitlines()}
 
 
 def select_cases(cases: Sequence[Case], only: Sequence[str]) -> list[Case]:
@@ -187,11 +188,19 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
     found = summary("", rows)
     for evidence in EVIDENCE:
         found |= summary(f"{evidence}_", [row for row in rows if row["evidence"] == evidence])
-    for kind in sorted({row["kind"] for row in rows}, key=_by_count):
-        for evidence in EVIDENCE:
-            of = [row for row in rows if (row["kind"], row["evidence"]) == (kind, evidence)]
-            found |= summary(f"{kind}_{evidence}_", of)
+    for kind, evidence in groups(rows):
+        found |= summary(f"{kind}_{evidence}_", _of_group(rows, kind, evidence))
     return found
+
+
+def groups(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """Returns kinds and evidence that rows have, few cameras first."""
+    there = {(row["kind"], row["evidence"]) for row in rows}
+    return sorted(there, key=lambda group: (*_by_count(group[0]), EVIDENCE.index(group[1])))
+
+
+def _of_group(rows: Sequence[Row], kind: str, evidence: str) -> list[Row]:
+    return [row for row in rows if (row["kind"], row["evidence"]) == (kind, evidence)]
 
 
 def summary(prefix: str, rows: Sequence[Row]) -> dict[str, float]:
@@ -226,6 +235,20 @@ def table(rows: Sequence[Row]) -> str:
     )
     order = sorted(rows, key=lambda row: (*_by_count(row["kind"]), EVIDENCE.index(row["evidence"]), row["subject"]))
     return markdown.table(header, [_cells(row) for row in order])
+
+
+def summary_table(rows: Sequence[Row]) -> str:
+    """Writes a Markdown table, a row for each kind of rig with each evidence."""
+    keys = ("rows", "refused", "crashed", "unwarned_share", "worst_unwarned_turn_deg", "worst_unwarned_shift_mm")
+    header = (
+        *("rig", "evidence", "rows", "refused", "crashed", "share not warned of", "its worst turn, deg"),
+        *("its worst shift, mm", "silently wrong"),
+    )
+    lines = []
+    for kind, evidence in groups(rows):
+        found = summary("", _of_group(rows, kind, evidence))
+        lines.append([kind, evidence, *(found.get(key) for key in keys), found["silent_wrong"]])
+    return markdown.table(header, lines)
 
 
 def _cells(row: Row) -> list[markdown.Cell]:

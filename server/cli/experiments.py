@@ -81,8 +81,8 @@ def experiments(
             only=only or (),
             detail=detail,
         )
-    lines = found.pop("lines", [])
-    answer(found, json_out, lines + [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
+    lines = found.pop("lines", None)
+    answer(found, json_out, lines or [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
 
 
 def _experiment_real(

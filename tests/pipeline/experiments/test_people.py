@@ -11,7 +11,16 @@ import pytest
 from pipeline.diagnostics import WARNING_CODES
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.experiments import people as experiment
-from pipeline.experiments.people import SPEAKING, figures, is_warned, is_wrong, people, select_cases, table
+from pipeline.experiments.people import (
+    SPEAKING,
+    figures,
+    is_warned,
+    is_wrong,
+    people,
+    select_cases,
+    summary_table,
+    table,
+)
 from pipeline.experiments.people_subjects import (
     EVIDENCE,
     STUDIO_KINDS,
@@ -124,14 +133,19 @@ def test_the_table_marks_what_is_silently_wrong_and_says_how_others_ended() -> N
     assert "refused: no view shows a head" in lines[0]
 
 
+def test_a_line_a_kind_says_the_worst_that_nobody_is_told_of() -> None:
+    refusal = {"name": "n", "subject": "s", "kind": "circle-8", "evidence": "plates", "refused": "no", "seconds": 1.0}
+    lines = summary_table([row(), row(turn_deg=9.0), refusal]).splitlines()[2:]
+    assert lines == [
+        "| front-3 | plates | 2 | 0 | 0 | 1 | 9 | 0.4 | 1 |",
+        "| circle-8 | plates | 1 | 1 | 0 | - | - | - | 0 |",
+    ]
+
+
 def cases() -> list[Case]:
     subjects = ("anna", "ben")
-    return [
-        Case(s, k, e, planted)
-        for s in subjects
-        for k in ("front-3", "circle-8")
-        for e in EVIDENCE  # type: ignore[arg-type]
-    ]
+    read = partial(planted().person, fan().names)
+    return [Case(s, k, e, partial(read, e)) for s in subjects for k in ("front-3", "circle-8") for e in EVIDENCE]
 
 
 def test_words_of_one_sort_widen_and_words_of_different_sorts_narrow() -> None:
