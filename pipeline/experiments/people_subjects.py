@@ -16,7 +16,8 @@ from scipy.spatial import KDTree
 
 from pipeline.eigenheads.expressions import closed_lids, plain_name
 from pipeline.eigenheads.landmarks import SEVEN_POINTS
-from pipeline.eigenheads.model import HeadModel
+from pipeline.eigenheads.model import HeadModel, Level
+from pipeline.eigenheads.subdivision import refine
 from pipeline.experiments.view_subsets import even_views, frontal_views, is_circle
 from pipeline.experiments.visible_surface import read_visible
 from pipeline.imaging.cpu_raster import depth_maps
@@ -257,8 +258,9 @@ def photograph(
     asked = studio.expression
     weights = {name: asked[plain_name(name)] for name in drawn.expressions.names if plain_name(name) in asked}
     vertices, level = drawn.posed_vertices(spread * rng.standard_normal(modes), weights), drawn.levels["full"]
-    marks = {name: vertices[row] for name, row in drawn.landmarks.items()}
-    subject = Subject(Mesh(vertices, level.faces), marks, level.face_region, studio.what, closed_lids(weights))
+    head, face = (Mesh(vertices, level.faces), level.face_region) if corresponds else _finer(vertices, level)
+    marks = {name: head.vertices[row] for name, row in drawn.landmarks.items()}
+    subject = Subject(head, marks, face, studio.what, closed_lids(weights))
     rig = rig_from_directions(studio.directions_deg, distance_mm=studio.distance_mm, rolls_deg=studio.rolls_deg)
     look = random_look(rng)
     preset = replace(PRESET, hairstyle=studio.hairstyle, backdrop_unevenness=studio.unevenness)
@@ -273,9 +275,15 @@ def photograph(
         faults=(Fault("camouflage"),) if studio.is_before_own_colour else (),
     )
     scene = shot.scene
-    places = {name: scene.head.vertices[row] for name, row in drawn.landmarks.items() if name in SEVEN_POINTS}
-    known = (scene.head, level.face_region, scene.visible, places)
+    places = {name: place for name, place in scene.landmarks_world.items() if name in SEVEN_POINTS}
+    known = (scene.head, face, scene.visible, places)
     return CaptureWithTruth(shot.capture, shot.rig, shot.masks, *known, vertices_correspond=corresponds)
+
+
+def _finer(vertices: Float[np.ndarray, "v 3"], level: Level) -> tuple[Mesh, Bool[np.ndarray, " w"]]:
+    """Returns a head with four times the triangles, old vertices first, and its face: brows are painted on vertices."""
+    operator, faces = refine(level.faces, len(vertices), 1)
+    return Mesh(operator @ vertices, faces), operator @ level.face_region.astype(float) > 0.5
 
 
 def _seated(pose_deg: tuple[float, float, float], preset: Preset, rng: np.random.Generator) -> Similarity:

@@ -2,7 +2,7 @@
 that they leave: rows (so that a stopped run goes on), a Markdown table, pictures."""
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,6 +54,23 @@ class MissingPeers(EigenheadError):
         super().__init__(f"{package} is not installed: run `uv sync --group peers`")
 
 
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What some experiments take alone.
+
+    ``simplex``: how many subjects of a table the simplex fits too; ``captures``: whether those of the shared folder
+    count beside the studio's heads; ``openmvs``: that peer's programs. Of people ``folders`` are its captures, ``only``
+    says which of its rows, ``detail`` how deep.
+    """
+
+    simplex: int | None = None
+    captures: bool = False
+    openmvs: Path | None = None
+    folders: tuple[Path, ...] = ()
+    only: tuple[str, ...] = ()
+    detail: str | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
     """What a command asks for."""
@@ -63,12 +80,10 @@ class Task:
     shared: Path
     folder: Path | None
     report: Report
-    simplex: int | None = None
-    captures: bool = False
-    openmvs: Path | None = None
-    folders: Sequence[Path] = ()
-    only: Sequence[str] = ()
-    detail: str | None = None
+    options: Options
+
+
+NO_OPTIONS = Options()
 
 
 def run_experiment(
@@ -79,24 +94,16 @@ def run_experiment(
     shared: Path,
     folder: Path | None,
     report: Report,
-    simplex: int | None = None,
-    captures: bool = False,
-    openmvs: Path | None = None,
-    folders: Sequence[Path] = (),
-    only: Sequence[str] = (),
-    detail: str | None = None,
+    options: Options = NO_OPTIONS,
 ) -> Outcome:
     """Figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a table and
-    pictures are left there. ``simplex``: how many subjects of a table the simplex fits too;
-    ``captures``: whether those of ``shared`` count beside the studio's heads; ``openmvs``: that peer's programs;
-    ``folders``, ``only``, ``detail``: of ``people``, its captures, which of its rows, and how deep.
+    pictures are left there.
 
     ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
     """
     if name not in EXPERIMENTS:
         raise UnknownExperiment(name)
-    own = (simplex, captures, openmvs, folders, only, detail)
-    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, *own))
+    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, options))
     pictures = found.pop("pictures", {})
     text = found.pop("markdown", None) or markdown.of_figures(found["figures"])
     if folder is not None:
@@ -119,7 +126,7 @@ def _drawn(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
 
 def _table(table: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
     def run(task: Task) -> Outcome:
-        given = {"subjects": task.subjects, "simplex_subjects": task.simplex}
+        given = {"subjects": task.subjects, "simplex_subjects": task.options.simplex}
         count = {key: value for key, value in given.items() if value is not None}
         with Renderer.create() as renderer:
             return table(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
@@ -203,22 +210,26 @@ def _surfaces(task: Task) -> Outcome:
     found = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
     with Renderer.create() as renderer:
         return surfaces(
-            task.head, found, renderer=renderer, report=task.report, openmvs=task.openmvs, folder=task.folder
+            task.head, found, renderer=renderer, report=task.report, openmvs=task.options.openmvs, folder=task.folder
         )
 
 
 def _people(task: Task) -> Outcome:
-    captures = list(task.folders) or [path.with_suffix("") for path in _truths(task.shared).values()]
+    shared = sorted((task.shared / "captures").glob("*.truth"))  # the studio has heads where there are none
+    try:
+        others = _facekit(task.shared)
+    except InputError:
+        others = None
     with Renderer.create() as renderer:
         return people(
             task.head,
-            _facekit(task.shared),
-            captures,
+            others,
+            list(task.options.folders) or [path.with_suffix("") for path in shared],
             renderer=renderer,
             report=task.report,
             subjects=task.subjects,
-            only=task.only,
-            detail=task.detail,
+            only=task.options.only,
+            detail=task.options.detail,
             folder=task.folder,
         )
 
@@ -231,7 +242,7 @@ def _templates(task: Task) -> Outcome:
 
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
-    return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.captures else {}
+    return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
 
 
 EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {

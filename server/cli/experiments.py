@@ -64,22 +64,12 @@ def experiments(
         raise typer.BadParameter("only real and people take folders", param_hint="FOLDERS")
     if (only or detail) and name != "people":
         raise typer.BadParameter("only people takes it", param_hint="--only" if only else "--detail")
-    from pipeline.experiments.runner import run_experiment
+    from pipeline.experiments.runner import Options, run_experiment
 
+    options = Options(simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail)
     with progress_bar() as report:
         found = run_experiment(
-            name,
-            model=model,
-            subjects=subjects,
-            simplex=simplex,
-            captures=captures,
-            openmvs=openmvs,
-            shared=shared,
-            folder=out,
-            report=report,
-            folders=folders or (),
-            only=only or (),
-            detail=detail,
+            name, model=model, subjects=subjects, shared=shared, folder=out, report=report, options=options
         )
     lines = found.pop("lines", None)
     answer(found, json_out, lines or [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])

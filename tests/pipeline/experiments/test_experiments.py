@@ -11,7 +11,7 @@ from pipeline.experiments import markdown, peers, records, soft_rasteriser, view
 from pipeline.experiments.pictures import heads
 from pipeline.experiments.records import Records, key_of
 from pipeline.experiments.robustness import WRONG_RADII_PX, WRONG_SHARE, spoiled
-from pipeline.experiments.runner import EXPERIMENTS, UnknownExperiment, run_experiment
+from pipeline.experiments.runner import EXPERIMENTS, Options, UnknownExperiment, run_experiment
 from pipeline.experiments.subjects import off_by, stated
 from pipeline.experiments.tables import correlation
 from rig.errors import EigenheadError
@@ -188,8 +188,9 @@ def test_every_name_of_the_contract_is_there() -> None:
 )
 def test_a_short_run_leaves_rows_a_table_and_figures(tmp_path: Path, name: str, figure: str, most: float) -> None:
     found = run_experiment(
-        name, model="default", subjects=2, simplex=0, shared=tmp_path, folder=tmp_path, report=lambda s, f: None
-    )
+        name, model="default", subjects=2, shared=tmp_path, folder=tmp_path, report=lambda s, f: None,
+        options=Options(simplex=0),
+    )  # fmt: skip
     assert 0.0 < found["figures"][figure] < most
     assert all(np.isfinite(value) for value in found["figures"].values())
     assert (tmp_path / f"{name}.md").read_text().startswith("| ")

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.experiments.detail import Known
 from pipeline.experiments.openmvs import PeerFailed
-from pipeline.experiments.runner import run_experiment
+from pipeline.experiments.runner import Options, run_experiment
 from pipeline.experiments.surfaces import as_markdown, figures, peer_row
 from rig.capture import Capture
 from rig.errors import InputError
@@ -62,5 +62,5 @@ def test_a_folder_without_the_programs_is_refused_before_anything_is_computed(tm
     with pytest.raises(InputError, match="DensifyPointCloud"):
         run_experiment(
             "surfaces", model="default", subjects=None, shared=tmp_path, folder=None, report=lambda s, f: None,
-            openmvs=tmp_path,
+            options=Options(openmvs=tmp_path),
         )  # fmt: skip
