@@ -28,6 +28,7 @@ from pipeline.experiments.span import weighted_quantile
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
 from rig.render.renderer import Renderer
@@ -126,7 +127,7 @@ def judge_case(case: Case, model: HeadModel, settings: Settings, renderer: Rende
 
 def run_job(capture: Capture, rig: Rig, model: HeadModel, settings: Settings, renderer: Renderer) -> Reconstruction:
     """Runs the product's whole job."""
-    return reconstruct(capture, rig, model, settings, renderer=renderer, report=lambda stage, fraction: None)
+    return reconstruct(ReconstructionContext(capture, rig, model, settings, renderer))
 
 
 def judge_result(person: Person, result: Reconstruction, model: HeadModel) -> Row:
@@ -136,8 +137,8 @@ def judge_result(person: Person, result: Reconstruction, model: HeadModel) -> Ro
     row: Row = {
         "turn_deg": pose.turn_deg,
         "shift_mm": pose.shift_mm,
-        "deviation_mm": float(np.median(result.quality_mm[face])),
-        "level": result.detail.level,
+        "deviation_mm": float(np.median(result.refined.deviation_mm[face])),
+        "level": result.refined.detail.level,
         "warnings": sorted({warning.code for warning in result.warnings}),
     }
     return row | face_error(person, result)
@@ -162,7 +163,7 @@ def face_error(person: Person, result: Reconstruction) -> Row:
     mesh = result.mesh_world
     hit = SurfaceIndex(mesh.vertices, mesh.faces, 1.0).closest(person.mesh_world.vertices[person.seen])
     areas = vertex_areas(person.mesh_world.vertices, person.mesh_world.faces)[person.seen]
-    stated = (result.quality_mm[mesh.faces[hit.triangles]] * hit.weights).sum(axis=1)
+    stated = (result.refined.deviation_mm[mesh.faces[hit.triangles]] * hit.weights).sum(axis=1)
     by_stated = hit.distances / np.maximum(stated, 1e-6)
     return {
         "face_median_mm": weighted_quantile(hit.distances, areas, 0.5),
