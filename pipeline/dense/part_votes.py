@@ -11,13 +11,13 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap, points_world
+from pipeline.dense.part_codes import Part, codes_from_channels
 from pipeline.dense.parts import PartMap
 from pipeline.imaging.projection import project_points
 from rig.rig import Rig
 
-UNSEEN, SKIN, HAIR, CLOTHES = 0, 1, 2, 3
-"""Parts of a surface, as ``bust.ply`` counts them."""
-PART_NAMES = ("unseen", "skin", "hair", "clothes")
+SKIN = Part.SKIN  # as experiments call it
+PART_NAMES = tuple(part.name.lower() for part in Part)  # by code, in the report
 CELL_MM = 4.0  # edge of a cell
 
 
@@ -76,8 +76,8 @@ def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.n
 
 
 def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-    """SKIN, HAIR or CLOTHES at each point, whichever its own cell (or, without one, the nearest) shows most."""
-    return (SKIN + part_shares(votes, points).argmax(axis=1)).astype(np.uint8)
+    """The part (``Part``) that each point's own cell (or, without one, the nearest) shows most."""
+    return codes_from_channels(part_shares(votes, points).argmax(axis=1))
 
 
 def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

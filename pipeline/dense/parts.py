@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipeline.dense.part_cells import Cells, head_guide, make_cells
+from pipeline.dense.part_codes import CHANNELS
 from pipeline.dense.part_kernels import spread_parts
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.parallel_for import thread_count
@@ -26,7 +27,7 @@ from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.rig import Rig
 
-SKIN, HAIR, CLOTHES = 0, 1, 2
+SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL = (part.channel for part in CHANNELS)
 
 RED_BINS, BLUE_BINS, LIGHT_BINS, DETAIL_BINS = 36, 40, 20, 20
 RED_RANGE, BLUE_RANGE = (-0.8, 1.4), (-1.4, 1.0)  # of log ratios to green
@@ -95,7 +96,7 @@ def classify_parts(
 
     looks = gathered([bins(view) for view in cells])
     start, lower = gathered([starts(view) for view in cells]), gathered([lower_face(view) for view in cells])
-    by_colour, by_both = unlike_cheeks(looks, start[:, SKIN])
+    by_colour, by_both = unlike_cheeks(looks, start[:, SKIN_CHANNEL])
     bearded = beard_evidence(by_both, lower)
     otherwise = by_colour + bearded * lower * (by_both - by_colour)
     place = gathered([place_prior(view, bearded) for view in cells])
@@ -175,9 +176,10 @@ def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4
     skin = upper * skin_above + (1.0 - upper) * skin_below
     hair = (1.0 - skin) * (upper * 0.93 + (1.0 - upper) * hair_below / (1.0 - skin_below))
     zone = beard_zone(view)
-    skin, hair = np.where(zone, BARE_PRIOR[SKIN], skin), np.where(zone, BARE_PRIOR[HAIR], hair)
+    skin, hair = np.where(zone, BARE_PRIOR[SKIN_CHANNEL], skin), np.where(zone, BARE_PRIOR[HAIR_CHANNEL], hair)
     grown = bearded * (zone | sideburn_zone(view))
-    skin, hair = (own + grown * (there - own) for own, there in ((skin, BEARD_PRIOR[SKIN]), (hair, BEARD_PRIOR[HAIR])))
+    skin = skin + grown * (BEARD_PRIOR[SKIN_CHANNEL] - skin)
+    hair = hair + grown * (BEARD_PRIOR[HAIR_CHANNEL] - hair)
     # A beard grows close about the lips, and hides the underside of the jaw.
     feature = view.feature - grown * np.minimum(view.feature, 1.0 - view.feature)
     known = np.maximum(feature, (1.0 - grown) * view.underside)
@@ -221,13 +223,13 @@ def learn(
     """
     colour, detail = looks.T
     share = start.copy()
-    share[:, HAIR] = np.maximum(share[:, HAIR], lower) * otherwise
-    share[:, CLOTHES] *= otherwise
+    share[:, HAIR_CHANNEL] = np.maximum(share[:, HAIR_CHANNEL], lower) * otherwise
+    share[:, CLOTHES_CHANNEL] *= otherwise
     there = np.log(_there(otherwise, start, lower))
     logs = np.empty((len(colour), 4), np.float32)
     logs[:, 3] = settings.strength * -np.log(OUTLIER_BINS)
     for step in range(settings.steps):
-        for part in (SKIN, HAIR, CLOTHES):
+        for part in (SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL):
             like = colour_looks(colour, share[:, part])[colour] * detail_looks(detail, share[:, part])[detail]
             logs[:, part] = settings.strength * np.log(like) + there[part]
         if step < settings.steps - 1:
@@ -242,7 +244,7 @@ def _there(
     """Is there hair, are there clothes? The share of their sure places that look otherwise than skin; a beard is hair,
     too."""
     shares = [float(otherwise[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
-    return np.maximum([1.0, max(shares[HAIR], shares[3]), shares[CLOTHES]], LEAST_THERE)
+    return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], LEAST_THERE)
 
 
 def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from jaxtyping import Float32
 from numpy import ndarray
 
-from pipeline.dense.parts import HAIR, PartMap, classify_parts
+from pipeline.dense.part_codes import Part
+from pipeline.dense.parts import PartMap, classify_parts
 from pipeline.eigenheads.model import HeadModel
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.stages.context import ReconstructionContext
@@ -23,7 +24,7 @@ class PartLabels:
 
     def hair_probability(self) -> dict[str, Float32[ndarray, "_ _"]]:
         """Returns how probably each pixel shows hair, by camera."""
-        return {name: part.probability[..., HAIR] for name, part in self.maps.items()}
+        return {name: part.probability[..., Part.HAIR.channel] for name, part in self.maps.items()}
 
 
 @stage("parts")

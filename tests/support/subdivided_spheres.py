@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sparse
 import trimesh
 
-from pipeline.dense.part_votes import SKIN
+from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.subdivision import row_count, subdivision
 from pipeline.fitting.fine.nodes import Nodes, node_mesh
 from pipeline.fitting.fine.surface_points import SurfacePoints
@@ -36,7 +36,7 @@ def ellipsoid_points(
     normals = unit / semi_axes
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = unit * semi_axes + normals * rng.normal(0.0, noise_mm, (count, 1))
-    return SurfacePoints(points, normals, np.full(count, max(noise_mm, 0.05)), np.full(count, SKIN, np.uint8))
+    return SurfacePoints(points, normals, np.full(count, max(noise_mm, 0.05)), np.full(count, Part.SKIN, np.uint8))
 
 
 def ellipsoid_distance(points: np.ndarray, semi_axes: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap
-from pipeline.dense.part_votes import SKIN, UNSEEN, PartVotes, part_codes, part_shares
+from pipeline.dense.part_codes import Part
+from pipeline.dense.part_votes import PartVotes, part_codes, part_shares
 from pipeline.dense.surface.contradiction import silence_contradicted
 from pipeline.dense.surface.crossings import without_crossings
 from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
@@ -44,7 +45,7 @@ class BustSurface:
 
     mesh_world: Mesh
     deviation_mm: Float[np.ndarray, " v"]  # standard deviation along the normal
-    part: UInt8[np.ndarray, " v"]  # 0 unseen, 1 skin, 2 hair, 3 clothes
+    part: UInt8[np.ndarray, " v"]  # codes of ``Part``
     views: UInt8[np.ndarray, " v"]  # whose depth agrees with the place
     warnings: tuple[ReportWarning, ...] = ()
 
@@ -98,12 +99,12 @@ def fuse(
     seen = measured.views > 0
     mesh = without_bias(mesh, seen, bias)
     if head_skin_world is not None:
-        skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, 0]
+        skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, Part.SKIN.channel]
         mesh = drawn_to_skin(mesh, seen * skin, head_skin_world)
     mesh, _ = without_crossings(mesh, safe)
     report("bust", 0.9)
-    shown = np.full(len(mesh.vertices), SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
-    part = np.where(seen, shown, UNSEEN).astype(np.uint8)
+    shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
+    part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(_mask_warnings(names, contradicted))
     return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, warnings)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.dense.part_votes import UNSEEN
+from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.expressions import BLINKS, plain_name
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fine.association import associate
@@ -115,7 +115,7 @@ def _told(
     ``moved`` is what closes open lids."""
     middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
     off = np.linalg.norm(surface.points - middle, axis=1)
-    about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != UNSEEN))
+    about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != Part.UNSEEN))
     if len(about.points) < LEAST_POINTS:
         return own, 1.0
     near, faces = _patch(open_lids, model, middle, NEAR * slit.length_mm + REACH_MM)

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from pipeline.dense.depth_map import DepthMap, points_world
-from pipeline.dense.part_votes import HAIR, SKIN, PartVotes, part_shares
+from pipeline.dense.part_codes import Part, codes_from_channels
+from pipeline.dense.part_votes import PartVotes, part_shares
 from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.parallel_for import thread_count
 from pipeline.settings import FineSettings
@@ -39,11 +40,12 @@ def dense_points(
     # A million pixels, a tenth of that in cells.
     cells = thinned(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), settings.cell_mm)
     share = part_shares(votes, cells.points)
-    part = (SKIN + share.argmax(axis=1)).astype(np.uint8)
+    part = codes_from_channels(share.argmax(axis=1))
     # What may be hair may lie where hair does: the deviation of both together.
-    doubt = np.where(part == SKIN, 1.0 - share[:, 0] / np.maximum(share.sum(axis=1), 1e-9), 0.0)
+    skin = share[:, Part.SKIN.channel]
+    doubt = np.where(part == Part.SKIN, 1.0 - skin / np.maximum(share.sum(axis=1), 1e-9), 0.0)
     deviation = np.sqrt(cells.deviation_mm**2 + doubt * settings.hair_off_mm**2)
-    part[_behind(cells.points, head_world)] = HAIR  # it bounds nothing there and pulls nothing
+    part[_behind(cells.points, head_world)] = Part.HAIR  # it bounds nothing there and pulls nothing
     return replace(cells, deviation_mm=deviation, part=part)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.dense.part_votes import SKIN
+from pipeline.dense.part_codes import Part
 from pipeline.dense.window_bias import WindowBias, windowed_height
 from pipeline.estimation.robust import Cauchy
 from pipeline.fitting.fine.association import associate, interpolated
@@ -36,7 +36,7 @@ class OnFace:
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
     """The points of skin near the fitted head's ``face`` (mm, world frame)."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
-    skin = np.flatnonzero(surface.part == SKIN)
+    skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
         return OnFace(skin, np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     given = (surface.points[skin], surface.normals[skin], vertices, normals, faces)

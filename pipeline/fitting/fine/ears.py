@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.dense.part_votes import SKIN
+from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import Target, interpolated
@@ -53,7 +53,7 @@ def with_ears_in_place(
     """
     faces, ears = model.levels["full"].faces, head_regions(model)["ears"]
     middle = model.vertices(np.zeros(0))[:, 0] < 0
-    skin = surface.chosen(surface.part == SKIN)
+    skin = surface.chosen(surface.part == Part.SKIN)
     moved = np.zeros_like(vertices)
     for side in (ears & middle, ears & ~middle):
         rows = np.flatnonzero(side)

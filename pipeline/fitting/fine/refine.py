@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.dense.part_votes import SKIN, UNSEEN
+from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import Associated, associate, interpolated
@@ -155,7 +155,7 @@ def draw_to_surface(
         The same vertices displaced; where no point is near, as they were.
     """
     amplitude = np.maximum(deviation_mm, settings.least_amplitude_mm)
-    told = surface.chosen((surface.part != UNSEEN) & np.isfinite(surface.deviation_mm))
+    told = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
     many = thinned(told, settings.cell_mm)
     few = thinned(many, settings.coarse_cell_mm)
     now = vertices
@@ -218,7 +218,7 @@ def observe(
     between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
     point = surface.points[found.row]
     off = ((point - interpolated(now[corner], found.blend)) * between).sum(axis=1)
-    skin = surface.part[found.row] == SKIN
+    skin = surface.part[found.row] == Part.SKIN
     speaks = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair speaks where skin stands out of it
     variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
     robust = np.where(skin, 1.0 / (1.0 + (off / each.robust_mm) ** 2) ** 2, 1.0)

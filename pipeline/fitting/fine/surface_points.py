@@ -13,7 +13,7 @@ class SurfacePoints:
     points: Float[np.ndarray, "n 3"]  # mm
     normals: Float[np.ndarray, "n 3"]  # unit, outwards
     deviation_mm: Float[np.ndarray, " n"]  # along the normal
-    part: UInt8[np.ndarray, " n"]  # UNSEEN, SKIN, HAIR or CLOTHES
+    part: UInt8[np.ndarray, " n"]  # codes of ``Part``
 
     def chosen(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> "SurfacePoints":
         """The given rows."""

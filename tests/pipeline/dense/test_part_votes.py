@@ -3,7 +3,8 @@
 import numpy as np
 
 from pipeline.dense.depth_map import DepthMap
-from pipeline.dense.part_votes import HAIR, SKIN, part_codes, vote_parts
+from pipeline.dense.part_codes import Part
+from pipeline.dense.part_votes import part_codes, vote_parts
 from pipeline.dense.parts import PartMap
 from rig.camera import Camera, Intrinsics
 from rig.geometry import RigidTransform
@@ -44,11 +45,11 @@ def test_cells_say_what_most_of_their_pixels_show() -> None:
     assert votes is not None
     x = np.linspace(-28.0, 28.0, 15)
     points = np.column_stack([x, np.zeros(15), np.zeros(15)])
-    expected = np.where(x > 0, HAIR, SKIN)
+    expected = np.where(x > 0, Part.HAIR, Part.SKIN)
     clear = np.abs(x) > 4.0  # a cell away from the border
     np.testing.assert_array_equal(part_codes(votes, points)[clear], expected[clear])
     beyond = np.array([[-500.0, 0.0, 0.0], [28.0, 3.0, 40.0]])  # no cell holds them: the nearest one says
-    np.testing.assert_array_equal(part_codes(votes, beyond), [SKIN, HAIR])
+    np.testing.assert_array_equal(part_codes(votes, beyond), [Part.SKIN, Part.HAIR])
 
 
 def test_a_view_without_parts_does_not_vote() -> None:

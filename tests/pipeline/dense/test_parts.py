@@ -9,11 +9,9 @@ import pytest
 from scipy.spatial import KDTree
 
 from pipeline.dense.part_cells import head_guide, make_cells
+from pipeline.dense.part_codes import CHANNELS, Part
 from pipeline.dense.part_kernels import spread_parts
 from pipeline.dense.parts import (
-    CLOTHES,
-    HAIR,
-    SKIN,
     classify_parts,
     colour_looks,
     detail_looks,
@@ -133,7 +131,7 @@ def shares(rig: Rig, made: Planted, fitted: Subject | None = None) -> dict[int, 
     right: dict[int, list[np.ndarray]] = {1: [], 2: [], 3: []}
     for name, each in found.items():
         for code, kept in right.items():
-            kept.append(each.probability[..., code - 1][made.truth[name] == code] > 0.5)
+            kept.append(each.probability[..., Part(code).channel][made.truth[name] == code] > 0.5)
     return {code: float(np.concatenate(kept).mean()) for code, kept in right.items() if np.concatenate(kept).size}
 
 
@@ -210,10 +208,10 @@ def test_starts_lie_on_the_cheeks_over_the_crown_and_below_the_neck(rig):
         truth = made.truth[view.camera.name][half :: view.size_px, half :: view.size_px]
         start = starts(view)
         truth = truth[: start.shape[0], : start.shape[1]]
-        for part in (SKIN, HAIR, CLOTHES):
-            sure = truth[(start[..., part] > 0) & (view.inside > 0.9)]
+        for part in CHANNELS:
+            sure = truth[(start[..., part.channel] > 0) & (view.inside > 0.9)]
             assert sure.size > 20
-            assert (sure == part + 1).mean() > 0.9
+            assert (sure == part).mean() > 0.9
 
 
 def test_guide_measures_from_the_border_of_the_face_and_the_chin():

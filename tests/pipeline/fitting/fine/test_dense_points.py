@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from pipeline.dense.part_votes import HAIR, SKIN, PartVotes
+from pipeline.dense.part_codes import Part
+from pipeline.dense.part_votes import PartVotes
 from pipeline.fitting.fine.dense_points import dense_points
 from pipeline.settings import FineSettings
 from rig.mesh import Mesh
@@ -27,7 +28,7 @@ def test_a_point_that_may_be_hair_is_less_sure_by_what_hair_stands_off() -> None
         found.append(dense_points([seen_wall(camera)], votes, wall_head(), SETTINGS))
     sure, doubtful, hair = found
     assert len(sure.points) > 0
-    for surface, part in ((sure, SKIN), (doubtful, SKIN), (hair, HAIR)):
+    for surface, part in ((sure, Part.SKIN), (doubtful, Part.SKIN), (hair, Part.HAIR)):
         assert (surface.part == part).all()
     expected = np.sqrt(sure.deviation_mm**2 + 0.3 * SETTINGS.hair_off_mm**2)
     np.testing.assert_allclose(doubtful.deviation_mm, expected, rtol=1e-6)

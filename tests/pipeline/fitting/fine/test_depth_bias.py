@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.dense.part_votes import HAIR, SKIN
+from pipeline.dense.part_codes import Part
 from pipeline.dense.window_bias import REACH_MM, WINDOW_MM, WindowBias, windowed_height, without_bias
 from pipeline.fitting.fine.depth_bias import measure_bias, points_on_face, without_window_bias
 from pipeline.fitting.fine.surface_points import SurfacePoints
@@ -27,7 +27,7 @@ def seen_through_windows(wall: Mesh, common_mm: float, share: float) -> SurfaceP
     noise = np.random.default_rng(3).normal(0.0, NOISE_MM, len(rows))
     off = common_mm + share * windowed_height(wall.vertices, normals)[rows] + noise
     points = wall.vertices[rows] + off[:, None] * normals[rows]
-    return SurfacePoints(points, normals[rows], np.full(len(rows), NOISE_MM), np.full(len(rows), SKIN, np.uint8))
+    return SurfacePoints(points, normals[rows], np.full(len(rows), NOISE_MM), np.full(len(rows), Part.SKIN, np.uint8))
 
 
 def test_the_mean_over_a_window_lies_below_a_dome_by_its_curvature() -> None:
@@ -61,12 +61,12 @@ def test_a_planted_bias_is_taken_off() -> None:
     assert abs(off(found.points).mean()) < 0.01
 
 
-@pytest.mark.parametrize("part", [HAIR, SKIN])
+@pytest.mark.parametrize("part", [Part.HAIR, Part.SKIN])
 def test_without_enough_of_the_face_nothing_moves(part: int) -> None:
     wall = bumpy_wall()
     seen = seen_through_windows(wall, 0.2, 0.5)
     surface = SurfacePoints(seen.points, seen.normals, seen.deviation_mm, np.full(len(seen.points), part, np.uint8))
-    face = np.full(len(wall.vertices), part == HAIR)  # skin that is no face, or a face without skin
+    face = np.full(len(wall.vertices), part == Part.HAIR)  # skin that is no face, or a face without skin
     assert measure_bias(points_on_face(surface, wall, face)) == WindowBias()
 
 

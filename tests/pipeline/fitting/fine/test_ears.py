@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.dense.part_votes import SKIN
+from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.model import load_model
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.ears import with_ears_in_place
@@ -23,7 +23,7 @@ def test_ears_go_where_points_show_them_and_nowhere_when_they_are_hidden(hidden:
     shown = ~ears & (vertices[:, 2] > 0.0) if hidden else np.ones(len(vertices), bool)
     normals = vertex_normals(truth, faces)[shown]
     count = len(normals)
-    points = SurfacePoints(truth[shown], normals, np.full(count, 0.2), np.full(count, SKIN, np.uint8))
+    points = SurfacePoints(truth[shown], normals, np.full(count, 0.2), np.full(count, Part.SKIN, np.uint8))
     found = with_ears_in_place(vertices, model, thinned(points, 2.5))
     if hidden:
         np.testing.assert_array_equal(found, vertices)

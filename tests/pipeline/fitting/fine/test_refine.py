@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.dense.part_votes import HAIR, SKIN
+from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.eyelids import EyeEvidence, bridged
@@ -80,7 +80,7 @@ def test_where_no_point_speaks_the_surface_carries_on_and_says_how_sure_it_is() 
 def test_hair_bounds_and_does_not_pull() -> None:
     rng = np.random.default_rng(2)
     outside, inside = ellipsoid_points(rng, np.full(3, 84.0), 0.1), ellipsoid_points(rng, np.full(3, 77.5), 0.1)
-    hair = np.full(len(outside.points), HAIR, np.uint8)
+    hair = np.full(len(outside.points), Part.HAIR, np.uint8)
     for surface, radius in ((outside, 80.0), (inside, 77.5)):
         found = drawn(SurfacePoints(surface.points, surface.normals, surface.deviation_mm, hair))[2]
         # Points that are met fall silent, those beyond go on: inwards by three of their deviations at most.
@@ -99,7 +99,7 @@ def test_without_points_nothing_moves() -> None:
 def test_thinning_keeps_parts_and_sides_apart() -> None:
     points = np.zeros((4, 3))
     normals = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, -1.0], [0, 0, 1.0]])
-    part = np.array([SKIN, SKIN, SKIN, HAIR], np.uint8)
+    part = np.array([Part.SKIN, Part.SKIN, Part.SKIN, Part.HAIR], np.uint8)
     thin = thinned(SurfacePoints(points, normals, np.full(4, 0.2), part), 1.0)
     assert sorted(zip(thin.part.tolist(), thin.normals[:, 2].tolist(), strict=True)) == [(1, -1.0), (1, 1.0), (2, 1.0)]
     np.testing.assert_allclose(thin.deviation_mm, 0.2)
@@ -115,7 +115,7 @@ def head_points(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generato
     normals = vertex_normals(vertices, faces)
     rows = np.flatnonzero(vertices[:, 2] > -20.0)
     points = vertices[rows] + normals[rows] * rng.normal(0.0, NOISE_MM, (len(rows), 1))
-    return SurfacePoints(points, normals[rows], np.full(len(rows), NOISE_MM), np.full(len(rows), SKIN, np.uint8))
+    return SurfacePoints(points, normals[rows], np.full(len(rows), NOISE_MM), np.full(len(rows), Part.SKIN, np.uint8))
 
 
 @pytest.mark.slow

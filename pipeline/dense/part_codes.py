@@ -1,0 +1,33 @@
+"""The parts that a surface shows, as ``bust.ply`` writes them, and the channel of each in a map of probabilities.
+
+A map's last axis holds skin, hair and clothes; there is no channel for what no view sees. Whoever goes from one to the
+other does it here.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+
+class Part(IntEnum):
+    """What a vertex or a point of the surface shows. The numbers stand in written files: they never change."""
+
+    UNSEEN = 0
+    SKIN = 1
+    HAIR = 2
+    CLOTHES = 3
+
+    @property
+    def channel(self) -> int:
+        """Returns the part's place along the last axis of probabilities; raises ValueError for UNSEEN."""
+        return CHANNELS.index(self)
+
+
+CHANNELS = (Part.SKIN, Part.HAIR, Part.CLOTHES)
+"""The part of every channel."""
+
+
+def codes_from_channels(channels: Int[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
+    """Returns the code of each channel's part."""
+    return np.array(CHANNELS, np.uint8)[channels]
