@@ -7,6 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.camera import Camera
+from rig.errors import EigenheadError
+
+
+class UnknownCamera(EigenheadError, KeyError):
+    """A name that no camera of the rig has."""
+
+    def __init__(self, name: str, names: tuple[str, ...]) -> None:
+        known = f"its cameras are {', '.join(names)}" if names else "it has no cameras at all"
+        super().__init__(f"the rig has no camera {name!r}; {known}")
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # KeyError's own would put it in quotes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +34,15 @@ class Rig:
         return iter(self.cameras)
 
     def __getitem__(self, name: str) -> Camera:
-        return next(camera for camera in self.cameras if camera.name == name)
+        """Returns the camera of that name.
+
+        Raises:
+            UnknownCamera: no camera has it.
+        """
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        raise UnknownCamera(name, self.names)
 
     def __contains__(self, name: object) -> bool:
         return any(camera.name == name for camera in self.cameras)
