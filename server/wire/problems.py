@@ -61,6 +61,7 @@ class ProblemDocument(TypedDict):
 
 
 STATUS_OF: dict[type[Refused], int] = {
+    Refused: 400,
     Unknown: 401,
     Forbidden: 403,
     NotFound: 404,
@@ -72,6 +73,12 @@ STATUS_OF: dict[type[Refused], int] = {
     Unavailable: 503,
     DiskFull: 507,
 }
+"""The HTTP status of each class of refusals; a class that is not named has its nearest ancestor's."""
+
+
+def status_of(refusal: type[Refused]) -> int:
+    """Returns the HTTP status of a class of refusals."""
+    return next(STATUS_OF[kind] for kind in refusal.__mro__ if kind in STATUS_OF)
 
 
 class Problem(EigenheadError):
@@ -112,7 +119,7 @@ def problem_from(error: Exception) -> Problem:
         error = unusable_input(error)
     if isinstance(error, Refused):
         again = {} if error.retry_after_s is None else {"Retry-After": str(error.retry_after_s)}
-        return Problem(STATUS_OF[type(error)], error.kind, error.detail, error.errors, again)
+        return Problem(status_of(type(error)), error.kind, error.detail, error.errors, again)
     if isinstance(error, RequestValidationError):
         faults = [f"{'.'.join(str(part) for part in e['loc'])}: {_told(e)}" for e in error.errors()]
         return Problem(
