@@ -78,7 +78,7 @@ def words(name: str) -> str:
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     """For each of Apple's names, in their order: which of the shapes together stand for it; none where none does.
 
-    A shape of that name, or the two sides of one that Apple does not part (ICT-FaceKit's ``cheekPuff_L`` and ``_R``).
+    A shape of that name, or the two sides of one that Apple does not part (ICT-FaceKit's cheekPuff_L and cheekPuff_R).
     """
     known = {plain_name(name): k for k, name in enumerate(names)}
     found = {}

@@ -1,8 +1,8 @@
 """Agisoft Metashape's XML of cameras (File > Export > Export Cameras, format Agisoft XML).
 
-The chunk's cameras are ``chunk_from_camera`` (4 x 4, axes as OpenCV's); the transform of their component or of the
-chunk takes them to the world, in metres. The lens (user manual, appendix "Camera models"): ``u = w / 2 + cx + x' f +
-x' b1 + y' b2`` with the corner of the picture at 0, so that half a pixel is taken off; p1 and p2 stand the other way
+Each camera has its transform to the chunk (4 x 4, axes as OpenCV's); the transform of their component or of the chunk
+takes them to the world, in metres. The lens (user manual, appendix "Camera models"): ``u = w / 2 + cx + x' f + x' b1 +
+y' b2`` with the corner of the picture at 0, so that half a pixel is taken off; p1 and p2 stand the other way
 round than OpenCV's; type ``fisheye`` is equidistant, which with k1 to k4 is Kannala and Brandt's lens.
 """
 
@@ -95,7 +95,7 @@ def _entry(name: str, sensor: ElementTree.Element, matrix: np.ndarray, world: Si
 
 
 def _similarity(node: ElementTree.Element, faults: list[str]) -> Similarity:
-    """``world_from_chunk``, metres made millimetres; without one, the chunk's free scale is taken as millimetres."""
+    """The chunk's transform to the world, metres made mm; without one, its free scale is taken as millimetres."""
     found = node.find("transform")
     if found is None:
         return np.eye(3), np.zeros(3), 1.0

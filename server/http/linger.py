@@ -2,7 +2,7 @@
 
 uvicorn closes a connection that is not kept alive as soon as the answer is out. Bytes that arrive after that reset it,
 and whoever was writing them, nginx above all, loses the answer: its client saw 502 in place of 401 or 422. So what is
-still coming is read and dropped before the answer ends, as nginx's own ``lingering_close`` does. A short upload is
+still coming is read and dropped before the answer ends, as nginx's own lingering_close does. A short upload is
 dropped before the answer begins: nginx ends its client's connection too where an answer overtakes the body, after it
 has promised to keep it, and the client's next request fails.
 """

@@ -1,6 +1,6 @@
 """What the worker needs of the job engine: its configuration, and one thing of its inside.
 
-The public ``resume_workflow`` takes a job from whoever has it by now, revives a cancelled one, and forgets how many
+DBOS's public resume_workflow takes a job from whoever has it by now, revives a cancelled one, and forgets how many
 workers the job took down with it. ``DBOS._recover_pending_workflows`` is what the engine itself does at its start: it
 changes only rows that still belong to the named executors. A test holds its shape.
 """

@@ -122,7 +122,7 @@ def filled(settings: ServiceSettings, captures: int, jobs: int) -> None:
 
 
 def lists(captures: int) -> dict[str, str]:
-    """Addresses by what they list; ``CURSOR`` stands for that of a page far behind."""
+    """Addresses by what they list; a page far behind begins before one of the middle."""
     middle = identity(captures // 2, 2)
     return {
         "captures": "/v1/captures?limit=100",

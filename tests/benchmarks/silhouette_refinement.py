@@ -4,12 +4,12 @@ worth to a head?
 ``python -m tests.benchmarks.silhouette_refinement [--seeds 3] [--captures 5] [--error-px 0.5] [--heads 2] [--rims]
 [--proposal] [--json]``. Every seed has its own subjects (heads of the model's first 60 modes with the studio's hair and
 shirts) and its own camera errors. Distances are RMS over the cameras of ``calibration.adjustment.gauge.image_distance``
-to the truth; ``no_scale`` leaves out the rig's scale, which no silhouette shows: eleven cameras that are off each for
-itself are off in scale too, and what the start has of that stays. ``sigma_px`` is what the refined rig's covariances
-say of the distance. ``--proposal``: only what all captures agree on, from disturbed cameras, with no capture held out
-and nothing decided, at an eleventh of the time.
+to the truth; ``no_scale_px`` leaves out the rig's scale, which no silhouette shows: eleven cameras that are off each
+for itself are off in scale too, and what the start has of that stays. ``sigma_px`` is what the refined rig's
+covariances say of the distance. ``--proposal``: only what all captures agree on, from disturbed cameras, with no
+capture held out and nothing decided, at an eleventh of the time.
 
-``head_before_mm``, ``head_after_mm``, ``head_exact_mm``: mean distance of the face's vertices from the truth, world
+``head_..._mm``, before, after and exact: mean distance of the face's vertices from the truth, world
 frame, of further subjects fitted without per-camera terms, with the cameras as disturbed, as refined, and exact. These
 heads are bare, so that cameras are what limits them; ``hair_...`` are the same heads with hair and shirt, whose fits
 hang on what the hair hides.

@@ -3,10 +3,10 @@
 Enters: a solved contour problem and the photographs. Leaves: the same problem with a finer basis and with observations
 of the surface, solved again. Three rounds, coarse to fine: each patch of the current surface (``patches``) moves along
 its normals through the images of the cameras that see it; where its views look most alike, the surface is said to be
-(``consistency``), and how far the views would rather slide says where the cameras are (``registration``). No peak
+(``depth_search``), and how far the views would rather slide says where the cameras are (``camera_term``). No peak
 inside the reach, or a low one (occluded, specular, textureless), is silence, and so is hair (``hair_mask``). The
-observations enter the normal equations beside rims, features and priors (``surface``), robustly; where they are silent
-the kernels carry on smoothly.
+observations enter the normal equations beside rims, features and priors (``surface_term``), robustly; where they are
+silent the kernels carry on smoothly.
 """
 
 from collections.abc import Mapping
