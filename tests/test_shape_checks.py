@@ -1,7 +1,9 @@
 """The fast tests hold every call to its annotated types and shapes: in the product, and by each kind of callable."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import Float
 
 from rig.geometry import RigidTransform
-from tests.support.shape_checks import checked
+from tests.support.shape_checks import COMPILED_BESIDE_OTHERS, ROOT, checked, checked_modules
 
 Row = Float[np.ndarray, " n"]
 
@@ -62,3 +64,26 @@ def test_each_call_has_letters_of_its_own() -> None:
     assert Pair(np.zeros(2), np.zeros(2)).both.shape == (2, 2)
     assert len(joined(np.zeros(2), joined(np.zeros(3), np.zeros(1)))) == 6
     assert Pair.of([np.zeros(1), np.zeros(1)]).one.shape == (1,)
+
+
+def relative(path: Path) -> Path:
+    return path.relative_to(ROOT)
+
+
+def test_only_compiled_loops_are_left_out() -> None:
+    """A module was left out where its text held the word njit, so that wrappers of loops went unchecked."""
+    files = {
+        path.relative_to(ROOT) for room in ("rig", "pipeline", "calibration") for path in (ROOT / room).rglob("*.py")
+    }
+    left_out = {path for path in files if ".".join(path.with_suffix("").parts) not in checked_modules()}
+    odd = {path.as_posix() for path in left_out if path.stem != "__init__" and not path.stem.endswith("_kernels")}
+    assert odd == set(COMPILED_BESIDE_OTHERS)
+
+
+def test_loops_are_compiled_in_modules_of_their_own() -> None:
+    """There, in ``*_kernels.py``, annotations are not checked; beside other functions they would be wrapped."""
+    files = [path for room in ("rig", "pipeline", "calibration") for path in (ROOT / room).rglob("*.py")]
+    compiled = {path for path in files if re.search(r"^\s*@njit\b", path.read_text(encoding="utf-8"), re.MULTILINE)}
+    assert len(compiled) > 30
+    odd = {relative(path).as_posix() for path in compiled if not path.stem.endswith("_kernels")}
+    assert odd == set(COMPILED_BESIDE_OTHERS)

@@ -10,16 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.compiled import njit
+from pipeline.dense.surface.contradiction_kernels import BLOCK, mark_contradicted
 from pipeline.dense.surface.view_stack import ViewStack
-from pipeline.dense.surface.vote_kernels import CENTRE, DEPTH, FRAME, OUTLINE, SIGMA, nearest_pixel, seen_at
-from pipeline.imaging.projection_kernels import LENS, NEAREST_MM
+from pipeline.dense.surface.vote_kernels import OUTLINE
 from pipeline.parallel_for import map_in_threads
 
-BLOCK = 4  # pixels along the side of what is decided at once
-STRIDE = 3  # every third pixel of every third row stands for the others
-CLEAR_PX = 2.5  # a point nearer to the outline is ordinary: blur, hair, calibration
-SURE_MM = 1.0  # points with a larger deviation do not count
 VIEWS_LEAST = 2  # that see something solid
 WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
 SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
@@ -31,7 +26,7 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
     def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
         height, width = views.sizes[v]
         blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
-        _mark(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
+        mark_contradicted(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
         solid = np.bitwise_count(blocks) >= VIEWS_LEAST
         own = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
         return _beyond_windows(solid, own.reshape(height, width)) if solid.any() else None
@@ -62,37 +57,3 @@ def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray
     np.maximum.at(farthest, part, np.where(solid, outline_px[np.ix_(rows, columns)], 0.0))
     wrong = farthest[part] > WIDENED_PX
     return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _mark(
-    target: int,
-    cameras: np.ndarray,
-    sizes: np.ndarray,
-    starts: np.ndarray,
-    pixels: np.ndarray,
-    blocks: np.ndarray,
-    width: int,
-) -> None:
-    """Sets the bit of each view that has a sure point in a block outside of the target's outline."""
-    place = np.empty(3)
-    for v in range(len(cameras)):
-        if v == target:
-            continue
-        p, bit = cameras[v], np.uint64(1) << np.uint64(v % 64)
-        for row in range(0, sizes[v, 0], STRIDE):
-            for column in range(0, sizes[v, 1], STRIDE):
-                at = starts[v] + row * sizes[v, 1] + column
-                if not pixels[at, SIGMA] < SURE_MM:
-                    continue
-                depth = pixels[at, DEPTH]
-                x, y = (column - p[LENS + 2]) / p[LENS] * depth, (row - p[LENS + 3]) / p[LENS + 1] * depth
-                for axis in range(3):  # the rotation's inverse, from the camera's centre
-                    place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[CENTRE + axis]
-                ahead, at_column, at_row = seen_at(cameras[target], place)
-                if ahead <= NEAREST_MM:
-                    continue
-                near, beyond = nearest_pixel(at_column, at_row, sizes[target])
-                there = starts[target] + near
-                if beyond == 0.0 and pixels[there, FRAME] < 0.0 and pixels[there, OUTLINE] > CLEAR_PX:
-                    blocks[near // width // BLOCK, near % width // BLOCK] |= bit

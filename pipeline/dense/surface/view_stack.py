@@ -6,12 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-from pipeline.compiled import njit
 from pipeline.dense.depth_map import DepthMap
-from pipeline.dense.surface.vote_kernels import DEPTH, FRAME, NORMAL, OUTLINE, SIGMA, Pixels
+from pipeline.dense.surface.view_stack_kernels import write_outline
+from pipeline.dense.surface.vote_kernels import DEPTH, NORMAL, SIGMA, Pixels
 from pipeline.imaging.projection import packed_lens
-from pipeline.imaging.projection_kernels import distorted
-from pipeline.imaging.sampling_kernels import held, sample
 from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera
 from rig.rig import Rig
@@ -52,7 +50,7 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
         alone = depth_map.views.ravel() < VIEWS_SURE
         own[:, SIGMA] = depth_map.deviation_mm.ravel() * np.where(alone, np.float32(ALONE_FACTOR), np.float32(1))
         crop = depth_map.camera.intrinsics.values()[:4]
-        _outline(crop, packed_lens(camera), depth_map.depth_mm.shape[1], silhouettes[camera.name].distance, own)
+        write_outline(crop, packed_lens(camera), depth_map.depth_mm.shape[1], silhouettes[camera.name].distance, own)
     return ViewStack(np.stack([_packed(depth_map.camera) for depth_map in depth_maps]), sizes, starts[:-1], pixels)
 
 
@@ -61,16 +59,3 @@ def _packed(camera: Camera) -> Float[np.ndarray, " 19"]:
     return np.concatenate(
         [pose.rotation.ravel(), pose.translation, camera.intrinsics.values()[:4], camera.centre_world]
     )
-
-
-@njit(cache=True, nogil=True)
-def _outline(crop: np.ndarray, lens: np.ndarray, width: int, distance: np.ndarray, pixels: np.ndarray) -> None:
-    """Signed distances (px) to the contour and to the frame, at the pixels of an undistorted crop.
-
-    Beyond the frame the contour's is the nearest pixel's of the frame: a shoulder that the edge cuts goes on there.
-    """
-    rows, columns = distance.shape
-    for at in range(len(pixels)):
-        u, v = distorted((at % width - crop[2]) / crop[0], (at // width - crop[3]) / crop[1], lens)
-        pixels[at, FRAME] = max(max(-u, u - (columns - 1)), max(-v, v - (rows - 1)))
-        pixels[at, OUTLINE] = sample(distance, held(u, columns), held(v, rows))

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from pipeline.fitting.photo.camera_term import camera_sensitivity, gram_matrices
-from pipeline.fitting.photo.correlation import Pictures, Samples, choose_views, correlate, sweep
+from pipeline.fitting.photo.correlation import choose_views, correlate, sweep
+from pipeline.fitting.photo.correlation_kernels import Pictures, Samples
 from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.fitting.photo.patches import Patches
 from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations, moved_views

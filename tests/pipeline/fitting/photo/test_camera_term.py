@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.fitting.photo.camera_term import _grey_and_slopes, camera_sensitivity
-from pipeline.fitting.photo.correlation import read
+from pipeline.fitting.photo.camera_term import camera_sensitivity
+from pipeline.fitting.photo.camera_term_kernels import read_with_slopes
+from pipeline.fitting.photo.correlation_kernels import read
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.studio.scene.layout import default_layout
@@ -79,5 +80,5 @@ def test_slopes_of_a_picture_are_differences_of_what_is_read_everywhere() -> Non
     for x in np.linspace(-1.5, width + 0.5, 29):
         for y in np.linspace(-1.5, height + 0.5, 23):
             expected = at(x, y), 0.5 * (at(x + 1.0, y) - at(x - 1.0, y)), 0.5 * (at(x, y + 1.0) - at(x, y - 1.0))
-            found = _grey_and_slopes(image, 0, width, height, x, y)
+            found = read_with_slopes(image, 0, width, height, x, y)
             np.testing.assert_allclose(found, expected, atol=255.0 * 1e-6)
