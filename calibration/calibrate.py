@@ -27,7 +27,6 @@ from calibration.adjustment.world import in_world_frame
 from calibration.board.board import Board
 from calibration.board.detection import (
     Detections,
-    Report,
     View,
     WrongBoard,
     detect_folder,
@@ -47,6 +46,7 @@ from calibration.quality.outliers import CORNER_SIGMAS, Dropped, bad_views, drop
 from calibration.result import Calibration, CalibrationRefused
 from rig.formats.serials import with_serials
 from rig.geometry import RigidTransform
+from rig.progress import Progress
 from rig.rig import Rig
 
 # Time offsets are used where they explain this share of the residuals; below it they would only follow noise.
@@ -62,7 +62,7 @@ def calibrate(
     previous: Rig | None = None,
     cache: Path | None = None,
     workers: int = 2,
-    report: Report = ignore_progress,
+    report: Progress = ignore_progress,
 ) -> Calibration:
     """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``; pictures of one shot name show one moment.
 
@@ -76,7 +76,7 @@ def calibrate(
 
 
 def calibrate_detections(
-    detections: Detections, *, front: str | None = None, previous: Rig | None = None, report: Report = ignore_progress
+    detections: Detections, *, front: str | None = None, previous: Rig | None = None, report: Progress = ignore_progress
 ) -> Calibration:
     """``calibrate`` after detection: a pure function."""
     detected = detections.corner_count
@@ -127,7 +127,7 @@ def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) ->
     raise CalibrationRefused(reasons)
 
 
-def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], report: Report) -> _Fit:
+def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], report: Progress) -> _Fit:
     """The bundle, again and again until nothing contradicts it any more."""
     names, noise = graph.names, np.array([lenses[name].noise_px for name in graph.names])
     weak = weak_prior([detections.sizes[name] for name in names])
@@ -168,7 +168,7 @@ def _finish(
     weak: LensPrior,
     noise: Float[np.ndarray, " c"],
     dropped: tuple[Dropped, ...],
-    report: Report,
+    report: Progress,
 ) -> _Fit:
     """Single corners out, Huber's cost, time offsets where they explain something."""
     names = graph.names
@@ -248,7 +248,7 @@ def _judged(
     detected: int,
     front: str | None,
     previous: Rig | None,
-    report: Report,
+    report: Progress,
 ) -> Calibration:
     report("checks", 0.0)
     state = orthonormal(fit.solution.state)

@@ -1,7 +1,6 @@
 """Every tunable of the pipeline, with its source. Values are frozen; unknown keys of a document are refused."""
 
 import dataclasses
-import difflib
 import math
 import re
 import types
@@ -12,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 from pipeline.diagnostics import WARNING_CODES
 from rig.errors import InputError
-from rig.text import encodes
+from rig.text import encodes, suggest
 
 T = TypeVar("T")
 
@@ -304,7 +303,7 @@ def _read(kind: type[T], document: Any, where: str, faults: list[str]) -> T:
     hints = typing.get_type_hints(kind)
     for key in document:
         if key not in hints:
-            near = difflib.get_close_matches(str(key), hints, n=1)
+            near = suggest(str(key), hints)
             faults.append(f"unknown key {where + str(key)!r:.80}" + (f"; did you mean {near[0]!r}?" if near else ""))
     values = {key: _value(hints[key], document[key], where + key, faults) for key in hints if key in document}
     return kind(**{key: value for key, value in values.items() if value is not ...})

@@ -7,9 +7,10 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
+from rig.image import ImageRgb
+
 Filed = TypeVar("Filed")
 
 

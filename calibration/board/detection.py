@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import io
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,15 +19,13 @@ from calibration.board.missing import explain
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras_json import name_fault
+from rig.progress import Progress
 
 VERSION = 1  # of the detector: part of the cache's key
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 
 
 EXPLAINED = 4  # pictures of a blind camera that are looked at twice
-
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +87,7 @@ def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
 
 
 def detect_folder(
-    folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Report = ignore_progress
+    folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Progress = ignore_progress
 ) -> Detections:
     """Finds the board in every picture of ``folder``. Raises InputError on damaged input, WrongBoard where no picture
     shows the board and some show another. ``cache`` is a folder in which finds are kept by the pictures' content."""

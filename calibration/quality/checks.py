@@ -13,6 +13,7 @@ from calibration.adjustment.lens_prior import LensPrior, fixed_prior
 from calibration.adjustment.state import BundleState, Observations, residuals
 from calibration.board.board import Board
 from rig.geometry import rigid_fit
+from rig.parabola import second_difference, vertex_offset
 from rig.rig import Rig
 
 HELD_OUT_EVERY = 5  # every fifth shot is held out once
@@ -193,10 +194,10 @@ def measure_aspect(
         stretched = replace(seen, points=seen.points * [1.0, 1.0 + stretch, 1.0])
         costs.append(solve(state, stretched, prior, sigma, free=free, loss=HUBER, steps=12).cost)
     low, middle, high = costs
-    curvature = (low - 2 * middle + high) / step**2
+    curvature = second_difference(low, middle, high)
     if curvature <= 0:
         return 1.0, float("inf")
-    return 1.0 + 0.5 * (low - high) / (low - 2 * middle + high) * step, float(np.sqrt(2.0 / curvature))
+    return 1.0 + vertex_offset(low, high, curvature) * step, float(np.sqrt(2.0 / (curvature / step**2)))
 
 
 def failed(checks: Sequence[Check]) -> list[Check]:

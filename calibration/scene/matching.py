@@ -6,7 +6,7 @@ a matter of the data and needs no constraint in the solver. Everything runs in o
 order of RANSAC's draws, and so the result, is that of the scheduler.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ import numpy as np
 from calibration.scene.photographs import ONE_SHOT, Photographs
 from rig.errors import InputError
 from rig.formats.images import decode_image_file, write_image
+from rig.progress import Progress
 
 SEED = 0
 LENS_MODEL = "RADIAL"  # f cx cy k1 k2: what one picture, or a few of one lens, can carry
 FEATURES_MOST = 3500  # a picture
 PEAK_LEAST = 0.002  # contrast of a keypoint; COLMAP's own 0.0067 leaves 600 of 3,100 on a face, and its views apart
 SIDE_MOST_PX = 2400  # features are found in pictures no larger; they are placed to a tenth of a pixel anyhow
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +41,7 @@ class Matches:
     matched_keypoints: int
 
 
-def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool | None, report: Report) -> Matches:
+def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool | None, report: Progress) -> Matches:
     """Features of every photograph, matched within each shot and verified by two-view geometry.
 
     ``scratch`` is a folder of the caller's that may be deleted once the structure is solved; ``one_lens``: all
@@ -105,7 +105,7 @@ def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, 
     return sizes
 
 
-def _extract(photographs: Photographs, scratch: Path, report: Report) -> None:
+def _extract(photographs: Photographs, scratch: Path, report: Progress) -> None:
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
@@ -125,7 +125,7 @@ def _extract(photographs: Photographs, scratch: Path, report: Report) -> None:
         )
 
 
-def _match_shots(photographs: Photographs, scratch: Path, report: Report) -> None:
+def _match_shots(photographs: Photographs, scratch: Path, report: Progress) -> None:
     import pycolmap
 
     options = pycolmap.FeatureMatchingOptions()

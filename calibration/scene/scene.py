@@ -5,7 +5,7 @@ with skin and hair in view of cameras 10 to 25 degrees apart, a table with thing
 """
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,9 +29,8 @@ from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.formats.scale_json import read_scale
 from rig.formats.serials import with_serials
+from rig.progress import Progress
 from rig.rig import Rig
-
-Report = Callable[[str, float], None]
 
 JOINED_LEAST = 0.5  # share of the views; where fewer join, there are two scenes or none
 MISFIT_MOST = (
@@ -46,7 +45,7 @@ def calibrate_scene(
     scale: Path | None = None,
     front: str | None = None,
     one_lens: bool | None = None,
-    report: Report = lambda stage, fraction: None,
+    report: Progress = lambda stage, fraction: None,
 ) -> SceneCalibration:
     """Calibrates the cameras of ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``.
 

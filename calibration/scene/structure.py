@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from calibration.scene.matching import SEED, Matches, Report, quiet
+from calibration.scene.matching import SEED, Matches, quiet
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform
+from rig.progress import Progress
 from rig.rig import Rig
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class Structure:
         return projected - self.pixels
 
 
-def solve_structure(matches: Matches, scratch: Path, *, report: Report) -> Structure | None:
+def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Structure | None:
     """The largest set of cameras that join, with their points; None where no pair of views starts one.
 
     Lenses of their own are started from the one that explains all views best, and keep its distortion: a view of a

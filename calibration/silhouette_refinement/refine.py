@@ -34,6 +34,7 @@ from pipeline.fitting.problem import camera_information
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import Tangency, find_tangencies
 from rig.errors import EigenheadError
+from rig.progress import Progress
 from rig.rig import Rig
 
 PRIOR_PX = 0.2  # of a camera that states no covariance
@@ -98,7 +99,7 @@ def refine(
     focal: bool = False,
     prior_px: float = PRIOR_PX,
     heads: Heads | None = None,
-    report: Callable[[str, float], None] = lambda stage, fraction: None,
+    report: Progress = lambda stage, fraction: None,
 ) -> Refinement:
     """Refines extrinsics, and with ``focal`` focal lengths, from all captures; kept if they agree when each is held out
     in its turn (several at a time where there are more than ``FOLDS``).

@@ -9,7 +9,7 @@ closely wins: under thick hair 15 modes cannot tell the right pose from one that
 ends in a local minimum under hair (docs/results.md), so the robust scale begins at 40 px.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -25,6 +25,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import Settings
 from rig.errors import EigenheadError
 from rig.geometry import Similarity, nearest_rotation, rotation_from_vector
+from rig.progress import Progress
 from rig.rig import Rig
 
 SPACING_MM, REACH_MM = 12.0, 264.0  # hull grid about the middle of the rig
@@ -59,7 +60,7 @@ def search_alignment(
     settings: Settings,
     *,
     front: str,
-    report: Callable[[str, float], None],
+    report: Progress,
 ) -> Similarity:
     """world_from_head of the mean head, found from the silhouettes alone. Raises NoSubject."""
     axes = subject_axes(rig, front)

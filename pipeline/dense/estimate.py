@@ -11,7 +11,7 @@ https://doi.org/10.1109/ICCV.2007.4408933). What no other view confirms is not t
 The result depends on nothing but what enters: views are refined each for itself, and compared when all are done.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import UInt8
@@ -29,9 +29,9 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import hull_extent
 from pipeline.settings import DenseSettings
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.rig import Rig
 
-Report = Callable[[str, float], None]
 FIRST, LEAST = 2, 3  # levels of the search and of its bounds: quarter and eighth of the photographs' size
 STEPS_PX = {2: (1, 3), 1: (1,), 0: ()}  # how far planes are taken over from, by level
 ROUNDS = {2: 2, 1: 2, 0: 1}  # of least squares
@@ -45,7 +45,7 @@ def estimate_depth(
     head_world: Mesh | None,
     settings: DenseSettings,
     *,
-    report: Report,
+    report: Progress,
 ) -> tuple[DepthMap, ...]:
     """What each photograph, matched with its neighbours, says of the surface.
 

@@ -10,7 +10,7 @@ https://doi.org/10.1007/978-3-642-15549-9_1).
 A cap is told from hair only where it looks like the clothes below; both hide skin alike.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -25,6 +25,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.parallel_for import thread_count
 from pipeline.settings import PartSettings
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.rig import Rig
 
 SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL = (part.channel for part in CHANNELS)
@@ -43,8 +44,6 @@ SKIN_RATIO = 0.15  # looks that skin has so much less often than the whole subje
 OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a part of its own would fill evenly
 PLAIN = 0.1  # a cell that is less of a feature or underside than this is plain skin, or a beard
 FLOOR = 0.02  # of a part's looks that its histogram has not shown
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +64,7 @@ def classify_parts(
     landmarks_world: Mapping[str, Float[np.ndarray, " 3"]],
     settings: PartSettings,
     *,
-    report: Report,
+    report: Progress,
 ) -> dict[str, PartMap]:
     """What the pixels of every usable view with a photograph show.
 

@@ -5,7 +5,6 @@ names are their source's; Apple's 52 (https://developer.apple.com/documentation/
 are what programs exchange, and ``arkit_parts`` says which of a model's shapes stand for which of them.
 """
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from rig.errors import InputError
+from rig.text import suggest
 
 LEAST_MM = 0.1  # a shape that moves the skin by less is none: pupils, the tongue
 SPARSE_MM = 0.004  # what is left out of a file: what float16 loses of a centimetre
@@ -101,7 +101,7 @@ def weights_from_text(given: Sequence[str], names: tuple[str, ...]) -> dict[str,
         if not 0.0 <= weight <= 1.0:
             faults.append(f"{text}: give NAME=WEIGHT, the weight from 0 to 1")
         elif name not in known:
-            near = difflib.get_close_matches(name, known, 3)
+            near = suggest(name, known, most=3)
             faults.append(f"{name}: the model has no such expression; " + (f"near are {', '.join(near)}" if near else
                           "`eigenhead model info` lists them"))  # fmt: skip
         else:

@@ -35,6 +35,7 @@ from pipeline.fitting.rim_term import observed_rim
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
+from rig.progress import Progress
 from rig.rig import Rig
 
 TRIES = 3  # of a step, each with a hundred times the damping
@@ -62,7 +63,7 @@ def fit_contour(
     settings: FittingSettings,
     *,
     features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
-    report: Callable[[str, float], None] = lambda stage, fraction: None,
+    report: Progress = lambda stage, fraction: None,
 ) -> Fit:
     """Fits shape, pose and cameras to the silhouettes that are usable, from a start pose.
 
@@ -80,7 +81,7 @@ def solve_contour(
     *,
     features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
     landmarks: LandmarkObservations | None = None,
-    report: Callable[[str, float], None] = lambda stage, fraction: None,
+    report: Progress = lambda stage, fraction: None,
 ) -> Solved:
     """``fit_contour`` without its covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)

@@ -20,6 +20,7 @@ from pipeline.parallel_for import thread_count
 from pipeline.results.overlay_kernels import tint
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
+from rig.image import ImageRgb
 from rig.mesh import Mesh
 
 INPUT_COLOUR = (70, 215, 255)  # sky blue, a little lighter
@@ -31,7 +32,6 @@ PANEL = (480, 360)  # width and height of one panel of the contact sheet
 PAPER = (245, 245, 245)
 MARGIN_PX = 16  # around a fitted mask: wider than any line that is painted
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 Resized = UInt8[np.ndarray, "_ _ 3"]  # a picture of any size, whatever others the call has
 
 

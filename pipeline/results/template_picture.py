@@ -4,9 +4,10 @@ import numpy as np
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.results.clay import SKIN, clay
-from pipeline.results.overlays import ImageRgb, contact_sheet
+from pipeline.results.overlays import contact_sheet
 from pipeline.templates.registration import Registration
 from pipeline.templates.template_file import Template
+from rig.image import ImageRgb
 from rig.mesh import Mesh
 
 DEEP, WHOLE = (120, 150, 214), (120, 204, 150)  # what follows the skin, and what moves as a whole

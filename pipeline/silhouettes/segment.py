@@ -8,13 +8,12 @@ The paper says only "background subtraction". A view whose mask cannot be truste
 False where it would hurt a fit, and ``quality.warnings`` say why. Operator masks override everything.
 """
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32
 
 from pipeline.imaging.contour_distance import distance_to_level
 from pipeline.imaging.masks import dilated, eroded
@@ -28,9 +27,10 @@ from pipeline.silhouettes.matting import Matte, solve_matte
 from pipeline.silhouettes.view_consistency import judge_agreement
 from rig.capture import Capture
 from rig.errors import InputError
+from rig.image import ImageRgb
+from rig.progress import Progress
 from rig.rig import Rig
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise, and smaller holes: whites of eyes before a grey wall
 SOLID_HOLE = 0.995  # mean coarse probability: 1.000 in false holes of noisy captures, at most 0.99 in gaps of hair
 UNDECIDED = 0.3  # from one half: share of a cut's windows that is neither yes nor no
@@ -41,9 +41,7 @@ NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small 
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
 
-def segment(
-    capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Callable[[str, float], None]
-) -> dict[str, Silhouette]:
+def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress) -> dict[str, Silhouette]:
     """The silhouette of every camera of the rig; without any plate or mask the subject is found from the photographs.
     Raises InputError where only some cameras have neither."""
     if not capture.backgrounds and not capture.masks:
@@ -84,7 +82,7 @@ def segment(
 
 
 def _without_plates(
-    capture: Capture, rig: Rig, settings: SegmentationSettings, report: Callable[[str, float], None]
+    capture: Capture, rig: Rig, settings: SegmentationSettings, report: Progress
 ) -> dict[str, Silhouette]:
     from pipeline.silhouettes.without_plates.decide import decide_without_plates  # packages that few captures need
 

@@ -9,10 +9,10 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
 from rig.capture import Capture
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
-Progress = Callable[[str, float], None]
 Segment = Callable[..., dict[str, Silhouette]]
 
 

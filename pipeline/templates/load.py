@@ -9,9 +9,10 @@ from jaxtyping import Float
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.templates.names import template_path
-from pipeline.templates.registration import Registration, Report, register
+from pipeline.templates.registration import Registration, register
 from pipeline.templates.template_file import Template, read_template
 from rig.formats.polygon_obj import PolygonMesh, read_polygons
+from rig.progress import Progress
 
 
 def load_template(name: str | None, model: HeadModel) -> Template | None:
@@ -31,7 +32,7 @@ def make_template(
     model: HeadModel,
     *,
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
-    report: Report,
+    report: Progress,
 ) -> tuple[Template, Registration]:
     """The mesh of an OBJ file, registered to a model. Raises InputError naming every fault of the file."""
     mesh = read_polygons(path)

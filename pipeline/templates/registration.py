@@ -5,7 +5,7 @@ non-rigid refinement of ``correspondence``: what the two differ in is not carrie
 skin then has its place on the model's surface, everything deeper follows (``carrying``).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +26,7 @@ from rig.errors import InputError
 from rig.formats.polygon_obj import PolygonMesh
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges, vertex_normals
-
-Report = Callable[[str, float], None]
+from rig.progress import Progress
 
 DRAWN = Search(steps=0, reach_mm=5.0, normal_mm=2.0, plane_mm=0.0)
 MARK_WEIGHT = 30.0  # of a landmark, beside 1 of a vertex that meets the head: it must move its neighbours along
@@ -80,7 +79,7 @@ def register(
     *,
     name: str,
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
-    report: Report,
+    report: Progress,
 ) -> Registration:
     """Registers a mesh, in any unit and any axis convention or with landmarks in its frame, to a model.
 

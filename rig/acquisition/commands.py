@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,9 +28,10 @@ from rig.errors import EigenheadError, InputError
 from rig.formats.capture_folder import write_capture
 from rig.formats.images import write_image
 from rig.formats.rig_toml import RigConfig
+from rig.image import ImageRgb
+from rig.progress import Progress
 from rig.rig import Rig
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 HIDDEN_BY_BOARD = ("view", "swapped", "moved", "plates", "overexposed")  # what is judged by the background, or is paper
 COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "sync", "last seen", "remark")
 
@@ -77,7 +78,7 @@ def capture(
     out: Path,
     make_driver: MakeDriver = driver_for,
     *,
-    report: Callable[[str, float], None] = lambda stage, fraction: None,
+    report: Progress = lambda stage, fraction: None,
 ) -> Shot:
     """`eigenhead rig capture`: one shot into the capture folder ``out``; ``report`` hears of "warm up", "shot", "done".
 

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
+from rig.image import ImageRgb
+from rig.parabola import second_difference, vertex_offset
+
 Grey = Float[np.ndarray, "h w"]
 
 BLUR_MOST_PX = 10.0  # what blur_px says of anything softer
@@ -187,12 +189,12 @@ def _find(here: Grey, there: Grey, point: tuple[int, int]) -> tuple[float, float
 
 
 def _peak(values: Float[np.ndarray, " n"], at: int) -> float:
-    """Offset of the vertex of the parabola through the highest value and its neighbours."""
+    """Returns how far the peak lies from the highest value, in samples; 0 at the ends."""
     if not 0 < at < len(values) - 1:
         return 0.0
     left, middle, right = (float(values[at + step]) for step in (-1, 0, 1))
-    curve = left - 2 * middle + right
-    return 0.0 if curve >= 0 else max(-0.5, min(0.5, 0.5 * (left - right) / curve))
+    curvature = second_difference(left, middle, right)
+    return 0.0 if curvature >= 0 else max(-0.5, min(0.5, vertex_offset(left, right, curvature)))
 
 
 def _largest_move(similarity: Float[np.ndarray, "2 3"], shape: tuple[int, ...]) -> float:

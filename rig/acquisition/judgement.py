@@ -5,15 +5,12 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from statistics import median
 
-import numpy as np
-from jaxtyping import UInt8
-
 from rig.acquisition.image_checks import Registration, blur_px, exposure, register
 from rig.acquisition.plates import Plates
 from rig.acquisition.shot import Fault, PictureCheck
 from rig.formats.rig_toml import ShotConfig
+from rig.image import ImageRgb
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 OtherView = Callable[[str, Registration], str | None]
 
 LEVEL_WITHOUT_PLATES = 64.0  # a studio picture's mean, where there is no plate to compare with

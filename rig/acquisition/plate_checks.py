@@ -4,7 +4,6 @@ and against the plates in use. Pure functions of pictures."""
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from jaxtyping import UInt8
 
 from rig.acquisition.image_checks import disturbed, noise_of
 from rig.acquisition.judgement import examine, judge
@@ -12,8 +11,7 @@ from rig.acquisition.plates import NO_PLATES, Plates
 from rig.acquisition.shot import Fault, ShotFailed
 from rig.acquisition.subject_place import find_subject
 from rig.formats.rig_toml import ShotConfig
-
-ImageRgb = UInt8[np.ndarray, "h w 3"]
+from rig.image import ImageRgb
 
 SEEN_SHARE = 0.5  # of the cameras: a person in the seat is seen by all; what one camera sees is its own wall or a bump
 

@@ -18,18 +18,15 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import UInt8
-
 from rig.acquisition.image_checks import noise_of
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.images import IMAGE_SUFFIXES, read_image, write_image
+from rig.image import ImageRgb
 
 FORMAT = "eigenhead-plates/1"
 VERSIONS_MOST = 6  # the one in use and refused ones included
 UNFINISHED_S = 3600.0  # no version takes so long to write
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 
 from rig.acquisition.judgement import examine, judge
 from rig.acquisition.plate_checks import PlatesRefused, occupied, plate_faults
@@ -28,9 +27,9 @@ from rig.drivers.feed import CameraFeed, FeedState
 from rig.drivers.registry import driver_for
 from rig.formats.cameras_json import read_rig
 from rig.formats.rig_toml import CameraConfig, RigConfig
+from rig.image import ImageRgb
 from rig.rig import Rig
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 MakeDriver = Callable[[CameraConfig, Path], Driver]
 
 _LIVE_WAIT_PERIODS = 3.0  # how long a camera that runs by itself may take for its next frame

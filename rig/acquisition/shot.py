@@ -9,14 +9,11 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Literal, TypedDict
 
-import numpy as np
-from jaxtyping import UInt8
-
 from rig.acquisition.image_checks import Exposure, Registration
 from rig.drivers.base import Frame
 from rig.errors import EigenheadError
+from rig.image import ImageRgb
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 Status = Literal["in sync", "late", "dropped", "missing", "recorded"]
 
 FAULTS = {

@@ -10,9 +10,10 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
+from rig.image import ImageRgb
+
 Edge = Literal["top", "left", "right"]
 
 WIDTH_PX = 320  # of the picture that is compared

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import Literal, TypedDict
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 
 from rig.acquisition.judgement import examine_picture, judge_checks, plate_level
 from rig.acquisition.shot import CheckDocument, Fault, PictureCheck
 from rig.acquisition.subject_place import SubjectPlace, find_subject, subject_of_mask
 from rig.formats.rig_toml import ShotConfig
+from rig.image import ImageRgb
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 Verdict = Literal["good", "usable", "poor"]
 
 PLACE_FAULTS = frozenset({"empty", "cut-off"})

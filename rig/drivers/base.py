@@ -13,8 +13,7 @@ from jaxtyping import UInt8
 
 from rig.errors import EigenheadError
 from rig.formats.rig_toml import CameraConfig
-
-ImageRgb = UInt8[np.ndarray, "h w 3"]
+from rig.image import ImageRgb
 
 
 @dataclass(frozen=True, slots=True)

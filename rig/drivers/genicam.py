@@ -22,9 +22,9 @@ from rig.drivers.base import (
     DriverError,
     DriverMissing,
     GrabTimeout,
-    ImageRgb,
 )
 from rig.formats.rig_toml import CameraConfig
+from rig.image import ImageRgb
 
 _BUFFERS = 4
 _SOURCES = {"external": b"Line1", "software": b"Software"}

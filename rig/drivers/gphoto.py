@@ -11,10 +11,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout, ImageRgb
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout
 from rig.drivers.opencv import decode_jpeg
 from rig.errors import how_to_install
 from rig.formats.rig_toml import CameraConfig
+from rig.image import ImageRgb
 
 # Two cameras that open at once would both walk the USB bus and claim each other's interface.
 _bus = threading.Lock()

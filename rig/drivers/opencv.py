@@ -11,9 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, GrabTimeout, ImageRgb
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, GrabTimeout
 from rig.drivers.mjpeg import MjpegStream, StreamBroken, StreamTimeout
 from rig.formats.rig_toml import CameraConfig
+from rig.image import ImageRgb
 
 _READ_LIMIT_S = 1.0  # of VideoCapture.grab, which takes no timeout of its own: it may overstay by that much
 _STALE_S = 1.0  # a kernel stamp further from now than this is of another clock

@@ -7,11 +7,12 @@
 import time
 from pathlib import Path
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, ImageRgb
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout
 from rig.drivers.frame_clock import Pace
 from rig.errors import InputError
 from rig.formats.images import IMAGE_SUFFIXES, read_image
 from rig.formats.rig_toml import CameraConfig
+from rig.image import ImageRgb
 
 _FPS = 10.0
 

@@ -8,10 +8,11 @@ trigger box, serve the studio (rig.studio.devices.serve).
 import time
 from pathlib import Path
 
-from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout, ImageRgb
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout
 from rig.drivers.frame_clock import Pace
 from rig.errors import InputError
 from rig.formats.rig_toml import CameraConfig
+from rig.image import ImageRgb
 from rig.studio.devices.sources import ImageSource, SceneImages, scene_of_file
 
 _FPS = 10.0

@@ -17,7 +17,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from difflib import SequenceMatcher
 from pathlib import Path
 from types import MappingProxyType
 
@@ -36,10 +35,11 @@ from rig.formats.unread_keys import unread_keys
 from rig.formats.work_size import at_share, work_features, work_rig, work_share
 from rig.plausibility import rig_faults
 from rig.rig import Rig
+from rig.text import suggest
 
 PLATES_MOST = 32  # clean plates read per camera
 BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
-ALIKE_LEAST = 0.75  # of the names of two folders, by difflib: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
+ALIKE_LEAST = 0.75  # of the names of two folders: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
@@ -120,12 +120,13 @@ def check_folders(folder: Path, rig: Rig) -> None:
     """Raises InputError for folders that nobody would read, and that are meant to be one of a capture's own: without a
     word the subject would be found without its plates, or every picture be missing."""
     kinds = ("images", *BESIDE_PICTURES)
-    others = [p.name for p in sorted(folder.iterdir()) if p.is_dir() and p.name not in (*kinds, *rig.names)]
+    folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
+    others = {name.casefold(): name for name in folders if name not in (*kinds, *rig.names)}
     faults = []
     for kind in kinds:
-        alike = [name for name in others if SequenceMatcher(None, name.casefold(), kind).ratio() >= ALIKE_LEAST]
+        alike = suggest(kind, others, min_likeness=ALIKE_LEAST)
         if alike and not (folder / kind).is_dir():
-            faults.append(f"{alike[0]}/ is not read: call it {kind}/")
+            faults.append(f"{others[alike[0]]}/ is not read: call it {kind}/")
     if faults:
         raise InputError("capture", faults)
 

@@ -17,9 +17,9 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from rig.atomic_write import write_atomically
-from rig.capture import ImageRgb
 from rig.errors import InputError, how_to_install
 from rig.formats.work_size import at_share, halvings
+from rig.image import ImageRgb
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")  # JPEG covers the MPO that many phones write into a .jpg
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")

@@ -6,7 +6,6 @@ indices swap. deploy/rig.example.toml shows every key.
 """
 
 import dataclasses
-import difflib
 import math
 import re
 import tomllib
@@ -20,6 +19,7 @@ from typing import Any, Literal
 from rig.errors import InputError
 from rig.formats.cameras_json import name_fault
 from rig.formats.capture_folder import PLATES_MOST
+from rig.text import suggest
 
 FORMAT = "eigenhead-rig/1"
 DriverName = Literal["opencv", "gphoto", "genicam", "replay", "simulated"]
@@ -320,5 +320,5 @@ def _allowed(hint: Any) -> str:
 
 
 def _nearest(word: Any, known: Iterable[Any]) -> str:
-    near = difflib.get_close_matches(str(word), [str(k) for k in known], n=1, cutoff=0.5)
+    near = suggest(str(word), map(str, known), min_likeness=0.5)
     return f"; did you mean {near[0]!r}?" if near else ""

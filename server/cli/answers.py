@@ -15,6 +15,7 @@ import typer
 
 from pipeline.eigenheads.data_folder import DATA
 from rig.errors import EigenheadError, InputError
+from rig.progress import Progress
 
 # Before OpenCV is loaded, here and in workers: what it has to say of a damaged picture, an error of ours says in words.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
@@ -59,7 +60,6 @@ Data = Annotated[
     ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
-Report = Callable[[str, float], None]
 
 
 def service_settings(**given: Any) -> Any:
@@ -164,7 +164,7 @@ def prepare_folder(path: Path) -> None:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Report]:
+def progress_bar() -> Iterator[Progress]:
     """A progress bar on standard error when that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda stage, fraction: None

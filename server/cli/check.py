@@ -5,7 +5,7 @@ pictures of no camera, which a reconstruction passes over; where they are in ord
 pictures and cameras (``pipeline.silhouettes.usable_views``). What is wrong with this machine is no fault of the capture
 and is raised."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, listed_pictures, read_capture, stray_faults
 from rig.formats.images import decode_image_file
 from rig.formats.work_size import WORK_PIXELS
+from rig.progress import Progress
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
 from server.tasks.child import WorkFailed
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from pipeline.imaging.silhouette import Silhouette
     from pipeline.settings import Settings
 
-Report = Callable[[str, float], None]
 RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 
 
@@ -49,7 +49,7 @@ class Checked(TypedDict):
     will: list[str]
 
 
-def checked(capture: Path, settings: dict[str, object], *, report: Report) -> Checked:
+def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> Checked:
     """Every fault and warning of a capture folder or archive that needs no fit. Raises InputError for settings that are
     none, WrongVariable and WorkFailed."""
     from pipeline.settings import settings_from_document
@@ -113,7 +113,7 @@ def _told_by_strays(root: Path) -> list[Warned]:
     return [Warned(code="picture-unread", message=f"{stray}; {passed}") for stray in strays]
 
 
-def _told_by_photographs(folder: Path, report: Report) -> tuple[list[str], list[str]]:
+def _told_by_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
     """Names of the photographs of a folder that has no cameras, and what a reconstruction will do with them. Raises
     InputError for photographs, or a scale.json, that cannot be used."""
     from calibration.scene.photographs import find_photographs
@@ -138,7 +138,7 @@ def _told_by_photographs(folder: Path, report: Report) -> tuple[list[str], list[
     return list(names), [begun, *unread, scale, masks]
 
 
-def _check_pictures(files: list[Path], root: Path, report: Report) -> None:
+def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
     """Decodes one after the other. Raises InputError naming every one that cannot be, or is too large."""
     faults = []
     for number, path in enumerate(files):
@@ -148,7 +148,7 @@ def _check_pictures(files: list[Path], root: Path, report: Report) -> None:
         raise InputError("photographs", filter(None, faults))
 
 
-def _told_by_outlines(folder: Path, chosen: "Settings", report: Report) -> list[Warned]:
+def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> list[Warned]:
     from pipeline.settings import OutputSettings
     from pipeline.silhouettes.segment import segment
     from pipeline.silhouettes.usable_views import usable_views

@@ -11,7 +11,7 @@ import hashlib
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ import httpx
 
 from rig.errors import EigenheadError
 from rig.formats.archive import is_archive, pack_folder
+from rig.progress import Progress
 from server.services.documents import CaptureDocument, ErrorDocument, JobDocument
 from server.storage.result_folder import fresh_folder
 
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 PART_BYTES = 8 << 20
 TUS = {"Tus-Resumable": "1.0.0"}
 RETRY_STATUSES = (429, 502, 503, 504)
-
-Report = Callable[[str, float], None]
 
 
 class ServiceError(EigenheadError):
@@ -98,7 +97,7 @@ class Client:
     def delete(self, path: str) -> None:
         self._request("DELETE", path)
 
-    def upload(self, source: Path, *, report: Report | None = None, **about: str) -> CaptureDocument:
+    def upload(self, source: Path, *, report: Progress | None = None, **about: str) -> CaptureDocument:
         """Uploads a capture folder or an archive of one, resuming after every break; returns the capture.
 
         ``about`` may hold session, label and expression. Raises ServiceError naming every fault of the capture.
@@ -143,7 +142,7 @@ class Client:
                     raise Unreachable(self.url, error) from error
             time.sleep(0.3)
 
-    def wait(self, job_id: str, *, report: Report | None = None) -> JobDocument:
+    def wait(self, job_id: str, *, report: Progress | None = None) -> JobDocument:
         """The succeeded job. Raises JobEnded for one that failed or was cancelled."""
         for kind, document in self.events(job_id):
             if kind == "end":
@@ -169,7 +168,7 @@ class Client:
                 path.write_bytes(data)
         return [folder / name for name in job["files"]]
 
-    def _upload_archive(self, archive: Path, report: Report, about: dict[str, str]) -> CaptureDocument:
+    def _upload_archive(self, archive: Path, report: Progress, about: dict[str, str]) -> CaptureDocument:
         if not is_archive(archive):
             raise ServiceError(422, "no-archive", f"{archive.name} is no .zip, .tar or .tar.gz", [])
         size = archive.stat().st_size

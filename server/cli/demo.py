@@ -5,7 +5,7 @@ import json
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +18,7 @@ from pipeline.results.overlays import PANEL
 from pipeline.settings import settings_from_document
 from rig.errors import EigenheadError
 from rig.formats.images import write_image
+from rig.progress import Progress
 from server.address import listen
 from server.cli.client import Client, Unreachable
 from server.processes import python_command, python_environment
@@ -27,8 +28,6 @@ from server.tasks.prepare import prepare_kernels
 
 START_S = 60.0
 STRIP = 60  # height of the headings, pixels
-
-Report = Callable[[str, float], None]
 
 
 class ServiceDied(EigenheadError):
@@ -58,7 +57,7 @@ class DemoDocument(TypedDict):
     methods: dict[str, MethodDocument]
 
 
-def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Report) -> DemoDocument:
+def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Progress) -> DemoDocument:
     """Starts a service in a temporary data folder, triggers its simulated rig, submits a job, follows it, and fetches
     its result into ``out``.
 
@@ -102,7 +101,7 @@ def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Report)
     }
 
 
-def _part(report: Report, name: str, start: float, share: float) -> Report:
+def _part(report: Progress, name: str, start: float, share: float) -> Progress:
     return lambda stage, fraction: report(name + stage, start + share * fraction)
 
 

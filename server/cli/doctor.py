@@ -1,6 +1,5 @@
 """``eigenhead doctor``: what is wrong with this machine, and what to do about it."""
 
-import difflib
 import os
 import shutil
 import socket
@@ -17,6 +16,7 @@ from pipeline.eigenheads.model_names import model_path
 from pipeline.parallel_for import THREADS, thread_count
 from rig.cache_folder import CACHE, cache_folder
 from rig.errors import EigenheadError
+from rig.text import suggest
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
 from server.tasks.child import Child, WorkFailed
@@ -219,7 +219,7 @@ def _variables(settings: ServiceSettings) -> tuple[bool, str]:
     faults = []
     for name in given:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
+            near = suggest(name, known)
             faults.append(f"{name} is not known" + (f"; did you mean {near[0]}?" if near else ""))
     return not faults, "; ".join(faults) or ", ".join(given) or "none set"
 

@@ -1,6 +1,5 @@
 """``eigenhead experiments real FOLDER...``: captures with more views than are used, calibrated first where needed."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,6 +8,7 @@ from typing import TYPE_CHECKING
 from rig.errors import InputError
 from rig.formats.capture_folder import capture_root
 from rig.formats.outlines_json import read_outlines
+from rig.progress import Progress
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from pipeline.experiments.outcome import Outcome
     from pipeline.experiments.real import RealCapture
 
-Report = Callable[[str, float], None]
 OUTLINES = "outlines.json"
 
 
@@ -27,7 +26,7 @@ def judge_folders(
     front: str | None,
     outlines: Path | None,
     kept: Path | None,
-    report: Report,
+    report: Progress,
 ) -> "Outcome":
     """Figures of every folder. ``outlines``: drawn masks of the only folder, else its own outlines.json; ``kept``:
     where cameras that had to be found stay. Raises InputError."""
@@ -52,7 +51,7 @@ def judge_folders(
 
 
 def read_real_capture(
-    folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Report
+    folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Progress
 ) -> "RealCapture":
     """A folder as ``real`` takes it: masks and outlines that it has judge, and feature points are left out."""
     from pipeline.experiments.real import RealCapture

@@ -3,7 +3,7 @@
 import json
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from rig.errors import InputError
 from rig.formats.archive import extract_archive
 from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, picture_folder
+from rig.progress import Progress
 from server.cli.answers import CannotWrite, SpoilsCapture
 from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
@@ -22,8 +23,6 @@ from server.tasks.progress import JobProgress
 if TYPE_CHECKING:
     from pipeline.results.report import Report as ReportDocument
     from pipeline.settings import Settings
-
-Report = Callable[[str, float], None]
 
 
 def settings_document(path: Path | None, **given: str | Mapping[str, object] | None) -> dict[str, object]:
@@ -46,7 +45,7 @@ def settings_document(path: Path | None, **given: str | Mapping[str, object] | N
 
 
 def reconstruct_locally(
-    capture: Path, out: Path, *, model: str | None, settings: Mapping[str, object], report: Report
+    capture: Path, out: Path, *, model: str | None, settings: Mapping[str, object], report: Progress
 ) -> "ReportDocument":
     """Reconstructs a capture folder or archive into ``out`` and returns report.json; cameras and masks that had to be
     found are kept in ``out``, whatever comes after. What can be wrong with settings, model, template,
@@ -65,7 +64,7 @@ def reconstruct_locally(
 
 
 def _reconstruct_folder(
-    folder: Path, out: Path, *, kept: Path, model: str | None, chosen: "Settings", report: Report
+    folder: Path, out: Path, *, kept: Path, model: str | None, chosen: "Settings", report: Progress
 ) -> None:
     from server.tasks.photographs import keep_masks, read_or_calibrate
 

@@ -1,6 +1,6 @@
 """``eigenhead refine``: captures on disk to a refined calibration."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,13 @@ from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture
 from rig.geometry import RigidTransform, Similarity
+from rig.progress import Progress
 from rig.rig import Rig
 from server.cli.reconstruct_local import folder_of
 
-Report = Callable[[str, float], None]
-
 
 def refine_locally(
-    captures: Sequence[Path], *, calibration: Path | None, focal: bool, model: str | None, report: Report
+    captures: Sequence[Path], *, calibration: Path | None, focal: bool, model: str | None, report: Progress
 ) -> RefinementRun:
     """Refines the calibration that the captures share, or ``calibration``, with the rims of ``model`` if it is given.
 

@@ -13,6 +13,7 @@ from rig.acquisition.commands import take_plates
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.rig_toml import read_rig_config
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.studio.devices.folder import write_truth
 from rig.studio.devices.serve import STUDIO, StudioDevices, device_fault_from_text, serve_scene
@@ -84,7 +85,7 @@ def serve_studio(
     fps: float,
     port: int,
     ready: Callable[[OpenStudio], None],
-    report: Callable[[str, float], None],
+    report: Progress,
 ) -> None:
     """Serves the subject that ``eigenhead simulate`` draws for the same seed, until SIGINT or SIGTERM.
 

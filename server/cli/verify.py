@@ -1,19 +1,18 @@
 """``eigenhead verify``: captures of a mannequin, or their results, judged against its scan."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.errors import EigenheadError, InputError
+from rig.progress import Progress
 from server.cli.reconstruct_local import reconstruct_locally
 
 if TYPE_CHECKING:
     from pipeline.verification.limits import Limits
     from pipeline.verification.report import VerificationReport
-
-Report = Callable[[str, float], None]
 
 
 class LimitsMissed(EigenheadError):
@@ -37,7 +36,7 @@ def verify_captures(
     model: str | None,
     settings: Mapping[str, object],
     limits: "Limits",
-    report: Report,
+    report: Progress,
 ) -> "VerificationReport":
     """Writes report.json and certificate.pdf into ``out``, and the results of captures into ``out/results``.
 

@@ -11,9 +11,10 @@ from typing import Protocol
 import structlog
 
 from rig.acquisition.image_checks import blur_px, exposure
+from rig.image import ImageRgb
 from server.console.live_frame import LiveFrame
 from server.console.studio_view import frames
-from server.services.rigs import ImageRgb, RigBackend, jpeg, reduced
+from server.services.rigs import RigBackend, jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child
 from server.wire.problems import problem_from

@@ -6,16 +6,15 @@ from typing import TypedDict
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from pipeline.results.report import Report
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.geometry import RigidTransform
+from rig.image import ImageRgb
 from rig.rig import Rig
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 WIDTH_MOST = 1600
 MM = 1000.0
 

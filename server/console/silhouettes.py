@@ -7,14 +7,15 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from rig.atomic_write import write_atomically
-from server.tasks.child import Bench, Report
+from rig.progress import Progress
+from server.tasks.child import Bench
 
 WIDTH = 640
 COLOUR = (108, 178, 255)  # the accent of the pages
 LINE_PX = 3
 
 
-def draw(bench: Bench, report: Report, *, capture: str, cache: str, target: str) -> None:
+def draw(bench: Bench, report: Progress, *, capture: str, cache: str, target: str) -> None:
     """Writes ``target``/<camera>.png, the outline with a tint of the subject on nothing. Raises InputError."""
     from pipeline.settings import SegmentationSettings
     from rig.formats.capture_folder import read_capture

@@ -1,10 +1,11 @@
 """The live view of the simulated studio, asked of a child process, so that this one need not load what draws it."""
 
+from rig.progress import Progress
 from server.console.live_frame import LiveFrame
-from server.tasks.child import Bench, Report
+from server.tasks.child import Bench
 
 
-def frames(bench: Bench, report: Report, *, look: int) -> list[LiveFrame]:
+def frames(bench: Bench, report: Progress, *, look: int) -> list[LiveFrame]:
     """One frame a camera; now and then one of them has blur_px."""
     from server.console import studio_drawing
 

@@ -14,7 +14,6 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from rig.acquisition.commands import board_shot
 from rig.acquisition.plate_checks import PlatesRefused
@@ -28,6 +27,7 @@ from rig.formats.cameras_json import read_rig, write_rig
 from rig.formats.capture_folder import write_capture
 from rig.formats.images import write_image
 from rig.formats.rig_toml import RigConfig, adjusted, read_rig_config
+from rig.image import ImageRgb
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
@@ -36,7 +36,6 @@ from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
 from server.tasks.child import Child, WorkFailed
 from server.tasks.simulate import SimulatedCertificate, look, simulated
 
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 PREVIEW_WIDTH = 640
 PREVIEW_QUALITY = 80
 SHOT_BYTES = 64 << 20

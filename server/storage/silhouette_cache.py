@@ -13,7 +13,6 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
@@ -28,6 +27,7 @@ from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.segment import segment
 from rig.atomic_write import write_atomically
 from rig.capture import Capture
+from rig.progress import Progress
 from rig.rig import Rig
 
 SUFFIX = ".silhouettes"
@@ -41,11 +41,9 @@ ROOMS = (
 )  # of the pipeline: what silhouettes come from
 QUICK = 1  # zlib's fastest level: 35 MB become 4.7 MB in 0.2 s, and no level gets below 4
 
-Report = Callable[[str, float], None]
-
 
 def segment_once(
-    folder: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Report
+    folder: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
 ) -> dict[str, Silhouette]:
     """``segment``, unless ``folder`` holds what it found before. ``capture`` was read from files."""
     path = folder / (_key(capture, settings) + SUFFIX)

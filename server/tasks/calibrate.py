@@ -10,8 +10,9 @@ from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.capture_folder import capture_root
+from rig.progress import Progress
 from server.storage.records import CalibrationOutcome
-from server.tasks.child import Bench, Report
+from server.tasks.child import Bench
 from server.tasks.photographs import SCALE, check_sizes
 
 BOARD = "board.toml"
@@ -36,7 +37,7 @@ def is_of_board(folder: Path) -> bool:
 
 
 def ingest_photographs(
-    bench: Bench, report: Report, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
+    bench: Bench, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> None:
     """Unpacks photographs of a scene, and scale.json where there is one, into ``folder`` and looks at both. Raises
     InputError."""
@@ -73,7 +74,7 @@ def check_scale(folder: Path) -> None:
         read_scale(folder / SCALE, [path.name for path in (folder / "images").iterdir()])
 
 
-def ingest_board_pictures(bench: Bench, report: Report, *, archive: str, folder: str, limits: ArchiveLimits) -> None:
+def ingest_board_pictures(bench: Bench, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits) -> None:
     """Unpacks board.toml and IMAGES/ into ``folder`` and looks at both. Raises InputError."""
     from calibration.board.board import read_board
     from calibration.board.detection import list_pictures
@@ -95,7 +96,7 @@ def ingest_board_pictures(bench: Bench, report: Report, *, archive: str, folder:
 
 
 def calibrate_folder(
-    bench: Bench, report: Report, *, folder: str, result: str, previous: str | None, cache: str, front: str | None
+    bench: Bench, report: Progress, *, folder: str, result: str, previous: str | None, cache: str, front: str | None
 ) -> CalibrationOutcome:
     """``calibrate()``, or ``calibrate_scene()``, and its files; returns what the record shows."""
     if not is_of_board(Path(folder)):
@@ -134,7 +135,7 @@ def calibrate_folder(
     }
 
 
-def _calibrate_scene(report: Report, folder: Path, result: Path, front: str | None) -> CalibrationOutcome:
+def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | None) -> CalibrationOutcome:
     from calibration.result import CalibrationRefused
     from calibration.scene.report import write_scene_report
     from calibration.scene.scene import calibrate_scene

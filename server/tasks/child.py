@@ -25,16 +25,17 @@ from multiprocessing.connection import Connection
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from rig.errors import Cancelled, EigenheadError, InputError
+from rig.progress import Progress
 from server.processes import SERVER, python_command, python_environment
 
 PATIENCE_S = 0.5  # between asking a piece of work to stop and killing it: a cancellation takes effect within a second
 REPORT_EVERY_S = 0.05
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
-Report = Callable[[str, float], None]
 P = ParamSpec("P")
 T = TypeVar("T")
 STOP = b""
+Report = Progress  # as the task of a reconstruction calls it
 
 
 class WorkFailed(EigenheadError):
@@ -71,9 +72,9 @@ class Child:
 
     def remote(
         self,
-        work: Callable[Concatenate[Bench, Report, P], T],
+        work: Callable[Concatenate[Bench, Progress, P], T],
         *,
-        report: Report = lambda stage, fraction: None,
+        report: Progress = lambda stage, fraction: None,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Callable[P, T]:
         """``work``, a function of a module, as it runs in the child: ``child.remote(work)(name=value)`` calls
@@ -88,7 +89,7 @@ class Child:
 
         return call
 
-    def _run(self, request: bytes, report: Report, cancelled: Callable[[], bool]) -> Any:
+    def _run(self, request: bytes, report: Progress, cancelled: Callable[[], bool]) -> Any:
         connection = self._started()
         try:
             connection.send_bytes(request)
@@ -123,7 +124,7 @@ class Child:
         self._connection = Connection(ours.detach())
         return self._connection
 
-    def _await(self, connection: Connection, report: Report, cancelled: Callable[[], bool]) -> Any:
+    def _await(self, connection: Connection, report: Progress, cancelled: Callable[[], bool]) -> Any:
         deadline: float | None = None
         while True:
             if connection.poll(0.05):
@@ -222,7 +223,7 @@ def serve(connection: Connection) -> None:
         connection.send(answer)
 
 
-def _reporter(connection: Connection, stop: threading.Event) -> Report:
+def _reporter(connection: Connection, stop: threading.Event) -> Progress:
     last: tuple[str, float] = ("", 0.0)
 
     def report(stage: str, fraction: float) -> None:

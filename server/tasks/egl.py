@@ -1,9 +1,10 @@
 """Whether this machine draws; runs in a child process."""
 
-from server.tasks.child import Bench, Report
+from rig.progress import Progress
+from server.tasks.child import Bench
 
 
-def try_egl(bench: Bench, report: Report) -> str:
+def try_egl(bench: Bench, report: Progress) -> str:
     """The name of the GL device. Raises the renderer's own error."""
     from rig.render.context import GlContext  # without the renderer's NumPy: half the time
 

@@ -36,16 +36,17 @@ from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
 from rig.plausibility import rig_faults
+from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
-from server.tasks.child import Bench, Report
+from server.tasks.child import Bench
 from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, check_sizes, photographs_alone
 
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
 
 def ingest_archive(
-    bench: Bench, report: Report, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
+    bench: Bench, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> CaptureContent:
     """Unpacks ``archive``, checks the capture in it, and leaves ``folder`` with exactly its files.
 
@@ -67,7 +68,7 @@ def ingest_archive(
     return described
 
 
-def _calibrate(root: Path, image_pixels: int, report: Report) -> tuple[ReportWarning, ...]:
+def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportWarning, ...]:
     """Leaves cameras.json and calibration.json beside photographs that came alone, and only those that joined. Raises
     InputError with the views that did not."""
     from calibration.result import CalibrationRefused
@@ -131,13 +132,13 @@ def _with_calibration(found: CaptureContent, root: Path, told: tuple[ReportWarni
 
 
 def ingest_folder(
-    bench: Bench, report: Report, *, folder: str, image_pixels: int, measured: bool = False
+    bench: Bench, report: Progress, *, folder: str, image_pixels: int, measured: bool = False
 ) -> CaptureContent:
     """The same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was taken."""
     return check_capture(Path(folder), image_pixels, report, measured=measured)
 
 
-def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int) -> CaptureContent:
+def ingest_board(bench: Bench, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
     """A shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
     root = Path(folder)
     for entry in root.iterdir():
@@ -160,7 +161,7 @@ def ingest_board(bench: Bench, report: Report, *, folder: str, image_pixels: int
 
 
 def check_capture(
-    root: Path, image_pixels: int, report: Report, *, measured: bool = False, strays_pass: bool = False
+    root: Path, image_pixels: int, report: Progress, *, measured: bool = False, strays_pass: bool = False
 ) -> CaptureContent:
     """What a capture folder holds; pictures of no camera are faults unless ``strays_pass``. Raises InputError naming
     every fault."""
@@ -221,7 +222,7 @@ def _shows_its_plate(shot: Capture, name: str) -> bool:
     return image is not None and any(np.array_equal(image, plate) for plate in plates)
 
 
-def check_features(bench: Bench, report: Report, *, folder: str, points: Points) -> bytes:
+def check_features(bench: Bench, report: Progress, *, folder: str, points: Points) -> bytes:
     """Judges feature points for the capture in ``folder``; returns the file of them. Raises InputError."""
     rig_file = find_rig_file(Path(folder))
     if rig_file is None:

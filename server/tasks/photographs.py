@@ -6,7 +6,7 @@ calibration.html; then masks/. A second run with the same photographs takes them
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,9 +28,9 @@ from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.capture_folder import capture_root, picture_folder, read_capture, read_shot
 from rig.formats.images import is_picture, picture_size, write_image
 from rig.formats.work_size import WORK_PIXELS, work_rig
+from rig.progress import Progress
 from rig.rig import Rig
 
-Report = Callable[[str, float], None]
 CAMERAS, FIGURES, PAGE, SCALE = "cameras.json", "calibration.json", "calibration.html", "scale.json"
 
 
@@ -53,7 +53,7 @@ def photographs_alone(folder: Path) -> bool:
     return any(is_picture(path) for path in found)
 
 
-def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Report) -> Prepared:
+def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:
     """A capture folder as it is, or, where it has no cameras, with those that its photographs give.
 
     Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
@@ -70,7 +70,7 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Re
     return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
 
 
-def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Report) -> tuple[ReportWarning, ...]:
+def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Progress) -> tuple[ReportWarning, ...]:
     """Leaves cameras.json and its report in ``kept``, unless they are there and of the same photographs."""
     made_of = _made_of(root, front)
     if (told_before := calibration_warnings(kept, made_of)) is not None:
@@ -120,7 +120,7 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
 
 
 def keep_masks(
-    kept: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Report
+    kept: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
 ) -> dict[str, Silhouette]:
     """Silhouettes; where the photographs alone told them, masks/ in ``kept`` shows them, and a second run takes what
     it finds there."""

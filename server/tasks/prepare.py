@@ -8,19 +8,18 @@ import shutil
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
 from rig.cache_folder import cache_folder
+from rig.progress import Progress
 from server.tasks.child import Bench, Child
 
 if TYPE_CHECKING:
     from pipeline.kernel_list import Kernel
     from pipeline.settings import Settings
 
-Report = Callable[[str, float], None]
 log = logging.getLogger("eigenhead")
 FREE_LEAST = 16 << 20  # bytes of disk: the list takes 6 MB, and arrays come after it
 PROCESSES_MOST = 8  # each takes 250 MB and half a second to load what it compiles
@@ -34,7 +33,7 @@ class Prepared(NamedTuple):
     known: int
 
 
-def compile_kernel(bench: Bench, report: Report, *, line: str) -> bool:
+def compile_kernel(bench: Bench, report: Progress, *, line: str) -> bool:
     """In a child: compiles a line of the list. False where it could not be kept, which the log has said."""
     from pipeline.kernel_list import Kernel
 
@@ -43,7 +42,7 @@ def compile_kernel(bench: Bench, report: Report, *, line: str) -> bool:
     return kernel.is_kept()
 
 
-def prepare_kernels(report: Report, settings: "Settings | None" = None) -> Prepared:
+def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Prepared:
     """Compiles what the list has and the cache folder lacks, and says so in a line.
 
     Where nothing can be kept it says so in a line and compiles nothing: each process will have to, for itself.
@@ -78,7 +77,7 @@ def prepare_kernels(report: Report, settings: "Settings | None" = None) -> Prepa
 class _Work:
     """Groups of kernels that several threads, each with a child, take one after another."""
 
-    def __init__(self, groups: "list[list[Kernel]]", total: int, report: Report) -> None:
+    def __init__(self, groups: "list[list[Kernel]]", total: int, report: Progress) -> None:
         self._groups, self._total, self._report = deque(groups), total, report
         self._lock = threading.Lock()
         self.done = 0

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from server.tasks.child import Bench, Report
+from rig.progress import Progress
+from server.tasks.child import Bench
 
 if TYPE_CHECKING:
     from rig.studio.scene.simulate import SimulatedCapture
@@ -26,7 +27,7 @@ class SimulatedCertificate(TypedDict):
     faults: list[str]
 
 
-def simulated(bench: Bench, report: Report, *, folder: str, seed: int | None) -> SimulatedCertificate:
+def simulated(bench: Bench, report: Progress, *, folder: str, seed: int | None) -> SimulatedCertificate:
     """A capture in ``folder/files``, its truth in ``folder/truth``; returns the shot's certificate.
 
     Without a seed the subject is another one each time. The operator's clicks are left out: they are made later.
@@ -56,7 +57,7 @@ def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
 
 
-def look(bench: Bench, report: Report, *, cameras: list[str]) -> dict[str, np.ndarray]:
+def look(bench: Bench, report: Progress, *, cameras: list[str]) -> dict[str, np.ndarray]:
     """What cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
     from pipeline.eigenheads.model import load_model
     from rig.render.renderer import Renderer

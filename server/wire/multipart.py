@@ -4,7 +4,6 @@ The body is parsed here, not by the framework, so that a key and free space are 
 file is held in memory or in a temporary folder elsewhere, and every write happens in a thread.
 """
 
-import difflib
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from rig.errors import InputError
+from rig.text import suggest
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
@@ -168,7 +168,7 @@ def check_fields(names: Iterable[str], known: Collection[str]) -> None:
     faults = []
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
+            near = suggest(name, known)
             told = f"did you mean {near[0]!r}?" if near else f"there are file, {', '.join(known)}"
             faults.append(f"unknown field {name!r:.80}; {told}")
     if faults:

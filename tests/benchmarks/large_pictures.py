@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from pipeline.eigenheads.model import load_model
-from rig.capture import ImageRgb
 from rig.formats.cameras_json import write_rig
 from rig.formats.images import write_image
+from rig.image import ImageRgb
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

@@ -13,14 +13,22 @@ from rig.atomic_write import write_atomically
 from rig.formats.glb import write_glb
 from rig.formats.ply import write_ply
 from rig.mesh import Mesh
-from server.tasks.child import Bench, Report
+from rig.progress import Progress
+from server.tasks.child import Bench
 
 RADIUS_MM = 90.0
 QUALITY_MOST_MM = 2.0  # at the top of the ball; 1.0 at the bottom
 
 
 def work(
-    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
+    bench: Bench,
+    report: Progress,
+    *,
+    capture: str,
+    result: str,
+    cache: str,
+    model: str | None,
+    settings: dict[str, Any],
 ) -> dict[str, Any]:
     """A grey ball about the world's origin; its standard deviation grows with its height; the upper half of the bust is
     hair. It takes ``EIGENHEAD_BALL_S`` seconds longer than it must."""

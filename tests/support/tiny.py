@@ -10,11 +10,19 @@ from typing import Any
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.capture_folder import read_capture
-from server.tasks.child import Bench, Report
+from rig.progress import Progress
+from server.tasks.child import Bench
 
 
 def work(
-    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
+    bench: Bench,
+    report: Progress,
+    *,
+    capture: str,
+    result: str,
+    cache: str,
+    model: str | None,
+    settings: dict[str, Any],
 ) -> dict[str, Any]:
     """Takes ``EIGENHEAD_TINY_S`` seconds and writes files that follow from the capture alone."""
     shot, _ = read_capture(Path(capture))
@@ -48,7 +56,14 @@ def work(
 
 
 def busy(
-    bench: Bench, report: Report, *, capture: str, result: str, cache: str, model: str | None, settings: dict[str, Any]
+    bench: Bench,
+    report: Progress,
+    *,
+    capture: str,
+    result: str,
+    cache: str,
+    model: str | None,
+    settings: dict[str, Any],
 ) -> dict[str, Any]:
     """About a second of one core, by count and not by clock, so that a busy core takes longer."""
     digest = b""

@@ -6,7 +6,7 @@ for each vertex. A signed distance is found on a grid (``signed_distance``), its
 mesh would cross itself (``crossings``).
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,9 +29,8 @@ from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import BustSettings
 from rig.mesh import Mesh, face_normals
+from rig.progress import Progress
 from rig.rig import Rig
-
-Report = Callable[[str, float], None]
 
 TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
 VIEWS_LEAST = 3
@@ -65,7 +64,7 @@ def fuse(
     settings: BustSettings,
     *,
     head_skin_world: Mesh | None = None,
-    report: Report,
+    report: Progress,
 ) -> BustSurface:
     """The closed surface that the views agree on.
 

@@ -8,7 +8,7 @@ is most probable under what is known of heads (``prior``), given the scan's land
 smooth displacement along the normals onto the scan.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -30,11 +30,10 @@ from pipeline.eigenheads.pca import align
 from pipeline.eigenheads.subdivision import edges_of, vertex_areas
 from rig.geometry import RigidTransform, cross_matrix, rigid_fit
 from rig.mesh import vertex_normals
+from rig.progress import Progress
 
 _TAUBIN = (0.5, -0.53)  # a step that smooths and one that gives the size back
 _SMOOTHINGS = 4  # of both: noise of single points falls to half; with 8, fine shape goes too
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +84,7 @@ class Target:
 
 
 def correspond(
-    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Report | None = None
+    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
 ) -> Correspondence:
     """Corresponded heads on the template's cage connectivity. Scans must have passed ``scan_checks.check``."""
     matching = matching or Matching()
@@ -194,7 +193,7 @@ def _refined(
     template: HeadModel,
     matching: Matching,
     crew: Workers,
-    report: Report | None,
+    report: Progress | None,
 ) -> Float[np.ndarray, "N V 3"]:
     count = len(template.mean)
     faces, mean = template.levels["cage"].faces, template.vertices(np.zeros(0))[:count]

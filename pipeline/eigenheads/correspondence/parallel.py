@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import TypeVar
 
-Report = Callable[[str, float], None]
+from rig.progress import Progress
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -24,7 +25,7 @@ class Workers:
     pool: ProcessPoolExecutor | None
 
     def over(
-        self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Report | None
+        self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Progress | None
     ) -> list[Result]:
         """An exception of ``work`` is raised here, the earliest item's first."""
         results = map(work, items) if self.pool is None else self.pool.map(work, items, chunksize=_CHUNK)

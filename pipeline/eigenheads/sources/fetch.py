@@ -9,7 +9,6 @@ import re
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -18,8 +17,7 @@ from pipeline.eigenheads.data_folder import models_folder
 from pipeline.eigenheads.model_file import ModelParts, save_model
 from pipeline.eigenheads.sources.imports import import_model
 from rig.errors import EigenheadError
-
-Report = Callable[[str, float], None]
+from rig.progress import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +67,7 @@ def fetch_model(
     source: str | Path | None = None,
     commit: str | None = None,
     timeout_s: float = 1800.0,
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> Fetched:
     """Fetch the named model and save it below ``models_folder()``.
 
@@ -96,7 +94,7 @@ def fetch_model(
     return Fetched(path, parts, licence_text, wanted)
 
 
-def _check_out(name: str, url: str, commit: str, remote: Remote, folder: Path, timeout_s: float, say: Report) -> None:
+def _check_out(name: str, url: str, commit: str, remote: Remote, folder: Path, timeout_s: float, say: Progress) -> None:
     """The needed part of the pinned commit in ``folder``; no history, no other file."""
     say("fetching", 0.0)
     place = str(Path(url).resolve()) if Path(url).exists() else url
@@ -111,7 +109,7 @@ def _check_out(name: str, url: str, commit: str, remote: Remote, folder: Path, t
     say("fetching", 1.0)
 
 
-def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Report | None = None) -> str:
+def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Progress | None = None) -> str:
     """One git command. It never asks for a password; its progress lines become reports."""
     environment = os.environ | {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C", "GIT_LFS_SKIP_SMUDGE": "1"}
     try:
@@ -139,7 +137,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Report
     return out.decode(errors="replace")
 
 
-def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, say: Report | None) -> bytes:
+def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, say: Progress | None) -> bytes:
     """Standard output of a process; its progress lines are reported meanwhile. Raises TimeoutExpired."""
     while True:
         try:

@@ -9,7 +9,7 @@ triangles between existing vertices, so that the head hides what is behind it.
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,8 +31,7 @@ from pipeline.eigenheads.training.training import Training, above_neck, face_reg
 from rig.errors import how_to_install
 from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
-
-Report = Callable[[str, float], None]
+from rig.progress import Progress
 
 ICT_NAME = "ict-facekit"
 ICT_LICENCE = "MIT"
@@ -64,7 +63,7 @@ _BASEL_NAMES = {
 }  # fmt: skip
 
 
-def import_model(path: Path, *, name: str | None = None, report: Report | None = None) -> ModelParts:
+def import_model(path: Path, *, name: str | None = None, report: Progress | None = None) -> ModelParts:
     """Read a foreign model and make it one of ours (or a model file of ours, renamed). Of a folder that holds one model
     file, that file. Raises CannotImport."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
@@ -106,7 +105,7 @@ def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
     return visible(Expressions(names, shapes))
 
 
-def read_ict_repository(folder: Path, *, report: Report | None = None) -> Foreign:
+def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Foreign:
     """ICT-FaceKit as its repository lays it out: generic_neutral_mesh.obj and identity000.obj ... (centimetres)."""
     inside = next((f for f in (folder, folder / "FaceXModel") if (f / "generic_neutral_mesh.obj").is_file()), None)
     if inside is None:
@@ -130,7 +129,7 @@ def read_ict_repository(folder: Path, *, report: Report | None = None) -> Foreig
 
 
 def _repository_expressions(
-    folder: Path, neutral: Float[np.ndarray, "V 3"], report: Report | None
+    folder: Path, neutral: Float[np.ndarray, "V 3"], report: Progress | None
 ) -> Expressions | None:
     """The meshes named for what a face does: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
@@ -239,7 +238,7 @@ def _check_plain(path: Path, mean: np.ndarray, modes: np.ndarray, faces: np.ndar
         raise CannotImport(path, "a face index lies outside the vertices")
 
 
-def adopt(foreign: Foreign, *, report: Report | None = None) -> ModelParts:
+def adopt(foreign: Foreign, *, report: Progress | None = None) -> ModelParts:
     """Orthogonal modes, all 26 landmarks, head frame, face region, closed openings, levels. Raises CannotImport."""
     say = report or (lambda stage, fraction: None)
     extent = float(np.ptp(foreign.mean, axis=0).max())

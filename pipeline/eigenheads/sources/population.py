@@ -23,7 +23,8 @@ from pipeline.eigenheads.model_file import ModelParts, save_model
 from pipeline.eigenheads.model_names import DEFAULT, PACKS
 from pipeline.eigenheads.sources import makehuman
 from pipeline.eigenheads.sources.makehuman import Base, HeadCut, Source
-from pipeline.eigenheads.training.training import Report, Training, train
+from pipeline.eigenheads.training.training import Training, train
+from rig.progress import Progress
 
 RACES = ("african", "asian", "caucasian")
 LICENCE = "CC0-1.0"
@@ -157,7 +158,7 @@ def _clipped(rng: np.random.Generator, limit: float) -> float:
 
 
 def sample_shapes(
-    base: Base, targets: Targets, sampling: Sampling, *, report: Report | None = None
+    base: Base, targets: Targets, sampling: Sampling, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V 3"]:
     """The base meshes (MakeHuman units) of all subjects, males first. Subject k depends on the seed and k alone."""
     shapes = []
@@ -192,7 +193,7 @@ def landmark_vertices(base: Base, cut: HeadCut) -> dict[str, int]:
     return {name: out[name] for name in NAMES}
 
 
-def build(source: Path, sampling: Sampling | None = None, *, report: Report | None = None) -> ModelParts:
+def build(source: Path, sampling: Sampling | None = None, *, report: Progress | None = None) -> ModelParts:
     """The default model's parts from MakeHuman's data. Raises NoMakeHuman."""
     sampling = sampling or Sampling()
     files = Source(source)

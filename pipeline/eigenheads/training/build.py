@@ -1,6 +1,6 @@
 """A head model from a folder of raw scans: check, correspond (section 3.2), align, principal components (3.1)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,11 +18,10 @@ from pipeline.eigenheads.model_file import ModelParts, read_parts, save_model
 from pipeline.eigenheads.model_names import model_path
 from pipeline.eigenheads.training.training import Training, train
 from rig.errors import InputError
+from rig.progress import Progress
 
 FEWEST = 3  # two modes; with fewer heads nothing can be left out
 _SHARPENINGS = 4
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +42,7 @@ def build_model(
     licence: str = "not stated",
     on_bad: Literal["stop", "skip"] = "stop",
     matching: Matching | None = None,
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> Built:
     """Build a model from the scans of a folder and save it as ``out``.
 
@@ -76,7 +75,7 @@ def build_model(
 
 
 def read_checked(
-    folder: Path, template: HeadModel, *, report: Report | None = None
+    folder: Path, template: HeadModel, *, report: Progress | None = None
 ) -> tuple[list[Checked], dict[str, str]]:
     """The sound scans of a folder, and what is wrong with the others by name. Raises InputError for an empty folder."""
     paths = find_scans(folder)
@@ -95,7 +94,7 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
 
 
 def corresponded_cages(
-    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Report | None = None
+    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V0 3"]:
     """Cages (mm) whose subdivided surface runs through the corresponded points.
 

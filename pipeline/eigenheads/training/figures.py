@@ -3,7 +3,7 @@
 Shaded and drawn in software, so that a machine without a graphics card or plotting library shows the same.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -27,8 +27,8 @@ from pipeline.imaging.cpu_raster import picture
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.mesh import vertex_normals
+from rig.progress import Progress
 
-Report = Callable[[str, float], None]
 Image = UInt8[np.ndarray, "H W 3"]
 
 PANEL = (260, 320)  # width, height of one head
@@ -41,7 +41,7 @@ _DISTANCE_MM = 1600.0
 _BEHIND_RAD = 2.4
 
 
-def show_model(model: HeadModel, folder: Path, *, modes: int = 5, report: Report | None = None) -> list[Path]:
+def show_model(model: HeadModel, folder: Path, *, modes: int = 5, report: Progress | None = None) -> list[Path]:
     """Write modes.png, correspondence.png and curves.png (the last where training heads are known) into a folder."""
     say = report or (lambda stage, fraction: None)
     say("drawing modes", 0.0)
@@ -124,7 +124,7 @@ def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
     return np.vstack([np.hstack(front), np.hstack([shaded(v, f, marked, _BEHIND_RAD) for _, v, f, marked in steps])])
 
 
-def curves_figure(model: HeadModel, *, report: Report | None = None) -> Image:
+def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
     """Compactness, generalisation (leave one out) and specificity over the number of modes."""
     counts = [
         c for c in (1, 2, 5, 10, 20, 40, USED_MODES, 100, 137) if c <= min(len(model.modes), len(model.scores) - 1)

@@ -4,13 +4,14 @@ R. Davies, *Learning Shape: Optimal Models for Analysing Natural Variability* (2
 gamed: a model of one head is compact and specific, a model of everything generalises.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.pca import Components, principal_components
+from rig.progress import Progress
 
 
 def compactness(sigma: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
@@ -23,7 +24,7 @@ def generalisation(
     region: Bool[np.ndarray, " V"],
     counts: Iterable[int],
     *,
-    report: Callable[[str, float], None] | None = None,
+    report: Progress | None = None,
 ) -> dict[int, float]:
     """Leave one out: mean vertex distance (mm, over ``region``) of each head to its best likeness in the others' PCA.
 

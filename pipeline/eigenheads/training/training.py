@@ -1,6 +1,6 @@
 """From corresponded heads to a model file's content: alignment, principal components, levels, face region."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +11,11 @@ from pipeline.eigenheads.model_file import ModelParts
 from pipeline.eigenheads.pca import Components, align, principal_components
 from pipeline.eigenheads.subdivision import check_manifold, refine, row_count
 from pipeline.eigenheads.training import model_metrics
+from rig.progress import Progress
 
 PAPER_FACES = 96_000  # section 3.1; its levels of 95 % and 99 % have 4,800 and 960 triangles
 FACE_WEIGHT = 4.0  # decimation keeps the face region this much more exactly than skull and neck
 USED_MODES = 60  # section 4.4
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -34,7 +33,7 @@ class Training:
     subdivisions: int
 
 
-def train(training: Training, *, report: Report | None = None) -> ModelParts:
+def train(training: Training, *, report: Progress | None = None) -> ModelParts:
     """Rigid Procrustes (no scale), PCA, levels, generalisation and specificity. Raises NotAManifold."""
     say = report or (lambda stage, fraction: None)
     check_manifold(training.faces)
@@ -60,7 +59,7 @@ def finish(
     region: Bool[np.ndarray, " V0"],
     figures: Mapping[str, float],
     *,
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> ModelParts:
     """The parts of a model from its components: decimated levels are chosen on the mean head."""
     say = report or (lambda stage, fraction: None)

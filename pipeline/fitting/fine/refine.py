@@ -39,8 +39,8 @@ from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.fitting.fit import Fit
 from pipeline.settings import FineSettings
 from rig.mesh import vertex_normals
+from rig.progress import Progress
 
-Report = Callable[[str, float], None]
 SEED = 16
 
 
@@ -81,7 +81,7 @@ def refine_to_surface(
     deviation_mm: Float[np.ndarray, " v"],
     eyes: Mapping[str, EyeEvidence] | None = None,
     patches: PatchSearch | None = None,
-    report: Report = lambda stage, fraction: None,
+    report: Progress = lambda stage, fraction: None,
 ) -> Displaced:
     """A fit's head drawn to the dense surface.
 
@@ -136,7 +136,7 @@ def draw_to_surface(
     *,
     loose: Bool[np.ndarray, " v"],
     look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
-    report: Report = lambda stage, fraction: None,
+    report: Progress = lambda stage, fraction: None,
 ) -> Displaced:
     """A surface displaced to points of another, as far as those speak.
 

@@ -29,11 +29,13 @@ from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
+from rig.parabola import second_difference, vertex_offset
 
 DEPTH_LEVEL = "p95"  # of the z-buffer: it differs from the full mesh by far less than what may hide a sample
 LEAST_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
 EDGE_PX = 4  # nothing is read nearer to the image's edge
 WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
+FLATTEST = 1e-6  # curvature of correlation by a step squared: below it a peak has no place of its own
 BOUND_HEIGHT = 0.9  # correlation from which on hair says where it is
 SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring a surface within the window
 
@@ -269,16 +271,16 @@ class Peaks:
 
 
 def find_peaks(score: Float32[np.ndarray, "c d"], steps: Float[np.ndarray, " d"]) -> Peaks:
-    """Through the parabola of the highest step and its neighbours."""
+    """Finds each patch's peak by the highest step and its neighbours."""
     best = score.argmax(axis=1)
     middle = np.clip(best, 1, len(steps) - 2)
     rows, step = np.arange(len(score)), steps[1] - steps[0]
     below, at, above = (score[rows, middle + j].astype(float) for j in (-1, 0, 1))
-    bend = np.maximum(2.0 * at - below - above, 1e-6)
-    offset = np.clip(0.5 * (above - below) / bend, -1.0, 1.0)
+    curvature = np.minimum(second_difference(below, at, above), -FLATTEST)
+    offset = np.clip(vertex_offset(below, above, curvature), -1.0, 1.0)
     return Peaks(
         place=steps[middle] + offset * step,
         height=np.minimum(at + 0.25 * (above - below) * offset, 1.0),
-        curvature=bend / step**2,
+        curvature=-curvature / step**2,
         inside=best == middle,
     )

@@ -5,7 +5,7 @@ pose stays what the alignment said, as in the paper. The coarse answer is the st
 levels begin with p_i = p_0 + mu_i e_i, mu_i = 3 sigma_i (three standard deviations, the unit of our coefficients).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,6 +18,7 @@ from pipeline.fitting.simplex.xor_objective import SilhouetteObjective
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
@@ -45,7 +46,7 @@ def fit_simplex(
     settings: FittingSettings,
     *,
     renderer: Renderer,
-    report: Callable[[str, float], None],
+    report: Progress,
     hierarchy: tuple[HierarchyLevel, ...] = HIERARCHY,
     speaking: Literal["face", "all"] = "face",
     weighted: bool = True,

@@ -16,18 +16,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.cameras_json import write_rig
+from rig.image import ImageRgb
 from rig.studio.devices.sources import ImageSource, SceneImages
 from rig.studio.devices.streams import Film, StreamServer
 from rig.studio.devices.trigger_box import LIGHTS, BoxLogic, Release, SimulatedTriggerBox
 from rig.studio.scene.simulate import Scene
 from rig.studio.sensor.faults import fault_parts
-
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 
 STUDIO = "simulated studio"  # the name in rig.toml
 KINDS = {

@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from rig.formats.mesh_file import read_mesh
+from rig.image import ImageRgb
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene, view_light
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import drift, expose
-
-ImageRgb = UInt8[np.ndarray, "h w 3"]
 
 
 @runtime_checkable

@@ -1,0 +1,7 @@
+"""How long work tells how far it is."""
+
+from collections.abc import Callable
+
+Progress = Callable[[str, float], None]
+"""Takes a stage's name and how much of it is done, 0 to 1; long stages call it often. It may raise
+``rig.errors.Cancelled``, which ends the work."""
