@@ -12,9 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from pipeline.geometry.surface_nets import volume_net
 from pipeline.imaging.projection import packed_camera
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.visual_hull_kernels import COARSE, carve_view, mark_occupied, surface_net
+from pipeline.multiview.visual_hull_kernels import COARSE, carve_view, mark_occupied
 from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
@@ -77,7 +78,7 @@ def visual_hull(
     views = _believed(silhouettes, rig)
     blocks = int(np.ceil(min(edge / spacing_mm, cells) / COARSE))
     field, step = _field(silhouettes, views, centre, edge, blocks)
-    vertices, faces = surface_net(field)
+    vertices, faces = volume_net(field)
     if not len(faces):
         raise NoHull
     corner = centre - edge / 2

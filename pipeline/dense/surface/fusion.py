@@ -2,8 +2,8 @@
 
 Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
 for each vertex. A signed distance is found on a grid (``signed_distance``), its zero level made a mesh
-(``net_kernels``), the vertices are drawn to the depth maps themselves (``refinement``) and taken back where the
-mesh would cross itself (``crossings``).
+(``pipeline.geometry.surface_nets``), the vertices are drawn to the depth maps themselves (``refinement``) and taken
+back where the mesh would cross itself (``crossings``).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +18,7 @@ from pipeline.dense.part_codes import Part
 from pipeline.dense.part_votes import PartVotes, part_codes, part_shares
 from pipeline.dense.surface.contradiction import silence_contradicted
 from pipeline.dense.surface.crossings import without_crossings
-from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
+from pipeline.dense.surface.net_kernels import component_of, compose_well
 from pipeline.dense.surface.quality import deviation_mm, without_islands
 from pipeline.dense.surface.refinement import refine_vertices
 from pipeline.dense.surface.signed_distance import Level, NoSurface, solve
@@ -26,6 +26,7 @@ from pipeline.dense.surface.skin import drawn_to_skin
 from pipeline.dense.surface.view_stack import stack_views
 from pipeline.dense.window_bias import WindowBias, without_bias
 from pipeline.diagnostics import ReportWarning
+from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import BustSettings
 from rig.mesh import Mesh, face_normals
@@ -124,8 +125,8 @@ def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.nd
     the cubes about the inner nodes."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
-    vertices, of_cell = net_vertices(field, grid.index, grid.neighbours)
-    faces, cells = net_faces(field, grid.neighbours, vertices, of_cell), np.flatnonzero(of_cell >= 0)
+    net = surface_net(field, grid.index, grid.neighbours)
+    vertices, faces, cells = net.vertices, net.faces, np.flatnonzero(net.of_cell >= 0)
     head = None if head_world is None else (head_world.vertices - grid.corner) / grid.step_mm
     kept = _subject(vertices, faces, head)
     used, corners = np.unique(faces[kept], return_inverse=True)

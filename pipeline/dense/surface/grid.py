@@ -7,9 +7,10 @@ found by walking two lists at once: no hash table and no index volume, whatever 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int32
 
 from pipeline.dense.surface import grid_kernels as kernels
+from pipeline.geometry.surface_nets import link_nodes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,11 +60,5 @@ def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "
 def _linked(
     corner: Float[np.ndarray, " 3"], step_mm: float, shape: tuple[int, int, int], index: Int32[np.ndarray, "n 3"]
 ) -> Grid:
-    neighbours = kernels.linked(index, keys(index, shape), shape[1], shape[2])
+    neighbours = link_nodes(index, shape)
     return Grid(corner, step_mm, shape, index, neighbours, kernels.outermost(neighbours))
-
-
-def keys(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> Int64[np.ndarray, " n"]:
-    """Rank of each node in the full box."""
-    wide = index.astype(np.int64)
-    return (wide[:, 0] * shape[1] + wide[:, 1]) * shape[2] + wide[:, 2]

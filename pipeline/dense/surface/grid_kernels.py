@@ -3,6 +3,7 @@
 import numpy as np
 
 from pipeline.compiled import njit
+from pipeline.geometry.surface_nets_kernels import corners_of
 
 
 @njit(cache=True, nogil=True)
@@ -26,26 +27,6 @@ def halved(wanted: np.ndarray) -> np.ndarray:
                     index[made, 0], index[made, 1], index[made, 2] = i, j, 2 * k + half
                     made += 1
     return index
-
-
-@njit(cache=True, nogil=True)
-def linked(index: np.ndarray, keys: np.ndarray, ny: int, nz: int) -> np.ndarray:
-    """Rows of the six neighbours of every node, -1 where there is none; ``keys`` ascend."""
-    count = len(keys)
-    out = np.full((count, 6), -1, np.int32)
-    steps = (np.int64(ny) * nz, np.int64(nz), np.int64(1))
-    for axis in range(3):
-        step, other = steps[axis], 0
-        for n in range(count):
-            while other < count and keys[other] < keys[n] + step:
-                other += 1
-            if other == count:
-                break
-            # A key further may also be the beginning of the next row.
-            if keys[other] == keys[n] + step and index[other, axis] == index[n, axis] + 1:
-                out[n, 2 * axis + 1] = other
-                out[other, 2 * axis] = n
-    return out
 
 
 @njit(cache=True, nogil=True)
@@ -129,21 +110,3 @@ def crossed_at_rim(values: np.ndarray, neighbours: np.ndarray, outer: np.ndarray
             if other >= 0 and outer[n] and outer[other] and (values[n] < 0) != (values[other] < 0):
                 return True
     return False
-
-
-@njit(cache=True, nogil=True, inline="always")
-def corners_of(n: int, neighbours: np.ndarray, corners: np.ndarray) -> bool:
-    """Rows of the eight corners of the cell above node ``n``; False where one is missing. Corner c lies at
-    (c >> 2, (c >> 1) & 1, c & 1)."""
-    for c in range(8):
-        at = n
-        if c & 4:
-            at = neighbours[at, 1]
-        if at >= 0 and c & 2:
-            at = neighbours[at, 3]
-        if at >= 0 and c & 1:
-            at = neighbours[at, 5]
-        if at < 0:
-            return False
-        corners[c] = at
-    return True

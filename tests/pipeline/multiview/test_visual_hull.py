@@ -4,7 +4,6 @@ import pytest
 from pipeline.imaging.cpu_raster import depth_map
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.multiview.visual_hull import NoHull, hull_extent, visual_hull
-from pipeline.multiview.visual_hull_kernels import surface_net
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.view_consistency import judge_agreement
 from rig.formats.capture_folder import read_capture
@@ -24,18 +23,6 @@ def rig() -> Rig:
 @pytest.fixture(scope="module")
 def traced(rig: Rig) -> dict[str, Silhouette]:
     return {camera.name: silhouette_from_mask(trace(camera, 0.0)[1]) for camera in rig}
-
-
-def test_surface_net_of_a_sphere_is_the_sphere() -> None:
-    n, radius = 40, 13.3
-    grid = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1) - 19.7
-    vertices, faces = surface_net((np.linalg.norm(grid, axis=-1) - radius).astype(np.float32))
-    # A chord of one step on a radius of 13.3 is 1 / (8 r) = 0.01 off, a cell's mean of its crossings a few times that.
-    assert np.abs(np.linalg.norm(vertices - 19.7, axis=1) - radius).max() < 0.06
-    assert len(boundary_edges(faces)) == 0
-    a, b, c = (vertices[faces[:, i]].astype(float) - 19.7 for i in range(3))
-    volume = np.einsum("fi,fi->f", a, np.cross(b, c)).sum() / 6  # positive: wound outwards
-    assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.01)
 
 
 def test_the_hull_holds_the_body_and_casts_its_silhouettes(rig: Rig, traced: dict[str, Silhouette]) -> None:

@@ -8,7 +8,8 @@ import pytest
 from pipeline.dense.surface.crossings import crossing_faces, without_crossings
 from pipeline.dense.surface.grid import Grid, refined, whole_box
 from pipeline.dense.surface.grid_kernels import crossed_at_rim, interpolated
-from pipeline.dense.surface.net_kernels import component_of, compose_well, net_faces, net_vertices
+from pipeline.dense.surface.net_kernels import component_of, compose_well
+from pipeline.geometry.surface_nets import surface_net
 from rig.mesh import Mesh
 from tests.support.closed_meshes import one_fan_a_vertex
 
@@ -19,8 +20,8 @@ def noise_net(seed: int, count: int = 10) -> tuple[np.ndarray, np.ndarray, Grid,
     field = np.random.default_rng(seed).uniform(-1, 1, len(grid)).astype(np.float32)
     field[grid.outer] = 1.0
     compose_well(field, grid.neighbours, grid.outer, 0.01)
-    vertices, of_cell = net_vertices(field, grid.index, grid.neighbours)
-    return vertices, net_faces(field, grid.neighbours, vertices, of_cell), grid, field, of_cell
+    net = surface_net(field, grid.index, grid.neighbours)
+    return net.vertices, net.faces, grid, field, net.of_cell
 
 
 @pytest.mark.parametrize("seed", range(4))

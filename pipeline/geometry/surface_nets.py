@@ -1,0 +1,90 @@
+"""Surface nets: a mesh of the zero level between the nodes of a grid.
+
+Gibson, *Constrained elastic surface nets*, 1998, the naive kind: a vertex in every cell with both signs, at the mean of
+the places where the cell's edges cross the level; a quadrilateral over every edge with both. Enters: a field that is
+negative inside, at the nodes of a sparse grid or of a whole volume, positive on the outermost ones. Leaves: vertices in
+steps of the grid, triangles wound outwards. The mesh is closed; it is a manifold where the signs are well composed
+(``pipeline.dense.surface.net_kernels``).
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32, Int64
+
+from pipeline.geometry.surface_nets_kernels import linked, net_faces, net_vertices, nodes_about_surface
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceNet:
+    """A mesh in steps of its grid; ``of_cell`` is the vertex in the cell above each node, -1 where there is none."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int32[np.ndarray, "f 3"]
+    of_cell: Int32[np.ndarray, " n"]
+
+
+def node_keys(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> Int64[np.ndarray, " n"]:
+    """Returns the rank of each node in the full box."""
+    wide = index.astype(np.int64)
+    return (wide[:, 0] * shape[1] + wide[:, 1]) * shape[2] + wide[:, 2]
+
+
+def link_nodes(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> Int32[np.ndarray, "n 6"]:
+    """Returns the rows of each node's neighbours towards -x +x -y +y -z +z, -1 where there is none.
+
+    Args:
+        index: of the nodes, in the order of ``node_keys``.
+        shape: of the full box.
+    """
+    return linked(index, node_keys(index, shape), shape[1], shape[2])
+
+
+def surface_net(
+    field: Float32[np.ndarray, " n"], index: Int32[np.ndarray, "n 3"], neighbours: Int32[np.ndarray, "n 6"]
+) -> SurfaceNet:
+    """Returns the net of a sparse grid; each quadrilateral is split along its shorter diagonal.
+
+    Args:
+        field: at the nodes; negative inside.
+        index: of the nodes in the full box, in the order of ``node_keys``.
+        neighbours: of ``link_nodes``; every cell with both signs must be whole.
+    """
+    vertices, of_cell = net_vertices(field, index, neighbours)
+    return SurfaceNet(vertices, net_faces(field, neighbours, vertices, of_cell, True), of_cell)
+
+
+def volume_net(
+    field: Float32[np.ndarray, "nx ny nz"],
+) -> tuple[Float32[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
+    """Returns vertices and triangles of the net of a whole volume; all quadrilaterals are split alike."""
+    nx, ny, nz = field.shape
+    index = nodes_about_surface(field)
+    neighbours = link_nodes(index, (nx, ny, nz))
+    values = field[tuple(index.T)]
+    vertices, of_cell = net_vertices(values, index, neighbours)
+    return vertices.astype(np.float32), net_faces(values, neighbours, vertices, of_cell, False)
+
+
+def volume_net_naive(
+    field: Float32[np.ndarray, "nx ny nz"],
+) -> tuple[Float[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
+    """Returns what ``volume_net`` does, cell by cell and edge by edge in plain Python; the triangles' order differs."""
+    shape, unit = np.array(field.shape), np.eye(3, dtype=int)
+    crossings: dict[tuple[int, ...], list[np.ndarray]] = {}
+    quads = []
+    for axis, node in itertools.product(range(3), np.ndindex(*field.shape)):
+        low, high = np.array(node), np.array(node) + unit[axis]
+        if (high >= shape).any() or (field[tuple(low)] < 0) == (field[tuple(high)] < 0):
+            continue
+        start, end = float(field[tuple(low)]), float(field[tuple(high)])
+        first, second = unit[(axis + 1) % 3], unit[(axis + 2) % 3]
+        cells = [tuple(int(i) for i in low - back) for back in (first + second, second, 0 * first, first)]
+        for cell in cells:
+            crossings.setdefault(cell, []).append(low + unit[axis] * (start / (start - end)))
+        quads.append(cells if start < 0 else [cells[0], cells[3], cells[2], cells[1]])
+    rows = {cell: row for row, cell in enumerate(sorted(crossings))}
+    vertices = np.array([np.mean(crossings[cell], axis=0) for cell in rows]).reshape(-1, 3)
+    faces = [[rows[quad[i]] for i in corners] for quad in quads for corners in ((0, 1, 2), (0, 2, 3))]
+    return vertices, np.array(faces, np.int32).reshape(-1, 3)
