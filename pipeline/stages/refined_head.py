@@ -11,6 +11,7 @@ from pipeline.fitting.fine.eyelids import look_at_eyes
 from pipeline.fitting.fine.patch_points import patch_search
 from pipeline.fitting.fine.refine import Displaced, refine_to_surface
 from pipeline.fitting.posterior import vertex_deviation_mm
+from pipeline.fitting.untangling import untangled_head
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth, is_refined
 from pipeline.stages.head_fit import HeadFit
@@ -22,7 +23,7 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedHead:
-    """The head as delivered: the fit's, or that deformed to the dense surface.
+    """The head as delivered: the fit's, or that deformed to the dense surface, without spoilt triangles.
 
     ``deviation_mm``: posterior standard deviation of each vertex; ``displaced``: None where the fit's own head is it.
     """
@@ -40,9 +41,8 @@ def refine_head(
     """Deforms the fitted head to the dense surface where that shows enough of the face."""
     settings, fit, model, mesh = context.settings, head.fit, head.model, head.mesh_world
     deviation_mm = vertex_deviation_mm(model, fit)
-    as_fitted = RefinedHead(mesh, deviation_mm, head.detail)
     if not is_refined(head, settings):
-        return Staged(as_fitted)
+        return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), head.detail))
     images = views.capture.images
     distances = {name: views.silhouettes[name].distance for name, used in fit.used.items() if used}
     displaced = refine_to_surface(
@@ -59,7 +59,7 @@ def refine_head(
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), settings.fine.least_share
     if share < needed:
         reason = f"the dense surface shows only {share:.0%} of the face, {needed:.0%} are needed"
-        return Staged(RefinedHead(mesh, deviation_mm, Detail("photo", reason)))
+        return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), Detail("photo", reason)))
     detail = Detail("fine", f"the dense surface shows {share:.0%} of the face")
     refined = Mesh(displaced.vertices, mesh.faces)
     return Staged(RefinedHead(refined, displaced.deviation_mm, detail, displaced))

@@ -52,7 +52,9 @@ def crossing_triangles(
         for column in range(COLUMNS):
             for at in range(ranges[column, 0], ranges[column, 1]):
                 g = order[at]
-                if (active[g] and g <= f) or not _boxes_meet(boxes, f, g):
+                if at <= position and active[g]:  # the pair is looked at from the other side
+                    continue
+                if not _boxes_meet(boxes, position, at):
                     continue
                 if _cross(vertices, faces[f], faces[g]):
                     crossing[f] = crossing[g] = True
@@ -74,10 +76,21 @@ def _cross(vertices: np.ndarray, f: np.ndarray, g: np.ndarray) -> bool:
             shared += f[a] == g[b]
     if shared >= 2:  # neighbours over an edge
         return False
+    if _beside(vertices, f, g) or _beside(vertices, g, f):  # most pairs whose boxes meet
+        return False
     for k in range(3):
         if _pierces(vertices, f[k], f[(k + 1) % 3], g) or _pierces(vertices, g[k], g[(k + 1) % 3], f):
             return True
     return False
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _beside(vertices: np.ndarray, f: np.ndarray, g: np.ndarray) -> bool:
+    """Whether all of ``g`` lies on one side of the plane of ``f``, touching it at most."""
+    one = _side(vertices, f[0], f[1], f[2], g[0])
+    two = _side(vertices, f[0], f[1], f[2], g[1])
+    three = _side(vertices, f[0], f[1], f[2], g[2])
+    return (one >= 0 and two >= 0 and three >= 0) or (one <= 0 and two <= 0 and three <= 0)
 
 
 @njit(cache=True, nogil=True)

@@ -5,10 +5,12 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.dense.cells import sorted_into_cells
 from pipeline.dense.surface.crossing_kernels import crossing_triangles, triangle_boxes
+from pipeline.dense.surface.grid_kernels import grown
 from pipeline.parallel_for import in_threads
 from rig.mesh import Mesh
 
 ROUNDS_MOST = 40
+SIZES = 4  # classes of triangles, each half as wide as the last
 HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of it, and take their neighbours along
 
 
@@ -16,14 +18,51 @@ def crossing_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
     """Triangles that cross another one, among pairs of which one is ``active`` (all of them, if None)."""
-    boxes = triangle_boxes(vertices, faces)
+    faces = faces.astype(np.int32)  # a copy: a model's own are read-only, which is another type
+    if active is None:
+        return _crossing_by_size(vertices, faces)
+    boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
+    near = np.flatnonzero(_near(boxes, active))
+    crossing[near] = _crossing(vertices, faces[near], boxes[near], active[near])
+    return crossing
+
+
+def _crossing_by_size(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """All triangles that cross another one: cells as wide as the neck's triangles hold too many of the face's, so that
+    each size is compared with itself and with what is smaller, in cells of its own."""
+    boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
+    wide = (boxes[:, 3:] - boxes[:, :3]).max(axis=1)
+    widest = float(wide.max(initial=0.0))
+    for size in range(SIZES):
+        rows = np.flatnonzero(wide <= widest / 2.0**size)
+        own = wide[rows] > (widest / 2.0 ** (size + 1) if size < SIZES - 1 else -1.0)
+        if own.any():
+            crossing[rows] |= _crossing(vertices, faces[rows], boxes[rows], own)
+    return crossing
+
+
+def _crossing(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    boxes: Float[np.ndarray, "f 6"],
+    active: Bool[np.ndarray, " f"],
+) -> Bool[np.ndarray, " f"]:
     low, high = boxes[:, :3], boxes[:, 3:]
-    cells = sorted_into_cells(0.5 * (low + high), max(float((high - low).max()), 1e-9))
+    cells = sorted_into_cells(0.5 * (low + high), max(float((high - low).max(initial=0.0)), 1e-9))
     crossing = np.zeros(len(faces), bool)
-    chosen = np.ones(len(faces), bool) if active is None else active
-    given = (vertices, faces, boxes, *cells, chosen, crossing)
+    given = (vertices, faces, boxes[cells.order], *cells, active, crossing)
     in_threads(len(faces), lambda first, last: crossing_triangles(*given, first, last))
     return crossing
+
+
+def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Triangles in or beside the cells that active ones lie in."""
+    middle = 0.5 * (boxes[:, :3] + boxes[:, 3:])
+    wide = max(float((boxes[:, 3:] - boxes[:, :3]).max(initial=0.0)), 1e-9)
+    cell = ((middle - middle.min(axis=0, initial=np.inf)) / wide).astype(np.int64) + 1
+    taken = np.zeros(cell.max(axis=0, initial=0) + 2, bool)
+    taken[tuple(cell[active].T)] = True
+    return grown(taken)[tuple(cell.T)]
 
 
 def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh, int]:

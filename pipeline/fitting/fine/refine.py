@@ -11,7 +11,7 @@ Hair bounds and does not pull: a point of hair or clothes says that the skin doe
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,6 +37,7 @@ from pipeline.fitting.fine.solve import (
 )
 from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.fitting.fit import Fit
+from pipeline.fitting.untangling import untangled_head
 from pipeline.settings import FineSettings
 from rig.mesh import vertex_normals
 from rig.progress import Progress
@@ -98,7 +99,7 @@ def refine_to_surface(
         report: told the share done.
 
     Returns:
-        The displaced head and what was decided about the eyes.
+        The displaced head, without spoilt triangles (``untangling``), and what was decided about the eyes.
     """
     faces = model.levels["full"].faces
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
@@ -123,7 +124,9 @@ def refine_to_surface(
         look=patches and patches.places,
         report=report,
     )
-    return replace(head, closed_eyes=closed | otherwise, lids=lids)
+    clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
+    observed = head.observed & (clean_deviation_mm < 2.0 * head.deviation_mm)  # what was moved farther is not as seen
+    return Displaced(clean.vertices, clean_deviation_mm, observed, closed | otherwise, lids)
 
 
 def draw_to_surface(

@@ -12,6 +12,7 @@ from pipeline.fitting.fine.refine import Displaced, draw_to_surface, refine_to_s
 from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
+from pipeline.fitting.untangling import head_topology, spoilt_faces
 from pipeline.settings import FineSettings
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
@@ -141,6 +142,7 @@ def test_a_planted_head_is_found_within_its_intervals(model: HeadModel) -> None:
     assert np.median(after[face]) < 0.1 < 0.3 < np.median(before[face])
     assert np.median(after[head_regions(model)["ears"] & found.observed]) < 0.5
     assert not folded(start, found.vertices, faces).mean() > 2e-3
+    assert not spoilt_faces(found.vertices, head_topology(model)).any()
     assert found.closed_eyes == frozenset()
 
 
