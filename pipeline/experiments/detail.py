@@ -41,7 +41,7 @@ from pipeline.reconstruct import fit_shape
 from pipeline.settings import Settings, document_from_settings
 from pipeline.silhouettes.segment import segment
 from pipeline.stages.alignment import align_head
-from pipeline.stages.context import ReconstructionContext, discard_progress
+from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.views import find_views
 from pipeline.texture.vertex_colours import texture
@@ -50,6 +50,7 @@ from rig.capture import Capture
 from rig.formats.capture_folder import read_capture
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh
+from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -59,7 +60,6 @@ from rig.studio.scene.visible import VisiblePoints
 from rig.studio.sensor.faults import Fault
 from rig.studio.sensor.preset import PRESET, Preset
 
-Report = Callable[[str, float], None]
 Level = Literal["span", "kernel", "photo"]
 LEVELS: tuple[Level, ...] = ("span", "kernel", "photo")
 IN_SPAN_MODES, IN_SPAN_SPREAD = 60, 0.8  # section 5.2
@@ -100,7 +100,7 @@ def run(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     others: HeadModel | None = None,
     draws: int = 20,
     in_span: int = 10,
@@ -205,13 +205,9 @@ def every_level(
     return fitted
 
 
-def _silent(stage: str, fraction: float) -> None:
-    pass
-
-
 def hull_row(known: Callable[[], Known]) -> Row:
     subject = known()
-    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=_silent)
+    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
     return {"hull": surface_error(subject, visual_hull(silhouettes, subject.rig))}
 
 
@@ -260,7 +256,7 @@ def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) 
     From the true outline to ours, since ours goes on where the true one hides behind shoulders, which no model has.
     """
     known, settings = read_known(path), Settings()
-    silhouettes = segment(known.capture, known.rig, settings.segmentation, report=_silent)
+    silhouettes = segment(known.capture, known.rig, settings.segmentation, report=discard_progress)
     rest = known.rig.subset(other for other in known.rig.names if other != camera)
     views = pack_views(known.rig.subset([camera]), {camera: silhouettes[camera].distance})
     true = find_rim(make_topology(known.mesh.faces, known.face), known.mesh.vertices, views)

@@ -44,11 +44,11 @@ from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
 from rig.geometry import look_at
 from rig.mesh import Mesh, boundary_edges
+from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS
 from rig.studio.sensor.preset import PRESET
 
-Report = Callable[[str, float], None]
 Level = Literal["span", "kernel", "photo", "fine"]
 HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm down the forehead
 SEEN_MM, HIDDEN_MM = 2.0, 4.0  # from the visible points, 1.5 mm apart; what lies between is neither
@@ -71,7 +71,7 @@ def hidden(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     others: HeadModel | None = None,
     subjects: int = 4,
     folder: Path | None = None,
@@ -112,9 +112,9 @@ def hidden(
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
     """One subject: ``{level: {<seen|hidden>_<region>_<quantity>: value}}``."""
     subject = known()
-    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=_silent)
+    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
 
-    def segmented(capture: Capture, *_: object, report: Report) -> dict[str, Silhouette]:
+    def segmented(capture: Capture, *_: object, report: Progress) -> dict[str, Silhouette]:
         """The same for every level; pictures that were put right are segmented anew."""
         again = capture is not subject.capture
         return segment(capture, subject.rig, Settings().segmentation, report=report) if again else silhouettes
@@ -131,10 +131,6 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
             **landmark_figures(subject.landmarks, done.evidence.landmarks, done.evidence.measurements),
         }
     return found
-
-
-def _silent(stage: str, fraction: float) -> None:
-    pass
 
 
 def landmark_figures(

@@ -7,7 +7,7 @@ light, so that both figures hold what the fits and the cameras' noise differ by;
 twice. ``chart_...`` is the same where a colour chart was held before the cameras in one clean plate each.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -41,6 +41,7 @@ from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.chart import chart_plate
@@ -50,7 +51,6 @@ from rig.studio.scene.simulate import Scene, build_scene, shoot
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 
-Report = Callable[[str, float], None]
 Image = UInt8[np.ndarray, "s s 3"]
 SUBJECTS = 1
 GRID = 512  # texels that are compared: 0.7 mm a texel, beyond what two fits differ by
@@ -74,7 +74,7 @@ def light(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:

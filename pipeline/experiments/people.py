@@ -8,7 +8,7 @@ wrong*: that number must be 0.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,10 +31,10 @@ from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
-Report = Callable[[str, float], None]
 EYES = "eyes"
 SPEAKING = ("contour-implausible", "pose-doubtful", "scale-implausible", "shape-implausible")
 """Warnings that say of a result, not of its input, that it may be wrong."""
@@ -48,7 +48,7 @@ def people(
     captures: Sequence[Path],
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     subjects: int | None = None,
     only: Sequence[str] = (),
     detail: str | None = None,

@@ -32,10 +32,10 @@ from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh, boundary_edges
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
-Report = Callable[[str, float], None]
 HIT = "cam03"  # the camera that suffers where one does
 STRANDS, STRAND_MM, STRAND_TURN = 40, 70.0, 0.9  # a view; their length, and how far (rad) they may lean
 OFF_PX = 0.5
@@ -44,7 +44,7 @@ SEED = 400
 
 
 def planted(
-    model: HeadModel, *, renderer: Renderer, report: Report, subjects: int = 2, folder: Path | None = None
+    model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = 2, folder: Path | None = None
 ) -> Outcome:
     """``{"figures": {...}, "rows": [...]}``; a figure is ``<fault>_<quantity>``, the mean over the subjects that it did
     not end, ``refused`` the share that it did.
@@ -205,10 +205,6 @@ def _line(image: ImageRgb, path: Float[np.ndarray, "n 2"], thickness: int, colou
 def _with_image(known: Known, name: str, image: ImageRgb) -> Known:
     capture: Capture = replace(known.capture, images={**known.capture.images, name: image})
     return replace(known, capture=capture)
-
-
-def _silent(stage: str, fraction: float) -> None:
-    pass
 
 
 def _figures(rows: list[Row]) -> dict[str, float]:

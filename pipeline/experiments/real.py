@@ -6,7 +6,7 @@ masks are found from all photographs; the surface from the eleven alone.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
@@ -37,8 +38,6 @@ SIDE_DEG = 100.0  # from the front view's direction: the eleven, and the views t
 INSIDE_PX = 8  # of the outline: points and colours nearer to it than that may be another thing's
 GAIN_STEPS = 4  # of the robust fit of a view's exposure
 CLIPPED = 250
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +52,7 @@ class RealCapture:
 
 
 def real(
-    model: HeadModel, captures: list[RealCapture], *, renderer: Renderer, settings: Settings, report: Report
+    model: HeadModel, captures: list[RealCapture], *, renderer: Renderer, settings: Settings, report: Progress
 ) -> Outcome:
     """Rows of every capture, and their figures. Raises InputError where a folder has no more views than are used."""
     rows: list[Row] = []
@@ -68,7 +67,7 @@ def real(
     return {"figures": figures, "rows": rows}
 
 
-def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings: Settings, report: Report) -> Row:
+def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings: Settings, report: Progress) -> Row:
     """The bust of eleven views, against the others."""
     started = time.perf_counter()
     silhouettes = segment(given.capture, given.rig, settings.segmentation, report=report)

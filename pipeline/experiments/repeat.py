@@ -11,7 +11,7 @@ every shot repeats, which is the distance of the mean head from the true surface
 0.10 mm over the face, ``reposed_rms_mm`` and ``drift_rms_mm``.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from pipeline.verification.repeatability import scatter
 from rig.capture import Capture
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.lights import LAMPS, Lamp
@@ -50,8 +51,6 @@ LAMP_DIMMING = 0.1  # standard deviation of log brightness, of each lamp by itse
 CONDITIONS = ("noise", "reposed", "drift", "clicked")
 STILL = ("noise", "clicked")
 
-Report = Callable[[str, float], None]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
@@ -65,7 +64,7 @@ class Shot:
 
 
 def repeat(
-    model: HeadModel, *, renderer: Renderer, report: Report, subjects: int = SHOTS, folder: Path | None = None
+    model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = SHOTS, folder: Path | None = None
 ) -> Outcome:
     """Scatter, stated deviation and repeated error by condition. ``subjects`` is the number of shots, two or more."""
     records = Records(
@@ -92,11 +91,11 @@ def repeat(
     return {"figures": figures, "rows": rows, "markdown": markdown.table(header, table)}
 
 
-def _of_condition(report: Report, condition: str, number: int, shot: str, fraction: float) -> None:
+def _of_condition(report: Progress, condition: str, number: int, shot: str, fraction: float) -> None:
     report(f"{condition} {shot}", (number + fraction) / len(CONDITIONS))
 
 
-def _row(model: HeadModel, condition: str, count: int, renderer: Renderer, report: Report) -> Row:
+def _row(model: HeadModel, condition: str, count: int, renderer: Renderer, report: Progress) -> Row:
     shots = []
     for i, (scene, rng) in enumerate(scenes(model, condition, count, renderer)):
         report(f"shot {i + 1}", i / count)

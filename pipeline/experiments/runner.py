@@ -35,9 +35,8 @@ from pipeline.experiments.visible import visible
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.images import write_image
+from rig.progress import Progress
 from rig.render.renderer import Renderer
-
-Report = Callable[[str, float], None]
 
 
 class UnknownExperiment(EigenheadError):
@@ -79,7 +78,7 @@ class Task:
     subjects: int | None
     shared: Path
     folder: Path | None
-    report: Report
+    report: Progress
     options: Options
 
 
@@ -93,7 +92,7 @@ def run_experiment(
     subjects: int | None,
     shared: Path,
     folder: Path | None,
-    report: Report,
+    report: Progress,
     options: Options = NO_OPTIONS,
 ) -> Outcome:
     """Figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a table and

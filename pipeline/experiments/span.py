@@ -6,7 +6,7 @@ captures' subjects (folders with head.ply, face_mask.npy, meta.json) and random 
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +22,7 @@ from pipeline.experiments.outcome import Outcome
 from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.geometry import rigid_fit
-
-Report = Callable[[str, float], None]
+from rig.progress import Progress
 
 SIGMA_MM = 1.5  # residual that weighs as much as one standard deviation of a coefficient, per cm² of face
 POINTS = 4000  # points of the truth in a fit; all of them count in the figures
@@ -44,7 +43,7 @@ def run(
     truths: Sequence[Truth],
     *,
     counts: Sequence[int] = (60, 0),
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> Outcome:
     """``{"figures": {...}, "rows": [...]}``: floors of each model on each truth, for each count of modes (0: all).
 

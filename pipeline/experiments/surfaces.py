@@ -40,9 +40,9 @@ from pipeline.silhouettes.segment import segment
 from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
+from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer
 
-Report = Callable[[str, float], None]
 POISSON_DEPTH = 9  # of its octree: cells of 1 to 1.5 mm about a bust
 SURE_MM = 1.0  # points with a larger deviation stay out
 COLUMNS = (
@@ -62,13 +62,15 @@ class Shown:
 
     @cached_property
     def silhouettes(self) -> dict[str, Silhouette]:
-        return segment(self.known.capture, self.known.rig, Settings().segmentation, report=_silent)
+        return segment(self.known.capture, self.known.rig, Settings().segmentation, report=discard_progress)
 
     @cached_property
     def depth_maps(self) -> tuple[DepthMap, ...]:
         known = self.known
         head = every_level(known.capture, known.rig, self.model, ("photo",), self.renderer)["photo"].mesh()
-        return estimate_depth(known.capture.images, self.silhouettes, known.rig, head, Settings().dense, report=_silent)
+        return estimate_depth(
+            known.capture.images, self.silhouettes, known.rig, head, Settings().dense, report=discard_progress
+        )
 
 
 def surfaces(
@@ -76,7 +78,7 @@ def surfaces(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     openmvs: Path | None = None,
     folder: Path | None = None,
 ) -> Outcome:
@@ -162,10 +164,6 @@ def by_openmvs(shown: Shown, *, programs: Mapping[str, Path]) -> tuple[Mesh, flo
     with tempfile.TemporaryDirectory(prefix="openmvs-") as folder:
         body = visual_hull(shown.silhouettes, shown.known.rig)
         return surface_by_openmvs(shown.depth_maps, body, programs, Path(folder))
-
-
-def _silent(stage: str, fraction: float) -> None:
-    pass
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:

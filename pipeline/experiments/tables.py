@@ -5,7 +5,7 @@ distances of corresponding vertices of the whole mesh, in mm. Hausdorff: largest
 the nearest of the other, both ways, in mm. The paper does not state its units; its database is another.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,11 +28,11 @@ from pipeline.imaging.silhouette import xor_cost
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import arrangement, default_layout
 
-Report = Callable[[str, float], None]
 STATISTICS = {"min": np.min, "max": np.max, "mean": np.mean, "median": np.median, "std": np.std}
 METHODS = {  # as rows name them: as tables do
     "contour": "contour",
@@ -55,7 +55,7 @@ def table1(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     subjects: int = 100,
     simplex_subjects: int = 100,
     folder: Path | None = None,
@@ -94,7 +94,7 @@ def table2(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     subjects: int = 100,
     simplex_subjects: int = 100,
     folder: Path | None = None,
@@ -109,7 +109,7 @@ def table3(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     subjects: int = 100,
     simplex_subjects: int = 25,
     folder: Path | None = None,
@@ -179,7 +179,7 @@ def _rows(
     subjects: int,
     simplex_subjects: int,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     folder: Path | None,
     *,
     all_too: bool = False,

@@ -9,7 +9,7 @@ registration puts a place of the face where the model has it, the twelve landmar
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +25,19 @@ from pipeline.templates.carrying import attach
 from pipeline.templates.registration import Registration, register
 from rig.formats.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
+from rig.progress import Progress
 
 SEED = 22
 OWN_SHAPE = 1.0  # standard deviations of the head that the third mesh has
 
-Report = Callable[[str, float], None]
-
 
 def templates(
-    models: Mapping[str, HeadModel], facekit: HeadModel, *, report: Report, draws: int = 50, folder: Path | None = None
+    models: Mapping[str, HeadModel],
+    facekit: HeadModel,
+    *,
+    report: Progress,
+    draws: int = 50,
+    folder: Path | None = None,
 ) -> Outcome:
     """``<model>_median_mm``, ``<model>_p95_mm`` over all vertices of all draws, and so on; ``facekit_drawn`` is
     ICT-FaceKit with a mesh that has one draw's shape; ``_marked``: the registration was given the twelve landmarks."""

@@ -43,10 +43,10 @@ from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
-Report = Callable[[str, float], None]
 SUBJECTS = 10
 KEPT_BACK = 4  # nearest cameras to the front one that take turns
 BLURS_PX = (0.0, 0.4, 0.55, 0.7, 0.85, 1.0, 1.2)
@@ -61,7 +61,7 @@ def texture(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:

@@ -35,11 +35,11 @@ from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.mesh import Mesh
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS, VisiblePoints
 from rig.studio.sensor.preset import PRESET
 
-Report = Callable[[str, float], None]
 STYLES = (
     "short", "over-ears", "long", "curly", "fringe", "bun", "beard", "bald", "cap", "glasses", "long,beard",
     "curly,glasses",
@@ -62,7 +62,7 @@ def visible(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Report,
+    report: Progress,
     subjects: int = len(STYLES),
     folder: Path | None = None,
 ) -> Outcome:
@@ -177,10 +177,6 @@ def _row(name: str, in_head: Mapping[str, Mesh]) -> np.ndarray:
             for title, mesh in in_head.items()
         ]
     )
-
-
-def _silent(stage: str, fraction: float) -> None:
-    pass
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:

@@ -5,19 +5,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from pipeline.eigenheads.model import HeadModel
+from pipeline.faces.networks import FaceNetworks, load_networks
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
 from rig.capture import Capture
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
 Segment = Callable[..., dict[str, Silhouette]]
-
-
-def discard_progress(stage: str, fraction: float) -> None:
-    """Does nothing: the progress of work that nobody waits for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +29,7 @@ class ReconstructionContext:
         renderer: an OpenGL context of the calling thread.
         progress: called with a stage's name and the share of it that is done; may raise Cancelled.
         segment: finds the silhouettes of a capture; a caller that caches them passes its own.
+        networks: find faces; a caller of many jobs passes them on.
     """
 
     capture: Capture
@@ -41,6 +39,7 @@ class ReconstructionContext:
     renderer: Renderer
     progress: Progress = discard_progress
     segment: Segment = field(default=segment)
+    networks: FaceNetworks = field(default_factory=load_networks)
 
     def within_stage(self, name: str) -> "ReconstructionContext":
         """Returns the context whose progress is reported under ``name``, whatever a part of that stage calls itself."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Concatenate, Generic, ParamSpec, TypeVar
 
 from pipeline.diagnostics import ReportWarning
-from pipeline.stages.context import Progress, ReconstructionContext
+from pipeline.stages.context import ReconstructionContext
+from rig.progress import Progress
 
 T = TypeVar("T")
 P = ParamSpec("P")

@@ -14,13 +14,12 @@ from pipeline.settings import Settings
 from pipeline.silhouettes.segment import segment
 from pipeline.silhouettes.usable_views import without_moved_cameras
 from pipeline.stages.alignment import align_to_views
-from pipeline.stages.context import discard_progress
 from pipeline.stages.views import Views
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture
 from rig.geometry import RigidTransform, Similarity
-from rig.progress import Progress
+from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 from server.cli.reconstruct_local import folder_of
 
