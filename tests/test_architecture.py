@@ -88,7 +88,6 @@ LONG_FOR_A_REASON = {
     "reconstruct": "the composition itself, one line a stage",
     "solve_alpha": "one compiled loop over a band of pixels: calls between would pass a dozen arrays",
     "vote": "one compiled loop over cells and views",
-    "closest_triangles": "one compiled loop over points and their neighbourhoods",
 }
 
 MANY_FOR_A_REASON = {

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.fitting.fine.association_kernels import Head, closest_triangles
+from pipeline.geometry.closest_point_kernels import FannedMesh, closest_at_vertices
 from pipeline.parallel_for import in_threads, thread_count
 
 CANDIDATES = 4  # vertices whose triangles are tried
@@ -39,7 +39,7 @@ def faces_at_vertices(
 class Target:
     """A head that points are asked for a place on, with what finds it."""
 
-    head: Head
+    head: FannedMesh
     tree: KDTree
     corner_mm: float  # from no place of a triangle is its nearest corner farther
 
@@ -49,7 +49,7 @@ class Target:
     ) -> "Target":
         """Of a mesh (mm) with its unit vertex normals."""
         sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
-        head = Head(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
+        head = FannedMesh(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
         return cls(head, KDTree(vertices), float(np.max(sides, initial=0.0)))
 
     def closest(
@@ -78,7 +78,7 @@ class Target:
         triangle = np.empty(len(points), np.int64)
         blend, square = np.zeros((len(points), 3)), np.empty(len(points))
         given = points, normals, near, self.head, least_agreement, triangle, blend, square
-        in_threads(len(points), lambda a, b: closest_triangles(a, b, *given))
+        in_threads(len(points), lambda a, b: closest_at_vertices(a, b, *given))
         row = np.flatnonzero((triangle >= 0) & (square <= reach_mm**2))
         return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.eigenheads.correspondence.closest import closest_on_triangles
 from pipeline.fitting.fine.association import associate
+from pipeline.geometry.closest_point import closest_on_triangles_naive
 from rig.mesh import vertex_normals
 from tests.support.subdivided_spheres import subdivided_sphere
 
@@ -20,7 +20,7 @@ def test_the_place_is_the_closest_of_all_triangles() -> None:
     )
     assert (found.row == np.arange(60)).all()
     for i in range(60):
-        foot, _ = closest_on_triangles(np.repeat(points[i : i + 1], len(faces), 0), vertices[faces])
+        foot, _ = closest_on_triangles_naive(np.repeat(points[i : i + 1], len(faces), 0), vertices[faces])
         best = np.linalg.norm(foot - points[i], axis=1).min()
         assert abs(found.distance_mm[i] - best) < 1e-9
     blended = np.einsum("nk,nkc->nc", found.blend, vertices[faces[found.triangle]])

@@ -1,0 +1,115 @@
+"""Compiled loops of ``pipeline.geometry.closest_point``, and of searches that know a point's neighbourhood."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.compiled import njit
+
+
+class FannedMesh(NamedTuple):
+    """Vertices with their unit normals, triangles, and by vertex where its triangles begin, and those."""
+
+    vertices: np.ndarray
+    vertex_normals: np.ndarray
+    faces: np.ndarray
+    start: np.ndarray
+    member: np.ndarray
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def closest_on_triangle(x, y, z, one, other, third):
+    """Barycentric weights of the second and third corner at the triangle's closest point to (x, y, z), and the squared
+    distance. After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5."""
+    abx, aby, abz = other[0] - one[0], other[1] - one[1], other[2] - one[2]
+    acx, acy, acz = third[0] - one[0], third[1] - one[1], third[2] - one[2]
+    apx, apy, apz = x - one[0], y - one[1], z - one[2]
+    d1, d2 = abx * apx + aby * apy + abz * apz, acx * apx + acy * apy + acz * apz
+    bb = abx * abx + aby * aby + abz * abz
+    bc = abx * acx + aby * acy + abz * acz
+    cc = acx * acx + acy * acy + acz * acz
+    d3, d4 = d1 - bb, d2 - bc  # of the point seen from b
+    d5, d6 = d1 - bc, d2 - cc  # and from c
+    vb, vc, va = d5 * d2 - d1 * d6, d1 * d4 - d3 * d2, d3 * d6 - d5 * d4
+    if d1 <= 0.0 and d2 <= 0.0:
+        w1, w2 = 0.0, 0.0
+    elif d3 >= 0.0 and d4 <= d3:
+        w1, w2 = 1.0, 0.0
+    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        w1, w2 = d1 / (d1 - d3), 0.0
+    elif d6 >= 0.0 and d5 <= d6:
+        w1, w2 = 0.0, 1.0
+    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        w1, w2 = 0.0, d2 / (d2 - d6)
+    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        w2 = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        w1 = 1.0 - w2
+    else:
+        total = va + vb + vc
+        w1, w2 = vb / total, vc / total
+    ex = apx - w1 * abx - w2 * acx
+    ey = apy - w1 * aby - w2 * acy
+    ez = apz - w1 * abz - w2 * acz
+    return w1, w2, ex * ex + ey * ey + ez * ez
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def closest_at_vertices(first, last, points, normals, near, surface, min_agreement, triangle, blend, square):
+    """For points ``first`` to ``last``: of the triangles at the vertices ``near`` whose side agrees with the point's
+    normal, the closest one, its barycentric weights, and the squared distance; triangle -1 where none agrees."""
+    vertices, vertex_normals, faces, start, member = surface
+    for p in range(first, last):
+        triangle[p] = -1
+        best = 1e30
+        x, y, z = points[p]
+        for c in range(near.shape[1]):
+            v = near[p, c]
+            if v == len(vertices):  # no more within reach
+                break
+            agreement = (
+                normals[p, 0] * vertex_normals[v, 0]
+                + normals[p, 1] * vertex_normals[v, 1]
+                + normals[p, 2] * vertex_normals[v, 2]
+            )
+            if agreement < min_agreement:
+                continue
+            for m in range(start[v], start[v + 1]):
+                t = member[m]
+                w1, w2, e = closest_on_triangle(
+                    x, y, z, vertices[faces[t, 0]], vertices[faces[t, 1]], vertices[faces[t, 2]]
+                )
+                if e < best:
+                    best = e
+                    triangle[p] = t
+                    blend[p, 0], blend[p, 1], blend[p, 2] = 1.0 - w1 - w2, w1, w2
+        square[p] = best
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def closest_of_candidates(first, last, points, candidates, corners, facing, facing_mm, triangle, weights):
+    """For points ``first`` to ``last``: the closest of their candidate triangles, and its barycentric weights. Where
+    ``facing`` has a unit normal a point, a triangle that faces the other way counts as ``facing_mm`` farther, one at a
+    right angle as half of that."""
+    for p in range(first, last):
+        least = np.inf
+        x, y, z = points[p]
+        for c in range(candidates.shape[1]):
+            t = candidates[p, c]
+            w1, w2, square = closest_on_triangle(x, y, z, corners[t, 0], corners[t, 1], corners[t, 2])
+            cost = np.sqrt(square)
+            if len(facing):
+                cost += 0.5 * facing_mm * (1.0 - _cosine(corners[t], facing[p]))
+            if cost < least:
+                least = cost
+                triangle[p] = t
+                weights[p, 0], weights[p, 1], weights[p, 2] = 1.0 - w1 - w2, w1, w2
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _cosine(corners, direction):
+    """Of the triangle's normal with a unit vector; 0 where the triangle has no area."""
+    abx, aby, abz = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1], corners[1, 2] - corners[0, 2]
+    acx, acy, acz = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1], corners[2, 2] - corners[0, 2]
+    nx, ny, nz = aby * acz - abz * acy, abz * acx - abx * acz, abx * acy - aby * acx
+    along = nx * direction[0] + ny * direction[1] + nz * direction[2]
+    return along / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-18)
