@@ -19,10 +19,11 @@ from calibration.board.missing import explain
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras_json import name_fault
+from rig.formats.picture_names import PLAIN_SUFFIXES
 from rig.progress import Progress
 
 VERSION = 1  # of the detector: part of the cache's key
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES)
 
 
 EXPLAINED = 4  # pictures of a blind camera that are looked at twice

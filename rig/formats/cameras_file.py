@@ -12,6 +12,7 @@ scale is free and taken as millimetres; aniposelib's, nerfstudio's and OpenCV's 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from rig.capture import Remark
 from rig.errors import InputError
 from rig.formats.blender_script import write_blender
 from rig.formats.cameras_json import read_rig, write_rig
@@ -19,8 +20,10 @@ from rig.formats.colmap import read_colmap, write_colmap
 from rig.formats.metashape import read_metashape, write_metashape
 from rig.formats.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
 from rig.formats.opencv_yaml import read_yaml, write_yaml
+from rig.formats.reading import CamerasRead
 from rig.formats.realitycapture import COLUMNS, read_csv, read_xmp, write_csv, write_xmp
 from rig.formats.transforms_json import read_transforms, write_transforms
+from rig.formats.unread_keys import unread_keys
 from rig.rig import Rig
 
 WRITERS: dict[str, Callable[[Rig, Path], None]] = {
@@ -92,10 +95,15 @@ def rig_files(folder: Path) -> Iterator[Path]:
 
 def read_rig_file(path: Path) -> Rig:
     """The rig in a file of any known format. Raises InputError naming every fault found in it."""
+    return read_cameras(path).rig
+
+
+def read_cameras(path: Path) -> CamerasRead:
+    """The rig in a file of any known format, with what its reader noticed. Raises InputError naming every fault."""
     if path.name == "transforms.json":
         return read_transforms(path)
     if path.suffix == ".json":
-        return read_rig(path)
+        return CamerasRead(read_rig(path), tuple(Remark("unknown-key", told) for told in unread_keys(path)))
     if path.suffix in (".bin", ".txt"):
         return read_colmap(path.parent, path.suffix)
     if path.suffix == ".xmp":

@@ -16,11 +16,12 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.formats.cameras_json import CAMERAS_MOST
-from rig.formats.foreign import camera_names, judged_rig, lens_entry, parsed
+from rig.formats.foreign import camera_names, lens_entry, parsed
+from rig.formats.reading import CamerasRead, Reading, shown
 from rig.geometry import vector_from_rotation
 from rig.rig import Rig
 
-# name: (number in the binary file, parameter names in their order). FOV and thin prisms have no counterpart here.
+# name: (number in the binary file, parameter names in their order).
 COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
     "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
@@ -31,13 +32,25 @@ COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
     "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k1")),
     "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
+    "SIMPLE_FISHEYE": (14, ("f", "cx", "cy")),
+    "FISHEYE": (15, ("fx", "fy", "cx", "cy")),
+}
+# Models that have no counterpart here, by their number.
+REFUSED_MODELS = {
+    7: "FOV",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+    12: "SIMPLE_DIVISION",
+    13: "DIVISION",
+    16: "EUCM",
+    17: "EQUIRECTANGULAR",
 }
 
 
 COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 
-def read_colmap(folder: Path, suffix: str = ".bin") -> Rig:
+def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
     """The rig in a COLMAP model: every image is a camera of this project, named after the image file."""
     files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
@@ -45,15 +58,16 @@ def read_colmap(folder: Path, suffix: str = ".bin") -> Rig:
     cameras = parsed(files[0], _binary_cameras if binary else _text_cameras)
     images = parsed(files[1], _binary_images if binary else _text_images)
     names = camera_names([image.name for image in images])
-    faults: list[str] = []
+    reading = Reading(subject)
+    faults = reading.faults
     entries = []
     for name, image in zip(names, images, strict=True):
         camera = cameras.get(image.camera)
         if camera is None:
             faults.append(f"image {name!r} names camera {image.camera}, which cameras{suffix} lacks")
             continue
-        entries.append(_colmap_entry(name, image, camera))
-    return judged_rig(entries, subject, faults)
+        entries.append(_colmap_entry(name, image, camera, faults))
+    return reading.finish(entries)
 
 
 def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = ".png") -> None:
@@ -120,7 +134,7 @@ def _binary_cameras(data: bytes) -> dict[int, ColmapCamera]:
         number, model, width, height = records.take("iiQQ")
         name = COLMAP_NAMES.get(model)
         if name is None:
-            raise ValueError(_model_fault(f"number {model}", number))
+            raise ValueError(_model_fault(f"{REFUSED_MODELS.get(model, 'of')} number {model}", number))
         values = records.take(f"{len(COLMAP_MODELS[name][1])}d")
         cameras[number] = ColmapCamera(name, width, height, values)
     return cameras
@@ -143,7 +157,7 @@ def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
             continue
         number, name, width, height, *values = line.split()
         if name not in COLMAP_MODELS:
-            raise ValueError(_model_fault(repr(name)[:60], number))
+            raise ValueError(_model_fault(shown(name), number))
         wanted = len(COLMAP_MODELS[name][1])
         if len(values) != wanted:
             raise ValueError(f"camera {number[:20]} has {len(values)} parameters; {name} has {wanted}")
@@ -153,19 +167,39 @@ def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
 
 
 def _text_images(data: bytes) -> list[ColmapImage]:
-    images = []
-    lines = _text_lines(data)
-    for line in lines:
+    """An image is a line, and the line after it holds its points; files that are written by hand often have none."""
+    images: list[ColmapImage] = []
+    after_image = False
+    for line in _text_lines(data):
+        if after_image and _is_of_points(line):
+            after_image = False
+            continue
         if not line.split():
             continue
         words = line.split(maxsplit=9)
         if len(words) != 10:
-            raise ValueError(f"an image line has {len(words)} entries, wanted 10")
+            raise ValueError(f"an image line has {len(words)} entries, wanted 10: {shown(line.strip())}")
         pose = [float(word) for word in words[1:8]]
         images.append(ColmapImage(pose, int(words[8]), words[9].strip()))
-        next(lines, "")  # its 2D points
+        after_image = True
         _limited(len(images))
     return images
+
+
+def _is_of_points(line: str) -> bool:
+    """Whether a line after an image's is that of its points: X, Y and a whole number each, or nothing. An image's
+    line has ten words and more, of which a name that is no number is one; ten numbers are not three to a point."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(
+            np.isfinite([float(x), float(y), int(i)]).all() for x, y, i in _triples(words)
+        )
+    except ValueError:
+        return False
+
+
+def _triples(words: list[str]) -> Iterator[tuple[str, str, str]]:
+    return zip(words[0::3], words[1::3], words[2::3], strict=True)
 
 
 def _text_lines(data: bytes) -> Iterator[str]:
@@ -179,10 +213,11 @@ def _limited(count: int) -> int:
 
 
 def _model_fault(model: str, number: Any) -> str:
-    return f"camera {number!s:.20} has the model {model}; known are {', '.join(COLMAP_MODELS)}"
+    remedy = "undistort the pictures, or calibrate with one of these"
+    return f"camera {number!s:.20} has the model {model}; known are {', '.join(COLMAP_MODELS)}: {remedy}"
 
 
-def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera) -> dict[str, object]:
+def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[str]) -> dict[str, object]:
     parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
     focal = parameters.get("f", 0.0)
     w, x, y, z = _unit_quaternion(image.pose[:4])
@@ -201,7 +236,7 @@ def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera) -> dict[s
             "cx": parameters["cx"] - 0.5,
             "cy": parameters["cy"] - 0.5,
         },
-        "distortion": lens_entry(parameters, fisheye="FISHEYE" in camera.model),
+        "distortion": lens_entry(parameters, name, faults, fisheye="FISHEYE" in camera.model),
         "camera_from_world": {"rotation": rotation, "translation": list(image.pose[4:])},
     }
 

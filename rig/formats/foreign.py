@@ -1,6 +1,6 @@
-"""What all readers of other programs' files share: damage becomes an InputError, and what was read is judged as the
-``eigenhead-cameras/1`` document would be."""
+"""What all readers of other programs' files share: damage becomes an InputError, names and lenses become ours."""
 
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,13 +10,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rig.errors import InputError
-from rig.formats.cameras_json import FORMAT, name_fault, rig_from_document
+from rig.formats.cameras_json import name_fault
+from rig.formats.picture_names import IMAGE_SUFFIXES, picture_stem
 from rig.recorded_lens import COEFFICIENTS, LensModel
-from rig.rig import Rig
 
 T = TypeVar("T")
 MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 LENS_LOSS_PX = 0.02  # a lens may lose so much on the way in: a tenth of what a camera's place is known by
+LENS_KEY = re.compile(r"[kpst]\d")  # coefficients of OpenCV's lenses, among other parameters of a camera
 METRES_MOST = 30.0  # the widest head rig, in metres; in millimetres it would fit in a hand
 BYTES_MOST = 1 << 29  # a sparse model of a rig is a few megabytes; its 2D points may be many
 
@@ -35,31 +36,34 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
         raise InputError(path.name, [f"cannot be understood ({str(error)[:200]})"]) from error
 
 
-def judged_rig(entries: Sequence[Mapping[str, object]], subject: str, faults: list[str]) -> Rig:
-    """The rig of ``entries``. Raises InputError naming ``faults`` and those that ``rig_from_document`` finds."""
-    try:
-        rig = rig_from_document({"format": FORMAT, "unit": "mm", "cameras": entries}, subject)
-    except InputError as error:
-        raise InputError(subject, [*faults, *error.faults]) from None
-    if faults:
-        raise InputError(subject, faults)
-    return rig
-
-
 def camera_names(files: list[str]) -> list[str]:
-    """Camera names: the pictures' stems or, where those repeat (``cam00/shot.png``), the folders they lie in."""
-    paths = [Path(file.replace("\\", "/")) for file in files]
-    stems = [path.stem for path in paths]
-    folders = [path.parent.name for path in paths]
-    return folders if len(set(stems)) < len(stems) and all(folders) else stems
+    """Camera names: the pictures' names without their endings or, where those repeat (``cam00/shot.png``), the names of
+    the innermost folders that tell them all apart."""
+    paths = [tuple(part for part in file.replace("\\", "/").split("/") if part not in ("", ".")) for file in files]
+    stems = [picture_stem(path[-1]) if path else "" for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    for depth in range(2, max(map(len, paths)) + 1):
+        folders = [path[-depth] if len(path) >= depth else "" for path in paths]
+        if all(folders) and len(set(folders)) == len(folders):
+            return folders
+    return stems
 
 
-def lens_entry(parameters: Mapping[str, float], *, fisheye: bool = False) -> dict[str, str | float]:
-    """The ``distortion`` of ``eigenhead-cameras/1`` of coefficients in OpenCV's names; those that are missing are 0."""
+def lens_entry(
+    parameters: Mapping[str, float], where: str, faults: list[str], *, fisheye: bool = False
+) -> dict[str, str | float]:
+    """The ``distortion`` of ``eigenhead-cameras/1`` of coefficients in OpenCV's names; those that are missing are 0.
+    The one place where a foreign lens gets its model: a coefficient that it does not have is a fault, unless 0."""
     model: LensModel | None = "kannala-brandt" if fisheye else None
     if model is None and any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
         model = "rational"
     keys = COEFFICIENTS[model] if model else ("k1", "k2", "p1", "p2", "k3")
+    lost = [key for key, value in parameters.items() if LENS_KEY.fullmatch(key) and key not in keys and value]
+    if lost:
+        kind = "a fisheye" if fisheye else "this lens"
+        those = "is not 0, and" if len(lost) == 1 else "are not 0, and"
+        faults.append(f"{where}: {', '.join(lost)} {those} {kind} has {', '.join(keys)} alone: calibrate without")
     return {"model": model or "brown-conrady", **{key: parameters.get(key, 0.0) for key in keys}}
 
 
@@ -88,11 +92,13 @@ def xml_root(data: bytes) -> ElementTree.Element:
 def sized(folder: Path, name: str, faults: list[str]) -> tuple[int, int]:
     """Width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold them.
     Where there is none, a fault that says where to put it."""
-    from rig.formats.images import IMAGE_SUFFIXES, picture_size  # decoders, which most formats do without
+    from rig.formats.images import picture_size  # decoders, which most formats do without
 
     for place in (folder, folder / "images", folder.parent / "images"):
-        for path in sorted(place.glob(f"{name}.*")) if name_fault(name) is None else ():
-            if path.suffix.lower() in IMAGE_SUFFIXES:
+        here = sorted(place.glob(f"{name}.*")) if name_fault(name) is None else []
+        inside = sorted(place.glob(f"{name}/*")) if name_fault(name) is None else []  # a camera's own folder
+        for path in [*(path for path in here if picture_stem(path.name) == name), *inside]:
+            if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
                 try:
                     return picture_size(path)
                 except InputError as error:

@@ -1,10 +1,12 @@
 """Picture files: read by their content, written so that no reader meets half of one.
 
 Ordinary pictures (8 or 16 bits) are decoded by OpenCV, RAW and DNG by LibRaw, HEIC by libheif; all become 8-bit sRGB.
+Of Netpbm's maps the header says which value is white (4095 of 12 bits), and that becomes 255.
 An EXIF flag of orientation is not obeyed: calibrations hold for the sensor's own rows and columns.
 """
 
 import hashlib
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -18,17 +20,19 @@ from PIL import Image, UnidentifiedImageError
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError, how_to_install
+from rig.formats.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
 from rig.formats.work_size import at_share, halvings
 from rig.image import ImageRgb
 
-IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")  # JPEG covers the MPO that many phones write into a .jpg
-RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
-HEIC_SUFFIXES = (".heic", ".heif")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *RAW_SUFFIXES, *HEIC_SUFFIXES)
+# Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "DIB", "PPM")
 
 
 PictureKind = Literal["colour", "grey", "mask"]
 JPEG = b"\xff\xd8\xff"
+NETPBM = re.compile(
+    rb"P[2356](?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+(\d+)\s"
+)  # its last number is white
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 GREY_FLAGS = (
     cv2.IMREAD_GRAYSCALE,
@@ -123,7 +127,7 @@ def decode_image_file(
 @contextmanager
 def _faults_of(where: str, told: str = "") -> Iterator[None]:
     """What decoders raise for a damaged file, as InputError."""
-    said = f"is damaged: {told}" if told else "is damaged or no PNG, JPEG, TIFF, WebP, RAW or HEIC picture"
+    said = f"is damaged: {told}" if told else "is damaged or no PNG, JPEG, TIFF, WebP, BMP, PPM, RAW or HEIC picture"
     try:
         yield
     except Image.DecompressionBombError as error:
@@ -153,6 +157,9 @@ def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int) -> np.
     elif suffix in HEIC_SUFFIXES:
         pixels = np.asarray(heif_header(data).to_pillow().convert("RGB"))
     else:
+        white = NETPBM.match(data, 0, 1 << 12)
+        if white is not None and int(white[1]) not in (255, 65535):
+            return _of_white(data, int(white[1]), kind)
         halved = halved if data.startswith(JPEG) and kind != "mask" else 0
         flags = cv2.IMREAD_UNCHANGED if kind == "mask" else (GREY_FLAGS if kind == "grey" else COLOUR_FLAGS)[halved]
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -164,6 +171,20 @@ def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int) -> np.
     if kind == "mask":
         return _subject(pixels)
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if kind == "grey" else np.ascontiguousarray(pixels)
+
+
+def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
+    """One of Netpbm's maps whose white is neither 255 nor 65535. Raises ValueError."""
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or not 0 < white < 65536:
+        raise ValueError("not decoded")
+    if kind == "mask":
+        return _subject(pixels)
+    bytes_of = np.clip(np.round(np.arange(65536) * (255.0 / white)), 0, 255).astype(np.uint8)
+    pixels = bytes_of[np.asarray(pixels, np.uint16)]
+    if kind == "grey":
+        return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB)
 
 
 def _subject(pixels: np.ndarray) -> UInt8[np.ndarray, "h w"]:

@@ -6,7 +6,7 @@ y' b2`` with the corner of the picture at 0, so that half a pixel is taken off; 
 round than OpenCV's; type ``fisheye`` is equidistant, which with k1 to k4 is Kannala and Brandt's lens.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,40 +16,126 @@ from jaxtyping import Float
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.foreign import LENS_LOSS_PX, brown_conrady, corner_radius, judged_rig, lens_entry, parsed, xml_root
+from rig.formats.foreign import (
+    LENS_LOSS_PX,
+    brown_conrady,
+    camera_names,
+    corner_radius,
+    lens_entry,
+    parsed,
+    xml_root,
+)
+from rig.formats.foreign_keys import METASHAPE
+from rig.formats.reading import CamerasRead, Reading, listed, shown
 from rig.rig import Rig
 
 KEYS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+TYPES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}  # whether equidistant
+SWITCHES = {"true": True, "1": True, "false": False, "0": False}
 Similarity = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]  # rotation, translation (mm), scale
 
 
-def read_metashape(path: Path) -> Rig:
-    """The aligned cameras of a Metashape export, named by their labels. Raises InputError naming every fault."""
+def read_metashape(path: Path) -> CamerasRead:
+    """The aligned cameras of a Metashape export that are switched on, named by their labels or, where those repeat, by
+    their groups. Raises InputError naming every fault."""
     root = parsed(path, xml_root)
-    chunk = root if root.tag == "chunk" else root.find("chunk")
-    if chunk is None:
-        raise InputError(path.name, ["holds no <chunk>: wanted Metashape's Export Cameras, Agisoft XML"])
-    faults: list[str] = []
+    reading = Reading(path.name)
+    chunk = _chunk(root, reading)
+    _judge(chunk, "chunk", "", reading)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    worlds = {part.get("id"): part for part in chunk.iterfind("components/component")}
-    entries = []
-    for camera in chunk.iterfind("cameras//camera"):
-        matrix = camera.find("transform")
-        if matrix is None:  # not aligned
-            continue
-        name = Path((camera.get("label") or "").replace("\\", "/")).name.split(".")[0]
-        sensor = sensors.get(camera.get("sensor_id"))
-        if sensor is None or sensor.get("master_id") not in (None, sensor.get("id")):
-            faults.append(f"{name}: its sensor {camera.get('sensor_id')!r:.20} is missing, or a slave of another's")
-            continue
-        world = worlds.get(camera.get("component_id"), chunk)
-        if world.find("transform") is None:
-            world = chunk
-        entries.append(
-            _entry(name, sensor, _numbers(matrix, 16, f"{name}.transform", faults), _similarity(world, faults))
-        )
-        _add_lens(entries[-1], sensor, name, faults)
-    return judged_rig(entries, path.name, faults)
+    parts = {part.get("id"): part for part in chunk.iterfind("components/component")}
+    for part in parts.values():
+        _judge(part, "component", "", reading)
+    cameras = list(_cameras(chunk, reading))
+    entries: list[dict[str, object]] = []
+    used: set[str | None] = set()
+    for name, camera in zip(_names(cameras), (camera for _, camera in cameras), strict=True):
+        if _takes_part(name, camera, reading):
+            sensor = sensors.get(camera.get("sensor_id"))
+            if sensor is None and camera.get("master_id") is None:
+                told = f"{name}: its sensor {shown(camera.get('sensor_id'), 20)} is missing: export with all sensors"
+                reading.faults.append(told)
+            _judge(camera, "camera", name, reading)
+            if sensor is not None:
+                entries.append(_read_camera(name, camera, sensor, chunk, parts, reading))
+                used.add(camera.get("component_id"))
+    alone = [part for key in used if (part := parts.get(key)) is not None and part.find("transform") is None]
+    if len(used) > 1 and alone:
+        told = "stand in no known place to each other: align all cameras together, or switch off those of the others"
+        reading.faults.append(f"cameras of {len(used)} components {told}")
+    return reading.finish(entries)
+
+
+def _chunk(root: ElementTree.Element, reading: Reading) -> ElementTree.Element:
+    """The one chunk that has aligned cameras. Raises InputError."""
+    chunks = [root] if root.tag == "chunk" else root.findall("chunk")
+    if not chunks:
+        raise InputError(reading.subject, ["holds no <chunk>: wanted Metashape's Export Cameras, Agisoft XML"])
+    aligned = [chunk for chunk in chunks if chunk.find("cameras//camera/transform") is not None]
+    if len(aligned) > 1:
+        labels = listed([shown(chunk.get("label") or "") for chunk in aligned])
+        told = f"holds {len(aligned)} chunks with aligned cameras ({labels}): export the one of this rig alone"
+        raise InputError(reading.subject, [told])
+    return (aligned or chunks)[0]
+
+
+def _cameras(chunk: ElementTree.Element, reading: Reading) -> Iterator[tuple[str, ElementTree.Element]]:
+    """Each camera with the label of its group, or nothing."""
+    holder = chunk.find("cameras")
+    for node in holder if holder is not None else ():
+        if node.tag == "camera":
+            yield "", node
+        elif node.tag == "group":
+            _judge(node, "group", "", reading, children=False)
+            yield from ((node.get("label") or "", camera) for camera in node.iter("camera"))
+
+
+def _names(cameras: Sequence[tuple[str, ElementTree.Element]]) -> list[str]:
+    return camera_names([f"{group}/{camera.get('label') or ''}" for group, camera in cameras])
+
+
+def _takes_part(name: str, camera: ElementTree.Element, reading: Reading) -> bool:
+    switch = SWITCHES.get((camera.get("enabled") or "true").strip().lower())
+    if switch is None:
+        reading.faults.append(f"{name}.enabled is {shown(camera.get('enabled'))}, wanted true or false")
+    elif not switch:
+        reading.leave_out(name, 'switched off (enabled="false")')
+    elif camera.find("transform") is None and camera.get("master_id") is None:
+        reading.leave_out(name, "not aligned")
+    return name not in reading.left_out
+
+
+def _judge(
+    node: ElementTree.Element, place: str, whose: str, reading: Reading, *, children: bool = True, tags: tuple = ()
+) -> None:
+    """Asks the table about attributes and, but for ``tags``, what stands within."""
+    keys: dict[str, object] = {f"{place}@{name}": text for name, text in node.attrib.items()}
+    if place in ("sensor", "camera") and node.get("master_id") == node.get("id"):
+        keys.pop(f"{place}@master_id", None)  # its own master
+    for child in node if children else ():
+        if child.tag not in tags:
+            named = place == "sensor" and child.tag == "property"
+            key = f"{place}/{child.tag}" + (f"[{child.get('name')}]" if named else "")
+            keys[key] = child.get("value") if named else (child.text or "").strip() or (True if len(child) else None)
+    reading.judge(METASHAPE, keys, whose)
+
+
+def _read_camera(
+    name: str,
+    camera: ElementTree.Element,
+    sensor: ElementTree.Element,
+    chunk: ElementTree.Element,
+    parts: Mapping[str | None, ElementTree.Element],
+    reading: Reading,
+) -> dict[str, object]:
+    world = parts.get(camera.get("component_id"), chunk)
+    if world.find("transform") is None:
+        world = chunk
+    _judge(sensor, "sensor", name, reading, tags=("calibration",))
+    matrix = _numbers(camera.find("transform"), 16, f"{name}.transform", reading.faults)
+    entry = _entry(name, sensor, matrix, _similarity(world, reading.faults))
+    _add_lens(entry, sensor, name, reading)
+    return entry
 
 
 def write_metashape(rig: Rig, path: Path) -> None:
@@ -97,7 +183,7 @@ def _entry(name: str, sensor: ElementTree.Element, matrix: np.ndarray, world: Si
 def _similarity(node: ElementTree.Element, faults: list[str]) -> Similarity:
     """The chunk's transform to the world, metres made mm; without one, its free scale is taken as millimetres."""
     found = node.find("transform")
-    if found is None:
+    if found is None or not len(found):
         return np.eye(3), np.zeros(3), 1.0
     rotation = _numbers(found.find("rotation"), 9, "transform.rotation", faults).reshape(3, 3)
     translation = _numbers(found.find("translation"), 3, "transform.translation", faults)
@@ -105,7 +191,8 @@ def _similarity(node: ElementTree.Element, faults: list[str]) -> Similarity:
     return rotation, 1000.0 * translation, 1000.0 * float(scale)
 
 
-def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, faults: list[str]) -> None:
+def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, reading: Reading) -> None:
+    faults = reading.faults
     calibrations = sensor.findall("calibration")
     found = next((node for node in calibrations if node.get("class") == "adjusted"), None)
     if found is None:
@@ -115,30 +202,44 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
         node = found.find(key)
         values[key] = 0.0 if node is None else float(_numbers(node, 1, f"{name}.{key}", faults)[0])
     kind = sensor.get("type") or found.get("type") or "frame"
-    if kind not in ("frame", "fisheye"):
-        faults.append(f"{name} is a {kind!r:.20} camera; frame and fisheye are read")
+    if kind not in TYPES:
+        faults.append(f"{name} is a {shown(kind)} camera; read are {', '.join(TYPES)}")
+    given = dict(found.attrib)
+    if given.get("type") == kind:
+        del given["type"]
+    below = {f"/{node.tag}": node.text for node in found}
+    reading.judge(METASHAPE, {f"@{key}": value for key, value in given.items()} | below, name, place="calibration")
+    size = found.find("resolution")
+    if size is not None and (_whole(size, "width"), _whole(size, "height")) != (entry["width"], entry["height"]):
+        of_lens = f"{shown(size.get('width'), 20)} x {shown(size.get('height'), 20)}".replace("'", "")
+        faults.append(f"{name}: its lens was calibrated at {of_lens} pixels, its sensor has another size: export again")
     width, height = (entry[key] if isinstance(entry[key], int) else 0 for key in ("width", "height"))
     assert isinstance(width, int)
     assert isinstance(height, int)
-    _name_lost(values, (width, height), name, faults)
+    _name_lost(values, (width, height), name, faults, fisheye=TYPES.get(kind, False))
     centre = values["cx"] + 0.5 * width, values["cy"] + 0.5 * height
     focal = values["f"] + values["b1"], values["f"]
     entry["intrinsics"] = {"fx": focal[0], "fy": focal[1], "cx": centre[0] - 0.5, "cy": centre[1] - 0.5}
-    if kind == "fisheye":
-        entry["distortion"] = lens_entry(values, fisheye=True)
+    if TYPES.get(kind, False):
+        held = {key: values[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        entry["distortion"] = lens_entry(held, name, faults, fisheye=True)
         return
     radial = [values[key] for key in ("k1", "k2", "k3", "k4")]
     k1, k2, k3 = brown_conrady(radial, corner_radius((width, height), focal, centre), values["f"], name, faults)
-    entry["distortion"] = lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": values["p2"], "p2": values["p1"]})
+    held = {"k1": k1, "k2": k2, "k3": k3, "p1": values["p2"], "p2": values["p1"]}
+    entry["distortion"] = lens_entry(held, name, faults)
 
 
-def _name_lost(values: Mapping[str, float], size: tuple[int, int], name: str, faults: list[str]) -> None:
-    """Names what of a lens neither Brown-Conrady nor Kannala-Brandt hold and a pixel would show."""
+def _name_lost(values: dict[str, float], size: tuple[int, int], name: str, faults: list[str], *, fisheye: bool) -> None:
+    """Names what of a lens neither Brown-Conrady nor Kannala-Brandt hold and a pixel would show, and forgets the rest
+    of it."""
     skewed_px = abs(values["b2"]) * size[1] / 2 / values["f"] if values["f"] > 0 else 0.0
     if skewed_px > LENS_LOSS_PX:
         faults.append(f"{name}.b2 skews the picture by {skewed_px:.2f} px: calibrate without it")
-    if values["p3"] or values["p4"]:
-        faults.append(f"{name}: p3 and p4 are not zero: calibrate without them")
+    if fisheye and values["f"] > 0:
+        reach = np.hypot(*size) / 2 / values["f"]  # of the corner, in radians
+        if 3 * max(abs(values["p1"]), abs(values["p2"])) * reach**2 * values["f"] <= LENS_LOSS_PX:
+            values["p1"] = values["p2"] = 0.0
 
 
 def _write_sensor(sensors: ElementTree.Element, number: int, camera: Camera) -> None:

@@ -13,29 +13,41 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, judged_rig, lens_entry, number_array, parsed
+from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, lens_entry, number_array, parsed
+from rig.formats.foreign_keys import ANIPOSELIB, CALISCOPE
+from rig.formats.reading import CamerasRead, Reading, shown
 from rig.geometry import rotation_from_vector, vector_from_rotation
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}  # millimetres in each
 
-def read_toml(path: Path) -> Rig:
+
+def read_toml(path: Path) -> CamerasRead:
     """The rig in caliscope's ``camera_array.toml`` or in an aniposelib calibration."""
     document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
-    tables = document.get("cameras")
+    tables, reading = document.get("cameras"), Reading(path.name)
     if isinstance(tables, dict):
-        pairs = [(f"cam_{key}", table) for key, table in tables.items()]
+        pairs, keys = [(f"cam_{key}", table) for key, table in tables.items()], CALISCOPE
         millimetres = 1000.0
+        reading.judge(CALISCOPE, {key: value for key, value in document.items() if key != "cameras"}, "")
     else:
-        pairs = [(key, table) for key, table in document.items() if key != "metadata"]
-        millimetres = _aniposelib_unit(document, pairs)
-    faults: list[str] = []
-    entries = [
-        _toml_entry(name, table, millimetres, faults)
-        for name, table in pairs
-        if not (isinstance(table, dict) and table.get("ignore") is True)
-    ]
-    return judged_rig(entries, path.name, faults)
+        pairs, keys = [(key, table) for key, table in document.items() if key != "metadata"], ANIPOSELIB
+        millimetres = _aniposelib_unit(document, pairs, reading)
+    entries = []
+    for name, table in pairs:
+        if not isinstance(table, dict):
+            reading.faults.append(f"{name} is no table")
+            continue
+        own = table["name"] if isinstance(table.get("name"), str) else name
+        if "ignore" in keys and _switch(table, "ignore", own, reading.faults):
+            reading.leave_out(own, "switched off (ignore = true)")
+        elif keys is CALISCOPE and not {"rotation", "translation"} & table.keys():
+            reading.leave_out(own, "without a pose")
+        else:
+            reading.judge(keys, table, own)
+            entries.append(_toml_entry(own, table, millimetres, reading.faults))
+    return reading.finish(entries)
 
 
 def write_caliscope(rig: Rig, path: Path) -> None:
@@ -70,15 +82,16 @@ def write_aniposelib(rig: Rig, path: Path) -> None:
     write_atomically(path, "\n".join(blocks).encode())
 
 
-def _toml_entry(name: str, table: Any, millimetres: float, faults: list[str]) -> dict[str, object]:
-    if not isinstance(table, dict):
-        faults.append(f"{name} is no table")
-        return {}
-    if isinstance(table.get("name"), str):
-        name = table["name"]
-    fisheye = table.get("fisheye") is True
-    if table.get("rotation_count") not in (None, 0):
-        faults.append(f"{name}.rotation_count is {table['rotation_count']!r:.20}: turn its images and calibrate again")
+def _switch(table: Mapping[str, Any], key: str, name: str, faults: list[str]) -> bool:
+    """What is true or false; absent is false."""
+    value = table.get(key, False)
+    if not isinstance(value, bool) and value not in (0, 1):
+        faults.append(f"{name}.{key} is {shown(value)}, wanted true or false")
+    return value is True or value == 1
+
+
+def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults: list[str]) -> dict[str, object]:
+    fisheye = _switch(table, "fisheye", name, faults)
     matrix = number_array(table.get("matrix"), (3, 3), f"{name}.matrix", faults)
     rotation = number_array(table.get("rotation"), None, f"{name}.rotation", faults)
     translation = number_array(table.get("translation"), (3,), f"{name}.translation", faults)
@@ -97,18 +110,22 @@ def _toml_entry(name: str, table: Any, millimetres: float, faults: list[str]) ->
         "width": width,
         "height": height,
         "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-        "distortion": lens_entry(dict(zip(names, lens.ravel().tolist(), strict=False)), fisheye=fisheye),
+        "distortion": lens_entry(dict(zip(names, lens.ravel().tolist(), strict=False)), name, faults, fisheye=fisheye),
         "camera_from_world": {"rotation": rotation.tolist(), "translation": (millimetres * translation).tolist()},
     }
 
 
-def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]]) -> float:
+def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]], reading: Reading) -> float:
     """Millimetres in one unit of the file. Its ``metadata.unit`` says so; without it, the size of the rig does:
     aniposelib takes the unit of the board, and cameras within 30 of each other are a rig in metres."""
     metadata = document.get("metadata")
     unit = metadata.get("unit") if isinstance(metadata, dict) else None
-    if unit in ("mm", "m"):
-        return 1.0 if unit == "mm" else 1000.0
+    if isinstance(metadata, dict):
+        reading.judge(ANIPOSELIB, metadata, "", place="metadata.")
+    if isinstance(unit, str) and unit in UNITS:
+        return UNITS[unit]
+    if unit is not None:
+        reading.faults.append(f"metadata.unit is {shown(unit)}; read are {', '.join(UNITS)}")
     lengths = [
         np.abs(number_array(table.get("translation"), (3,), "", [])).max()
         for _, table in pairs

@@ -6,7 +6,8 @@ the cameras lie within 30 of the origin, else mm. ``W_<name>`` and ``H_<name>`` 
 tell it.
 """
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,9 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, judged_rig, lens_entry, number_array, parsed, sized
+from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, lens_entry, number_array, parsed, sized
+from rig.formats.foreign_keys import OPENCV_YAML
+from rig.formats.reading import CamerasRead, Reading, listed
 from rig.geometry import rotation_from_vector
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
@@ -23,18 +26,25 @@ if TYPE_CHECKING:
     import cv2
 
 FILES = ("intri.yml", "extri.yml")
+POSE_KEY = re.compile(r"(R|Rot|T)_")
 WANTED = "K_<name>, dist_<name>, R_<name> and T_<name> of each camera"
 
 
-def read_yaml(path: Path) -> Rig:
+def read_yaml(path: Path) -> CamerasRead:
     """The rig in ``intri.yml`` and the ``extri.yml`` beside it, or in ``path`` alone. Raises InputError naming every
     fault."""
     parts = [path.with_name(name) for name in FILES] if path.name in FILES else [path, path]
     lenses, poses = (parsed(part, _matrices) for part in parts)
-    names = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
-    if not names:
+    held = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
+    if not held:
         raise InputError(path.name, [f"holds no camera; wanted are {WANTED}"])
-    faults: list[str] = []
+    reading = Reading(path.name)
+    faults = reading.faults
+    names = _taking_part(held, [*lenses["names"]] if isinstance(lenses.get("names"), list) else None, reading)
+    _judge(lenses | poses, held, reading)
+    lacking = [key for key in poses if (m := POSE_KEY.match(key)) and key[m.end() :] not in held]
+    if lacking:
+        faults.append(f"{listed(lacking)}: there is no K_<name> of that name")
     entries: list[dict[str, Any]] = []
     for name in names:
         matrix = number_array(lenses[f"K_{name}"], (3, 3), f"K_{name}", faults)
@@ -48,6 +58,7 @@ def read_yaml(path: Path) -> Rig:
         if turned is None and (given := poses.get(f"R_{name}")) is not None:
             turned = rotation_from_vector(given.ravel()) if given.size == 3 else given
         rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
+        _check_alike(poses, name, faults)
         translation = number_array(poses.get(f"T_{name}", np.zeros(0)).ravel(), (3,), f"T_{name}", faults)
         size: tuple[float, float]
         if f"W_{name}" in lenses and f"H_{name}" in lenses:
@@ -61,16 +72,49 @@ def read_yaml(path: Path) -> Rig:
                 "width": size[0],
                 "height": size[1],
                 "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-                "distortion": lens_entry(dict(zip(keys, lens.tolist(), strict=False))),
+                "distortion": lens_entry(dict(zip(keys, lens.tolist(), strict=False)), name, faults),
                 "camera_from_world": {"rotation": rotation.tolist(), "translation": translation},
             }
         )
-    reach = max(float(np.abs(entry["camera_from_world"]["translation"]).max()) for entry in entries)
+    reach = max((float(np.abs(entry["camera_from_world"]["translation"]).max()) for entry in entries), default=0.0)
     millimetres = 1000.0 if reach < METRES_MOST else 1.0
     for entry in entries:
         pose = entry["camera_from_world"]
         pose["translation"] = (millimetres * pose["translation"]).tolist()
-    return judged_rig(entries, path.name, faults)
+    return reading.finish(entries)
+
+
+def _taking_part(held: list[str], given: list[str] | None, reading: Reading) -> list[str]:
+    """The cameras that ``names`` has, where there is one; those of it that the file does not hold are a fault."""
+    if not given:
+        return held
+    lacking = [name for name in given if name not in held]
+    if lacking:
+        reading.faults.append(f"names has {listed(lacking)}, of which there is no K_<name>")
+    for name in held:
+        if name not in given:
+            reading.leave_out(name, "not among names")
+    return [name for name in held if name in given]
+
+
+def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) -> None:
+    """Asks the table about every key, whose camera's name becomes ``<name>``."""
+    for key, value in values.items():
+        name = next((name for name in sorted(held, key=len, reverse=True) if key.endswith(f"_{name}")), "")
+        general = key.removesuffix(name) + "<name>" if name else key
+        if name or key == "names" or not POSE_KEY.match(key):
+            plain = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+            reading.judge(OPENCV_YAML, {general: plain}, name)
+
+
+def _check_alike(poses: Mapping[str, Any], name: str, faults: list[str]) -> None:
+    """Both ways of writing a rotation may stand there; one that was changed alone is a fault."""
+    vector, matrix = poses.get(f"R_{name}"), poses.get(f"Rot_{name}")
+    if vector is None or matrix is None or vector.size not in (3, 9) or matrix.shape != (3, 3):
+        return
+    other = rotation_from_vector(vector.ravel()) if vector.size == 3 else vector.reshape(3, 3)
+    if not np.abs(other - matrix).max() < 1e-3:
+        faults.append(f"R_{name} and Rot_{name} are not the same rotation: leave the right one")
 
 
 def write_yaml(rig: Rig, folder: Path) -> None:
@@ -112,20 +156,25 @@ def _written(rig: Rig, fill: "Callable[[cv2.FileStorage], None]") -> bytes:
     return file.releaseAndGetString().encode()
 
 
-def _matrices(data: bytes) -> dict[str, np.ndarray]:
-    """Every matrix and number of a file by its key. Raises ValueError."""
+def _matrices(data: bytes) -> dict[str, Any]:
+    """Every matrix and number of a file by its key, and of a list of words the words. Raises ValueError."""
     import cv2
 
     try:
         file = cv2.FileStorage(data.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = file.root()
-        found = {}
+        found: dict[str, Any] = {}
         for key in root.keys():  # noqa: SIM118 a FileNode is no mapping
             node = root.getNode(key)
             if node.isMap():
                 found[key] = np.asarray(node.mat(), float)
             elif node.isReal() or node.isInt():
                 found[key] = np.array([node.real()])
+            elif node.isSeq():
+                words = [node.at(i) for i in range(node.size())]
+                found[key] = [word.string() for word in words if word.isString()]
+            elif node.isString():
+                found[key] = node.string()
         return found
     except (cv2.error, SystemError, TypeError) as error:
         said = " ".join(str(error).split())[:120]

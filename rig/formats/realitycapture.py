@@ -20,13 +20,17 @@ from jaxtyping import Float
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.foreign import brown_conrady, corner_radius, judged_rig, lens_entry, parsed, sized, xml_root
+from rig.formats.foreign import brown_conrady, camera_names, corner_radius, lens_entry, parsed, sized, xml_root
+from rig.formats.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
+from rig.formats.picture_names import picture_stem
+from rig.formats.reading import CamerasRead, Reading, shown
 from rig.rig import Rig
 
 XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 FILM_MM = 36.0
 MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
+NO_LENS = "division"  # the default of a file that has no coefficients
 COLUMNS = ("#name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 DOWN = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from those of the CSV: x right, y up, z backwards
 
@@ -45,18 +49,31 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 """
 
 
-def read_xmp(folder: Path) -> Rig:
-    """The rig in a folder of XMP files, a camera each. Raises InputError naming every fault."""
-    faults: list[str] = []
+def read_xmp(folder: Path) -> CamerasRead:
+    """The rig in a folder of XMP files, a camera each, but for those that are not aligned or not used for meshing.
+    Raises InputError naming every fault."""
+    reading = Reading(f"{folder.name}/*.xmp")
     entries = []
-    for path in sorted(folder.glob("*.xmp")):
+    components = set()
+    for path in sorted(path for path in folder.glob("*.xmp") if not path.name.startswith(".")):
         try:
             values = _xmp_values(path)
         except InputError as error:
-            faults += [f"{path.name} {fault}" for fault in error.faults]
+            reading.faults += [f"{path.name} {fault}" for fault in error.faults]
             continue
-        entries.append(_xmp_entry(folder, path.stem, values, faults))
-    return judged_rig(entries, f"{folder.name}/*.xmp", faults)
+        name = picture_stem(path.stem)  # RealityScan also writes cam00.png.xmp
+        if not {"Rotation", "Position"} & values.keys():
+            reading.leave_out(name, "not aligned (no Rotation, no Position)")
+        elif values.get("InMeshing", "1").strip().lower() in ("0", "false"):
+            reading.leave_out(name, 'switched off (InMeshing="0")')
+        else:
+            reading.judge(REALITYCAPTURE, values, name)
+            components |= {values["ComponentId"]} if "ComponentId" in values else set()
+            entries.append(_xmp_entry(folder, name, values, reading.faults))
+    if len(components) > 1:
+        told = "stand in no known place to each other: align all together, or export the largest component alone"
+        reading.faults.append(f"cameras of {len(components)} components {told}")
+    return reading.finish(entries)
 
 
 def write_xmp(rig: Rig, folder: Path) -> None:
@@ -75,15 +92,16 @@ def write_xmp(rig: Rig, folder: Path) -> None:
         write_atomically(folder / f"{camera.name}.xmp", text.encode())
 
 
-def read_csv(path: Path) -> Rig:
+def read_csv(path: Path) -> CamerasRead:
     """The rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
     rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(data.decode("utf-8-sig")))))
     if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
         raise InputError(path.name, [f"is no CSV of internal and external camera parameters: {','.join(COLUMNS)}"])
-    faults: list[str] = []
+    reading = Reading(path.name)
+    faults = reading.faults
     entries = []
-    for row in rows:
-        name = Path(str(row["#name"]).replace("\\", "/")).stem
+    for name, row in zip(camera_names([str(row["#name"]) for row in rows]), rows, strict=True):
+        reading.judge(REALITYCAPTURE_CSV, {str(key): value for key, value in row.items() if key}, name)
         values = {key: _number(row.get(key, "0"), f"{name}.{key}", faults) for key in COLUMNS[1:]}
         size = sized(path.parent, name, faults)
         side = max(size)
@@ -91,7 +109,7 @@ def read_csv(path: Path) -> Rig:
         offset = values["px"] / FILM_MM * side, values["py"] / FILM_MM * side
         position = np.array([values["x"], values["y"], values["alt"]])
         entries.append(_entry(name, size, (focal, focal), offset, values, DOWN @ _attitude(values).T, position, faults))
-    return judged_rig(entries, path.name, faults)
+    return reading.finish(entries)
 
 
 def write_csv(rig: Rig, path: Path) -> None:
@@ -142,14 +160,13 @@ def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[
         return found if len(found) == count else [np.nan] * count
 
     model = values.get("DistortionModel", "perspective")
-    if model not in MODELS:
-        faults.append(f"{name}: its DistortionModel is {model!r:.40}; read are {', '.join(MODELS)}")
+    bent = any(word.strip("0.-+") for word in values.get("DistortionCoeficients", "").split())
+    if model not in MODELS and (bent or model != NO_LENS):
+        faults.append(f"{name}: its DistortionModel is {shown(model)}; read are {', '.join(MODELS)}")
     size = sized(folder, name, faults)
     side = max(size)
     focal = numbers("FocalLength35mm", 1)[0] / FILM_MM * side
     aspect = numbers("AspectRatio", 1, "1")[0]
-    if abs(numbers("Skew", 1, "0")[0]) * side > 0.02:
-        faults.append(f"{name}.Skew is not 0: align without it")
     offset = numbers("PrincipalPointU", 1, "0")[0] * side, numbers("PrincipalPointV", 1, "0")[0] * side
     lens = numbers("DistortionCoeficients", 6, "0 0 0 0 0 0")
     rotation, position = np.array(numbers("Rotation", 9)).reshape(3, 3), np.array(numbers("Position", 3))
@@ -175,7 +192,7 @@ def _entry(
         "width": size[0],
         "height": size[1],
         "intrinsics": {"fx": focal[0], "fy": focal[1], "cx": centre[0] - 0.5, "cy": centre[1] - 0.5},
-        "distortion": lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": lens["t1"], "p2": lens["t2"]}),
+        "distortion": lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": lens["t1"], "p2": lens["t2"]}, name, faults),
         "camera_from_world": {
             "rotation": rotation.tolist(),
             "translation": (-rotation @ (1000.0 * position_m)).tolist(),
@@ -202,5 +219,5 @@ def _number(word: str | None, where: str, faults: list[str]) -> float:
     try:
         return float(word or "")
     except ValueError:
-        faults.append(f"{where} is {word!r:.40}, wanted a number")
+        faults.append(f"{where} is {shown(word)}, wanted a number")
         return np.nan

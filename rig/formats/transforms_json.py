@@ -17,35 +17,46 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.foreign import METRES_MOST, camera_names, judged_rig, lens_entry, number_array, parsed, sized
+from rig.formats.foreign import METRES_MOST, camera_names, lens_entry, number_array, parsed, sized
+from rig.formats.foreign_keys import TRANSFORMS
+from rig.formats.reading import CamerasRead, Reading, shown
 from rig.rig import Rig
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from OpenGL's
 MODELS = {"PINHOLE": False, "SIMPLE_PINHOLE": False, "OPENCV": False, "OPENCV_FISHEYE": True}
 LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # what may stand at the top and means each camera
 
 
-def read_transforms(path: Path) -> Rig:
+def read_transforms(path: Path) -> CamerasRead:
     """The rig in a ``transforms.json``: a camera a frame. Raises InputError naming every fault."""
     document = parsed(path, json.loads)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(path.name, ["is no object with a list 'frames' of objects"])
-    faults: list[str] = []
+    reading = Reading(path.name)
+    faults = reading.faults
+    reading.judge(TRANSFORMS, {key: value for key, value in document.items() if key not in PER_CAMERA}, "")
     names = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
     matrices = [
         number_array(frame.get("transform_matrix"), (4, 4), f"{name}.transform_matrix", faults)
         for name, frame in zip(names, frames, strict=True)
     ]
-    applied = document.get("applied_scale", 1.0)
-    scale = 1.0 / applied if isinstance(applied, int | float) and applied > 0 else 1.0
+    for name, frame in zip(names, frames, strict=True):
+        lens = {key: value for key, value in document.items() if key in PER_CAMERA}
+        reading.judge(TRANSFORMS, lens | frame, name)
+    _check_applied(document.get("applied_transform"), faults)
+    applied = _number(document.get("applied_scale", 1.0), "applied_scale", faults)
+    if applied <= 0:
+        faults.append(f"applied_scale is {applied:g}, wanted a positive number")
+    scale = 1.0 / applied if applied > 0 else 1.0
     reach = scale * max((np.abs(matrix[:3, 3]).max() for matrix in matrices), default=0.0)
     millimetres = scale * (1000.0 if reach < METRES_MOST else 1.0)
     entries = [
         _entry(path.parent, name, document | frame, matrix, millimetres, faults)
         for name, frame, matrix in zip(names, frames, matrices, strict=True)
     ]
-    return judged_rig(entries, path.name, faults)
+    return reading.finish(entries)
 
 
 def write_transforms(rig: Rig, path: Path) -> None:
@@ -73,9 +84,7 @@ def _lens(camera: Camera) -> dict[str, object]:
 def _entry(
     folder: Path, name: str, values: dict[str, Any], matrix: np.ndarray, millimetres: float, faults: list[str]
 ) -> dict[str, object]:
-    model = values.get("camera_model", "OPENCV")
-    if model not in MODELS:
-        faults.append(f"{name}.camera_model is {model!r:.40}; read are {', '.join(MODELS)}")
+    fisheye = _is_fisheye(values, name, faults)
     size = values.get("w"), values.get("h")
     if None in size:
         size = sized(folder, name, faults)
@@ -85,7 +94,6 @@ def _entry(
     cx = _number(values.get("cx", 0.5 * width), f"{name}.cx", faults)
     cy = _number(values.get("cy", 0.5 * height), f"{name}.cy", faults)
     lens = {key: _number(values.get(key, 0.0), f"{name}.{key}", faults) for key in LENS}
-    fisheye = MODELS.get(model if isinstance(model, str) else "", False)
     if not fisheye and lens["k4"]:
         faults.append(f"{name}.k4 is not 0 and the camera no OPENCV_FISHEYE: calibrate without k4")
         lens["k4"] = 0.0
@@ -95,12 +103,42 @@ def _entry(
         "width": width,
         "height": height,
         "intrinsics": {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5},
-        "distortion": lens_entry(lens, fisheye=fisheye),
+        "distortion": lens_entry(lens, name, faults, fisheye=fisheye),
         "camera_from_world": {
             "rotation": pose.tolist(),
             "translation": (-pose @ (millimetres * matrix[:3, 3])).tolist(),
         },
     }
+
+
+def _is_fisheye(values: dict[str, Any], name: str, faults: list[str]) -> bool:
+    """Whether the lens is Kannala-Brandt's: nerfstudio says so by ``camera_model``, instant-ngp by ``is_fisheye``."""
+    model, flag = values.get("camera_model"), values.get("is_fisheye", False)
+    if not (model is None or (isinstance(model, str) and model in MODELS)):
+        faults.append(f"{name}.camera_model is {shown(model)}; read are {', '.join(MODELS)}")
+        return False
+    if not isinstance(flag, bool) and flag not in (0, 1):
+        faults.append(f"{name}.is_fisheye is {shown(flag)}, wanted true or false")
+        return False
+    if flag and model is not None and not MODELS[model]:
+        told = "the two say different lenses: take the wrong one out"
+        faults.append(f"{name}.is_fisheye is true, and camera_model is {model}: {told}")
+    return bool(flag) or (model is not None and MODELS[model])
+
+
+def _check_applied(value: object, faults: list[str]) -> None:
+    """Any world will do, so that a rotation that was applied to it need not be taken back; a scale would change
+    lengths, and a mirror what is left and right."""
+    if value is None:
+        return
+    try:
+        matrix = np.array(value, dtype=float)[:3, :3]
+    except (TypeError, ValueError, IndexError):
+        matrix = np.zeros(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        faults.append(f"applied_transform is {shown(value)}, wanted 3 x 4 numbers")
+    elif np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-3 or np.linalg.det(matrix) < 0:
+        faults.append("applied_transform scales or mirrors the world: export without it")
 
 
 def _focal(
@@ -121,5 +159,5 @@ def _number(value: object, where: str, faults: list[str]) -> float:
     # NaN fails the comparison, and so does a whole number too large for a float
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12:
         return value
-    faults.append(f"{where} is {value!r:.40}, wanted a finite number")
+    faults.append(f"{where} is {shown(value)}, wanted a finite number")
     return math.nan

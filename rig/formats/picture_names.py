@@ -1,0 +1,159 @@
+"""Endings of picture files, and whose picture a file is by its name alone. Knows no decoder, so that it costs nothing.
+
+Programs call the mask of ``cam00.png`` ``cam00.png.png`` (COLMAP), ``cam00.png.mask.png`` (RealityScan) or
+``cam00_mask.png``, and number a picture of ``cam00`` ``shot_0001_cam00.tif``. Such names are read as words: runs of
+letters, and numbers without their leading zeros. Signs between them, their case and endings of pictures do not count.
+"""
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+HEIC_SUFFIXES = (".heic", ".heif")
+# Uncompressed files of machine vision software: Windows bitmaps, and Netpbm's grey and colour maps.
+PLAIN_SUFFIXES = (".bmp", ".dib", ".pbm", ".pgm", ".ppm", ".pnm")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES, *RAW_SUFFIXES, *HEIC_SUFFIXES)
+UNREAD_PICTURES = {
+    ".gif": "GIF",
+    ".exr": "OpenEXR",
+    ".hdr": "Radiance HDR",
+    ".pfm": "PFM",
+    ".avif": "AVIF",
+    ".jxl": "JPEG XL",
+    ".jp2": "JPEG 2000",
+    ".j2k": "JPEG 2000",
+    ".tga": "Targa",
+    ".psd": "Photoshop",
+    ".svg": "SVG",
+    ".pdf": "PDF",
+    ".npy": "NumPy",
+    ".raw": "raw pixels",
+    ".iiq": "Phase One RAW",
+    ".3fr": "Hasselblad RAW",
+    ".fff": "Hasselblad RAW",
+    ".nrw": "Nikon NRW",
+    ".x3f": "Sigma RAW",
+    ".mp4": "a video",
+    ".mov": "a video",
+    ".avi": "a video",
+}
+"""What pictures are kept in and nobody here reads, by ending: such a file is called what it is, not missing."""
+JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")  # what file managers add
+WORD = re.compile(r"\d+|[^\W\d_]+")
+
+
+def is_junk(name: str) -> bool:
+    """Whether a file manager added a file or folder of that name, or it is hidden."""
+    return name.casefold() in {junk.casefold() for junk in JUNK} or name.startswith(".")
+
+
+def picture_stem(name: str) -> str:
+    """A file's name without a picture's ending; a dot that begins no such ending belongs to the name."""
+    stem, dot, ending = name.rpartition(".")
+    return stem if dot and stem and f".{ending.lower()}" in (*IMAGE_SUFFIXES, *UNREAD_PICTURES) else name
+
+
+def match_names(names: Iterable[str], cameras: Sequence[str], *, several: bool = False) -> dict[str, list[str]]:
+    """Returns the file names of each camera that has none of exactly its own name, where they leave no doubt.
+
+    Args:
+        names: of files (with their endings) or of folders.
+        several: whether a camera may have more than one.
+    """
+    files = sorted(set(names))
+    exact = {picture_stem(name) for name in files} | {name for name in files if name in cameras}
+    lacking = {camera for camera in cameras if camera not in exact}
+    strays = {name: _words(name) for name in files if name not in cameras and picture_stem(name) not in cameras}
+    if not lacking or not strays:
+        return {}
+    words = {camera: _words(camera) for camera in cameras}
+    matched: dict[str, list[str]] = {}
+    for rule in (_equal, _alike_about, _naming_one, _numbered):
+        found = rule(strays, words)
+        for camera, own in found.items():
+            if camera in lacking and camera not in matched and (several or len(own) == 1):
+                matched[camera] = sorted(own)
+        taken = {name for own in matched.values() for name in own}
+        strays = {name: said for name, said in strays.items() if name not in taken}
+    return matched
+
+
+Words = tuple[str, ...]
+Found = Mapping[str, Sequence[str]]
+
+
+def _words(name: str) -> Words:
+    while (stem := picture_stem(name)) != name:
+        name = stem
+    folded = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
+    return tuple(word.lstrip("0") or "0" if word.isdecimal() else word for word in WORD.findall(folded))
+
+
+def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
+    """Files that say the camera's words and no more: ``CAM_0.png`` of cam00."""
+    times = Counter(cameras.values())
+    owners = {words: camera for camera, words in cameras.items() if words and times[words] == 1}
+    return _by_owner((owners[words], name) for name, words in strays.items() if words in owners)
+
+
+def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
+    """Files that say the same before and after the words of each camera, where one such pair fits most cameras."""
+    fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
+    for name, words in strays.items():
+        for camera, own in cameras.items():
+            for start in _places(own, words):
+                about = words[:start], words[start + len(own) :]
+                fitting.setdefault(about, {}).setdefault(camera, []).append(name)
+    if not fitting:
+        return {}
+    most = max(len(found) for found in fitting.values())
+    best = [found for found in fitting.values() if len(found) == most]
+    owners = Counter((camera, name) for found in best for camera, own in found.items() for name in own)
+    claimed = Counter(name for _, name in owners)
+    if most == 1 and any(not _is_telling(cameras[camera]) for camera, _ in owners):
+        return {}  # a number in one file's name may be anything
+    return _by_owner((camera, name) for camera, name in owners if claimed[name] == 1)
+
+
+def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
+    """Files that name one camera alone, whatever else each says: times, exposures, counters."""
+    pairs = []
+    for name, words in strays.items():
+        said = [camera for camera, own in cameras.items() if _is_telling(own) and any(_places(own, words))]
+        longest = [camera for camera in said if not any(_within(cameras[camera], cameras[other]) for other in said)]
+        pairs += [(longest[0], name)] if len(longest) == 1 else []
+    return _by_owner(pairs)
+
+
+def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
+    """Files that say only what tells the cameras apart (``00.png`` of cam00), where every camera has one."""
+    ways = list(cameras.values())
+    head = next((i for i, said in enumerate(zip(*ways, strict=False)) if len(set(said)) > 1), None)
+    if head is None or len(cameras) < 2:
+        return {}
+    owners = {words[head:]: camera for camera, words in cameras.items()}
+    found = _by_owner((owners[words], name) for name, words in strays.items() if words in owners)
+    return found if len(owners) == len(cameras) == len(found) else {}
+
+
+def _places(own: Words, words: Words) -> list[int]:
+    """Where the words of a camera stand among those of a file."""
+    return [i for i in range(len(words) - len(own) + 1) if own and words[i : i + len(own)] == own]
+
+
+def _within(own: Words, other: Words) -> bool:
+    return own != other and bool(_places(own, other))
+
+
+def _is_telling(words: Words) -> bool:
+    """Whether the words hold more than numbers, which may also be counters and dates."""
+    return any(not word.isdecimal() for word in words)
+
+
+def _by_owner(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for camera, name in pairs:
+        found.setdefault(camera, []).append(name)
+    return found

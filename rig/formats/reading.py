@@ -1,0 +1,98 @@
+"""What a reader of another program's cameras finds on its way: faults, unused keys, cameras that take no part."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from rig.capture import Remark
+from rig.errors import InputError
+from rig.formats.cameras_json import FORMAT, rig_from_document
+from rig.formats.foreign_keys import ForeignKey, Table, says_nothing
+from rig.rig import Rig
+
+NAMED_MOST = 4  # cameras or keys that one sentence names
+VALUE_MOST = 40  # characters of a value
+
+
+@dataclass(frozen=True, slots=True)
+class CamerasRead:
+    """A rig, what its reader noticed and did not mind, and the cameras of the file that take no part, with reasons."""
+
+    rig: Rig
+    remarks: tuple[Remark, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Reading:
+    """Collects while the file named ``subject`` is read."""
+
+    subject: str
+    faults: list[str] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+    _meant: dict[tuple[str, ForeignKey], list[tuple[str, object]]] = field(default_factory=dict)
+    _unknown: dict[str, None] = field(default_factory=dict)
+
+    def judge(self, table: Table, values: Mapping[str, object], whose: str, *, place: str = "") -> None:
+        """Notes the keys of ``values`` that the table refuses, tells or does not have. ``whose``: the camera's name, or
+        nothing where they are the whole file's; ``place``: what comes before each key in the table."""
+        for key, value in values.items():
+            rule = table.get(place + key)
+            if rule is None:
+                self._unknown[place + key] = None
+            elif rule.treatment in ("refused", "told") and value is not None and not says_nothing(value, rule):
+                self._meant.setdefault((place + key, rule), []).append((whose, value))
+
+    def leave_out(self, name: str, why: str) -> None:
+        """Notes a camera that takes no part, for the reason ``why``."""
+        self.left_out[name] = why
+
+    def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
+        """The rig of ``eigenhead-cameras/1`` entries. Raises InputError naming every fault."""
+        told: list[Remark] = []
+        for (key, rule), cases in self._meant.items():
+            sentence = f"{_whose([name for name, _ in cases], key)} is {shown(cases[0][1])}: {rule.why}"
+            if rule.treatment == "refused":
+                self.faults.append(sentence)
+            else:
+                told.append(Remark("unknown-key", f"{self.subject}: {sentence}; it is not used"))
+        if self._unknown:
+            keys = listed([shown(key) for key in self._unknown])
+            what = "key is" if len(self._unknown) == 1 else "keys are"
+            told.append(Remark("unknown-key", f"{self.subject}: the {what} not known and not read: {keys}"))
+        told += [Remark("view-left-out", sentence) for sentence in self._left_out()]
+        try:
+            rig = rig_from_document({"format": FORMAT, "unit": "mm", "cameras": list(entries)}, self.subject)
+        except InputError as error:
+            raise InputError(self.subject, [*self.faults, *error.faults, *self._left_out()]) from None
+        if self.faults:
+            raise InputError(self.subject, self.faults)
+        return CamerasRead(rig, tuple(told), MappingProxyType(dict(self.left_out)))
+
+    def _left_out(self) -> list[str]:
+        reasons: dict[str, list[str]] = {}
+        for name, why in self.left_out.items():
+            reasons.setdefault(why, []).append(name)
+        return [f"{listed(names)} {why} in {self.subject}: taking no part" for why, names in reasons.items()]
+
+
+def listed(names: Sequence[str], most: int = NAMED_MOST) -> str:
+    """A few names, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def shown(value: object, most: int = VALUE_MOST) -> str:
+    """A value as Python writes it, cut within its quotation marks and not through them."""
+    if isinstance(value, str):
+        return repr(value if len(value) <= most else value[: most - 3] + "...")
+    text = repr(value)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _whose(names: Sequence[str], key: str) -> str:
+    """A key and the cameras that have it, or the key alone where it is the whole file's."""
+    own = [name for name in names if name]
+    if len(own) == 1:
+        return key.replace("<name>", own[0]) if "<name>" in key else f"{own[0]}.{key}"
+    return f"{len(own)} cameras ({listed(own)}): {key}" if own else key
