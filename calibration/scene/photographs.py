@@ -13,8 +13,9 @@ from jaxtyping import Bool
 
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
-from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, size_fault
+from rig.formats.capture_folder import capture_root, size_fault
 from rig.formats.images import decode_image_file, is_picture
+from rig.formats.shot_files import BESIDE_PICTURES, find_files
 from rig.rig import Rig
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
@@ -67,21 +68,19 @@ def find_photographs(folder: Path) -> Photographs:
 def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
     """The masks (True = subject) that lie beside one shot's photographs, in masks/. Raises InputError for one that is
     damaged or of another size."""
-    inside = capture_root(folder) / "masks"
-    if photographs.shots != (ONE_SHOT,) or not inside.is_dir():
+    root = capture_root(folder)
+    if photographs.shots != (ONE_SHOT,) or not (root / "masks").is_dir():
         return {}
     masks, faults = {}, []
-    for path in _pictures(inside):
-        if path.stem not in rig:
-            continue
+    for name, path in find_files(root, rig, [name for name in photographs.names if name not in rig]).masks.items():
         pixels, _, fault = decode_image_file(path, f"masks/{path.name}", "mask")
-        k = rig[path.stem].intrinsics
+        k = rig[name].intrinsics
         if pixels is None:
             faults.append(fault)
         elif pixels.shape != (k.height, k.width):
             faults.append(size_fault(f"masks/{path.name}", (pixels.shape[1], pixels.shape[0]), k))
         else:
-            masks[path.stem] = pixels > 0
+            masks[name] = pixels > 0
     if faults:
         raise InputError(folder.name, faults)
     return masks

@@ -1,24 +1,21 @@
 """One synchronised shot of every camera, and the folder that holds it.
 
 cameras.json                       (or a COLMAP, caliscope or aniposelib file: rig.formats.cameras_file)
-images/<camera>.png|jpg|jpeg|tif|webp, RAW, DNG or HEIC
+images/<camera>.png|jpg|jpeg|tif|webp|bmp|ppm|pgm, RAW, DNG or HEIC
 background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
 features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
 
 Without background/ and masks/ altogether the subject is found from the photographs. Without images/ the pictures lie
-beside cameras.json; a folder of a camera's name may hold its one picture, whatever that is called; and so may a picture
-be called whose EXIF has the serial number of a camera (``rig.formats.serials``), or that differs in case alone.
+beside cameras.json. Which file is whose, where names differ, is found in ``rig.formats.shot_files``.
 """
 
 import hashlib
 import json
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -26,19 +23,25 @@ from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture, Features, Remark
 from rig.errors import InputError
-from rig.formats.cameras_file import NO_RIG, read_rig_file, rig_file_parts, rig_files
+from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import decode_image_file, is_picture, picture_size, write_image
-from rig.formats.serials import pictures_by_serial
-from rig.formats.unread_keys import unread_keys
+from rig.formats.images import decode_image_file, picture_size, write_image
+from rig.formats.picture_names import is_junk
+from rig.formats.reading import CamerasRead, say_once
+from rig.formats.shot_files import (
+    BESIDE_PICTURES,
+    ShotFiles,
+    find_files,
+    listed_pictures,
+    stray_sentence,
+)
 from rig.formats.work_size import at_share, work_features, work_rig, work_share
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.text import suggest
 
-PLATES_MOST = 32  # clean plates read per camera
-BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
+ENCLOSING_MOST = 3  # folders around a capture: of the archive, and of who packed a folder twice
 ALIKE_LEAST = 0.75  # of the names of two folders: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 
 
@@ -52,27 +55,47 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     if not rigs:
         raise InputError(folder.name, [NO_RIG])
     rig_file = rigs[0]
-    try:
-        rig = read_rig_file(rig_file)
-    except InputError as error:
-        raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+    read = read_rig_of(rig_file)
+    rig = read.rig
     check_folders(folder, rig)
     faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
-    capture = read_shot(folder, rig, faults, by_other_names(folder, rig, faults), pixels_most=pixels_most)
+    files = find_files(folder, rig, read.left_out)
+    faults += files.faults
+    capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most)
     if faults:
-        raise InputError("capture", faults)
+        raise InputError("capture", say_once(faults, rig.names))
     digests = dict(capture.digests)
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
-    remarks = [Remark("unknown-key", told) for told in unread_keys(rig_file)]
-    remarks += _unread_files(folder, rigs)
+    remarks = [*read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
     return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
 
 
-def _unread_files(folder: Path, rigs: Sequence[Path]) -> list[Remark]:
+def read_rig_of(rig_file: Path) -> CamerasRead:
+    """``read_cameras`` of a capture's file. Raises InputError whose faults name the file."""
+    try:
+        return read_cameras(rig_file)
+    except InputError as error:
+        raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+
+
+def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Remark]:
+    """Pictures that belong to no camera, and folders of pictures that are nobody's."""
+    told = [stray_sentence(files.strays, rig)] if files.strays else []
+    known = ("images", *BESIDE_PICTURES, *rig.names)
+    for path in sorted(folder.iterdir()):
+        is_other = path.is_dir() and path.name not in known and not is_junk(path.name)
+        used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
+        if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
+            told.append(f"{path.name}/ is not read: pictures lie in images/, masks/ and background/")
+    return [Remark("file-unread", message) for message in told]
+
+
+def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Remark]:
     """Cameras of another program, and a length for cameras that are known: files that do nothing here."""
     read, *others = (path.relative_to(folder).as_posix() for path in rigs)
+    others += _other_models(folder, rigs[0])
     told = [f"{other} is not read: the cameras come from {read}" for other in others]
     if (folder / "scale.json").is_file() and not (folder / "calibration.json").is_file():  # whose cameras it scaled
         told.append(
@@ -82,38 +105,29 @@ def _unread_files(folder: Path, rigs: Sequence[Path]) -> list[Remark]:
     return [Remark("file-unread", message) for message in told]
 
 
+def _other_models(folder: Path, rig_file: Path) -> list[str]:
+    """COLMAP models beside the one that is read: the same in another encoding, and cameras that joined no other."""
+    if rig_file.suffix not in (".bin", ".txt"):
+        return []
+    twin = rig_file.with_suffix(".txt" if rig_file.suffix == ".bin" else ".bin")
+    sparse = sorted((folder / "sparse").glob("*/cameras.*")) if (folder / "sparse").is_dir() else []
+    found = [twin] if twin.is_file() else []
+    found += [path for path in sparse if path.suffix in (".bin", ".txt") and path.parent != rig_file.parent]
+    return [path.relative_to(folder).as_posix() for path in found]
+
+
 def capture_root(folder: Path) -> Path:
-    """``folder``, or the single folder in it: an archive may hold one enclosing folder."""
+    """``folder``, or the single folder in it, and in that: an archive may hold enclosing folders."""
     if not folder.is_dir():
         raise InputError(str(folder.name or folder), ["is no folder; give the capture folder that holds cameras.json"])
-    entries = [entry for entry in folder.iterdir() if not entry.name.startswith((".", "__MACOSX"))]
-    return entries[0] if len(entries) == 1 and entries[0].is_dir() and entries[0].name != "sparse" else folder
-
-
-def by_other_names(folder: Path, rig: Rig, faults: list[str]) -> dict[str, dict[str, Path]]:
-    """Pictures, plates and masks that are not called exactly as their camera, by kind and camera: the case differs, the
-    camera's name in the rig's file ends like a picture's, or EXIF has the serial number of the camera's body."""
-    found: dict[str, dict[str, Path]] = {}
-    for kind, inner in (("images", picture_folder(folder)), *((kind, folder / kind) for kind in BESIDE_PICTURES)):
-        if inner.is_dir():
-            found[kind] = _by_spelling(inner, rig)
-            if not found[kind] and kind != "masks":
-                found[kind] = pictures_by_serial(inner, rig, faults)
-    return found
-
-
-def _by_spelling(folder: Path, rig: Rig) -> dict[str, Path]:
-    """Pictures whose name is that of one camera alone but for case, or an ending that the camera's name has, too."""
-    pictures = listed_pictures(folder)
-    exact = {path.stem for path in pictures}
-    cameras = Counter(name.casefold() for name in rig.names)
-    lacking = {name.casefold(): name for name in rig.names if name not in exact and cameras[name.casefold()] == 1}
-    fitting: dict[str, list[Path]] = {}
-    for path in pictures:
-        keys = [key for key in (path.stem.casefold(), path.name.casefold()) if key in lacking]
-        if path.stem not in rig and keys:
-            fitting.setdefault(lacking[keys[0]], []).append(path)
-    return {name: paths[0] for name, paths in fitting.items() if len(paths) == 1}
+    for _ in range(ENCLOSING_MOST):
+        entries = [entry for entry in folder.iterdir() if not is_junk(entry.name)]
+        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name == "sparse":
+            break
+        folder = entries[0]
+        if folder.name in ("images", *BESIDE_PICTURES):
+            break
+    return folder
 
 
 def check_folders(folder: Path, rig: Rig) -> None:
@@ -132,39 +146,14 @@ def check_folders(folder: Path, rig: Rig) -> None:
 
 
 def read_shot(
-    folder: Path,
-    rig: Rig,
-    faults: list[str],
-    filed: Mapping[str, Mapping[str, Path]] = MappingProxyType({}),
-    *,
-    pixels_most: int | None = None,
+    folder: Path, rig: Rig, faults: list[str], files: ShotFiles | None = None, *, pixels_most: int | None = None
 ) -> Capture:
-    """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``. ``filed``:
-    files that do not have their camera's name, as ``by_other_names`` finds them."""
-    jobs: list[tuple[str, str, Path]] = []
-    pictureless: list[str] = []
-    plateless: list[str] = []
-    pictures, alone = picture_folder(folder), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
-    for camera in rig:
-        image = _image_file(pictures, camera.name, faults) or _only_picture(pictures / camera.name, faults)
-        image = image or filed.get("images", {}).get(camera.name)
-        mask = _image_file(folder / "masks", camera.name, faults) or filed.get("masks", {}).get(camera.name)
-        plates = _plate_files(folder / "background", camera.name, faults)
-        plates = plates or [path for name, path in filed.get("background", {}).items() if name == camera.name]
-        if image is None:
-            pictureless.append(
-                f"{_inside(folder, pictures)}{camera.name}.png is missing (or .jpg, .tif, .webp, RAW, HEIC)"
-            )
-        if not plates and mask is None and not alone:
-            plateless.append(
-                f"background/{camera.name}.png is missing: a clean plate, or masks/{camera.name}.png, is needed"
-            )
-        found = [("images", image), ("masks", mask), *(("background", plate) for plate in plates)]
-        jobs += [(kind, camera.name, path) for kind, path in found if path is not None]
-    for lacking, place in ((pictureless, pictures), (plateless, folder / "background")):
-        strangers = [path.name for path in listed_pictures(place)] if len(lacking) == len(rig) > 1 else []
-        alike = len(strangers) < max(len(lacking), 2)
-        faults += lacking if alike else [_no_name_alike(rig, _inside(folder, place), strangers)]
+    """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``, but those
+    of ``files``, which were found before."""
+    if files is None:
+        files = find_files(folder, rig)
+        faults += files.faults
+    jobs = [(kind, camera.name, path) for camera in rig for kind, path in files.of_camera(camera.name)]
     with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
         decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig, pixels_most=pixels_most), jobs))
     images: dict[str, np.ndarray] = {}
@@ -189,31 +178,6 @@ def read_shot(
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
         features = work_features(features, rig, work_rig(rig, pixels_most))
     return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
-
-
-def _no_name_alike(rig: Rig, place: str, strangers: Sequence[str]) -> str:
-    """One cause, said once."""
-    cameras, found = f"{rig.names[0]} to {rig.names[-1]}", f"{strangers[0]} to {strangers[-1]}"
-    where = place or "the folder"
-    return f"no camera has a picture in {where}: the cameras are called {cameras}, the pictures {found}; rename either"
-
-
-def picture_folder(folder: Path) -> Path:
-    """Where a capture folder's photographs lie."""
-    return folder / "images" if (folder / "images").is_dir() else folder
-
-
-def _inside(folder: Path, pictures: Path) -> str:
-    return "" if pictures == folder else f"{pictures.name}/"
-
-
-def _only_picture(folder: Path, faults: list[str]) -> Path | None:
-    """The picture in a camera's own folder."""
-    found = listed_pictures(folder)
-    if len(found) > 1:
-        told = f"{folder.name}/ holds {len(found)} pictures; a capture is one shot: leave one of them"
-        faults.append(f"{told}, and give all to calibrate --from scene")
-    return found[0] if found else None
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
@@ -285,30 +249,3 @@ def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> str:
             f"{fault}, and the shape is the same: give it in the size that was calibrated, or calibrate with this one"
         )
     return fault
-
-
-def stray_faults(folder: Path, rig: Rig) -> list[str]:
-    """Pictures, masks and clean plates that belong to no camera of the rig, whose cameras the first names."""
-    files = [path for kind in ("images", "masks", "background") for path in listed_pictures(folder / kind)]
-    strays = [path.relative_to(folder).as_posix() for path in files if path.stem not in rig]
-    told = [f"{name} has no camera" for name in strays]
-    return [f"{strays[0]} has no camera: the rig has {', '.join(rig.names)}", *told[1:]] if told else []
-
-
-def _image_file(folder: Path, stem: str, faults: list[str]) -> Path | None:
-    found = [path for path in listed_pictures(folder) if path.stem == stem]
-    if len(found) > 1:
-        faults.append(f"{folder.name}/ holds {' and '.join(path.name for path in found)}: which one is meant?")
-    return found[0] if found else None
-
-
-def _plate_files(folder: Path, stem: str, faults: list[str]) -> list[Path]:
-    single = _image_file(folder, stem, faults)
-    return [*([single] if single is not None else []), *listed_pictures(folder / stem)][:PLATES_MOST]
-
-
-def listed_pictures(folder: Path) -> list[Path]:
-    """The pictures in a folder; none where there is no such folder."""
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if is_picture(path))

@@ -1,6 +1,7 @@
 """What a reader of another program's cameras finds on its way: faults, unused keys, cameras that take no part."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -11,6 +12,7 @@ from rig.formats.foreign_keys import ForeignKey, Table, says_nothing
 from rig.rig import Rig
 
 NAMED_MOST = 4  # cameras or keys that one sentence names
+SAME_LEAST = 3  # faults that differ in names alone, from which on they are one cause
 VALUE_MOST = 40  # characters of a value
 
 
@@ -61,12 +63,14 @@ class Reading:
             what = "key is" if len(self._unknown) == 1 else "keys are"
             told.append(Remark("unknown-key", f"{self.subject}: the {what} not known and not read: {keys}"))
         told += [Remark("view-left-out", sentence) for sentence in self._left_out()]
+        names = [str(entry.get("name")) for entry in entries]
         try:
             rig = rig_from_document({"format": FORMAT, "unit": "mm", "cameras": list(entries)}, self.subject)
         except InputError as error:
-            raise InputError(self.subject, [*self.faults, *error.faults, *self._left_out()]) from None
+            faults = [*self.faults, *error.faults]
+            raise InputError(self.subject, [*say_once(faults, names), *self._left_out()]) from None
         if self.faults:
-            raise InputError(self.subject, self.faults)
+            raise InputError(self.subject, say_once(self.faults, names))
         return CamerasRead(rig, tuple(told), MappingProxyType(dict(self.left_out)))
 
     def _left_out(self) -> list[str]:
@@ -74,6 +78,26 @@ class Reading:
         for name, why in self.left_out.items():
             reasons.setdefault(why, []).append(name)
         return [f"{listed(names)} {why} in {self.subject}: taking no part" for why, names in reasons.items()]
+
+
+def say_once(faults: Sequence[str], names: Iterable[str]) -> list[str]:
+    """Faults that differ only in the names of cameras and of their files, as one sentence that names the first and how
+    many others there are."""
+    ordered = sorted(set(names), key=len, reverse=True)
+    name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
+    plate = re.compile(r"\b(background/)\S+")
+    groups: dict[str, list[str]] = {}
+    for fault in faults:
+        masked = plate.sub(r"\1", fault)
+        groups.setdefault(masked if name is None else name.sub("\0", masked), []).append(fault)
+    told = []
+    for group in groups.values():
+        if len(group) < SAME_LEAST or name is None:
+            told += group
+            continue
+        others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault)))
+        told.append(f"{group[0]}; the same is true of {len(group) - 1} more files ({listed([*others])})")
+    return told
 
 
 def listed(names: Sequence[str], most: int = NAMED_MOST) -> str:

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from rig.errors import InputError
 from rig.formats.cameras_json import name_fault
-from rig.formats.capture_folder import PLATES_MOST
+from rig.formats.shot_files import PLATES_MOST
 from rig.text import suggest
 
 FORMAT = "eigenhead-rig/1"

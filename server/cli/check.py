@@ -5,24 +5,22 @@ pictures of no camera, which a reconstruction passes over; where they are in ord
 pictures and cameras (``pipeline.silhouettes.usable_views``). What is wrong with this machine is no fault of the capture
 and is raised."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypedDict
 
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError, WrongVariable
-from rig.formats.cameras_file import find_rig_file, read_rig_file
-from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, listed_pictures, read_capture, stray_faults
+from rig.formats.cameras_file import read_cameras, rig_files
+from rig.formats.capture_folder import capture_root, read_capture, unread_files, unread_pictures
 from rig.formats.images import decode_image_file
+from rig.formats.shot_files import BESIDE_PICTURES, find_files, listed_pictures
 from rig.formats.work_size import WORK_PIXELS
 from rig.progress import Progress
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
 from server.tasks.child import WorkFailed
-from server.tasks.ingest import check_capture, filed_by_other_names
+from server.tasks.ingest import check_capture
 from server.tasks.photographs import SCALE, photographs_alone
 from server.tasks.prepare import prepare_kernels
 
@@ -62,13 +60,13 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
                 found["cameras"], found["will"] = _told_by_photographs(folder, report)
                 _check_front(chosen.front, found["cameras"])
                 return found
-            with _named_by_camera(capture_root(folder)) as named:
-                found["warnings"] = _told_by_strays(named)
-                content = check_capture(named, service_settings().image_pixels, report, strays_pass=True)
+            found["warnings"] = _told_by_files(capture_root(folder))
+            content = check_capture(capture_root(folder), service_settings().image_pixels, report, strays_pass=True)
             found["cameras"] = [camera.name for camera in content.cameras]
             _check_front(chosen.front, found["cameras"])
             found["front"] = chosen.front or content.front
-            found["warnings"] += _told_by_outlines(folder, chosen, report)
+            seen = _told_by_outlines(folder, chosen, report)
+            found["warnings"] += [warned for warned in seen if warned not in found["warnings"]]
     except (WrongVariable, WorkFailed):
         raise
     except InputError as error:
@@ -78,39 +76,24 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     return found
 
 
-@contextmanager
-def _named_by_camera(root: Path) -> Iterator[Path]:
-    """The folder, or links to its files under the names of the cameras that took them. Raises InputError."""
-    filed = filed_by_other_names(root)
-    names = {path: name for files in filed.values() for name, path in files.items()}
-    if not names:
-        yield root
-        return
-    with TemporaryDirectory() as scratch:
-        for path in (path for path in root.rglob("*") if path.is_file()):
-            link = Path(scratch) / path.relative_to(root)
-            link = link.with_name(names[path] + path.suffix) if path in names else link
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(path.resolve())
-        yield Path(scratch)
-
-
 def _check_front(front: str | None, cameras: list[str]) -> None:
     if front is not None and front not in cameras:
         raise InputError("front", [f"front camera {front!r:.80} is none of the capture's ({', '.join(cameras)})"])
 
 
-def _told_by_strays(root: Path) -> list[Warned]:
-    """Pictures of no camera; none where the cameras cannot be read, which ``check_capture`` tells."""
-    rig_file = find_rig_file(root)
-    if rig_file is None:
-        return []
+def _told_by_files(root: Path) -> list[Warned]:
+    """What the reader of a capture folder notices and does not mind; nothing where its cameras cannot be read, which
+    ``check_capture`` tells."""
+    rigs = [*rig_files(root)]
     try:
-        strays = stray_faults(root, read_rig_file(rig_file))
+        read = read_cameras(rigs[0]) if rigs else None
     except InputError:
         return []
-    passed = "a reconstruction from here passes it over, the service refuses it"
-    return [Warned(code="picture-unread", message=f"{stray}; {passed}") for stray in strays]
+    if read is None:
+        return []
+    files = find_files(root, read.rig, read.left_out)
+    remarks = [*read.remarks, *unread_files(root, rigs), *unread_pictures(root, files, read.rig)]
+    return [Warned(code=remark.code, message=remark.message) for remark in remarks]
 
 
 def _told_by_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:

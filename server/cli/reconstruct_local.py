@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 from rig.errors import InputError
 from rig.formats.archive import extract_archive
-from rig.formats.capture_folder import BESIDE_PICTURES, capture_root, picture_folder
+from rig.formats.capture_folder import capture_root
+from rig.formats.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
 from server.cli.answers import CannotWrite, SpoilsCapture
 from server.processes import share_one_heap

@@ -7,7 +7,6 @@ import hashlib
 import json
 import shutil
 from dataclasses import replace
-from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -19,22 +18,14 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file, rig_file_parts
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
 from rig.formats.cameras_json import read_rig
-from rig.formats.capture_folder import (
-    BESIDE_PICTURES,
-    by_other_names,
-    capture_root,
-    check_folders,
-    listed_pictures,
-    picture_folder,
-    read_shot,
-    size_fault,
-    stray_faults,
-)
+from rig.formats.capture_folder import capture_root, check_folders, read_rig_of, read_shot, size_fault
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, picture_size
+from rig.formats.reading import say_once
 from rig.formats.rig_toml import ShotConfig
+from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
 from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
@@ -87,33 +78,40 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
 
 
 def _name_by_camera(root: Path) -> None:
-    """Gives pictures the names by which the service asks for them, images/<camera>.<ext>, wherever the archive has them
-    and those that are called otherwise and can be told. Raises InputError where that cannot be told."""
-    for files in filed_by_other_names(root).values():
-        for name, path in files.items():
-            path.rename(path.with_name(name + path.suffix.lower()))
+    """Gives files the names by which the service asks for them, images/<camera>.<ext>, masks/<camera>.<ext>,
+    background/<camera>.<ext> or background/<camera>/<anything>, wherever the archive has them and those that are called
+    otherwise and can be told. What cannot be told is left to ``check_capture``."""
+    rig_file = find_rig_file(root)
+    try:
+        read = None if rig_file is None else read_cameras(rig_file)
+    except InputError:
+        read = None
+    if read is not None:
+        files = find_files(root, read.rig, read.left_out)
+        for name in () if files.faults else read.rig.names:
+            own = files.of_camera(name)
+            several = sum(kind == "background" for kind, _ in own) > 1
+            for kind, path in own:
+                _move(path, _filed_as(root, kind, name, path, several=several))
     pictures, images = picture_folder(root), root / "images"
     images.mkdir(exist_ok=True)
-    for path in [*pictures.iterdir()]:
-        own = listed_pictures(path) if path.is_dir() and path.name not in (*BESIDE_PICTURES, "images") else []
-        if len(own) == 1 and not any(images.glob(f"{escape(path.name)}.*")):  # a camera's folder
-            own[0].rename(images / (path.name + own[0].suffix))
-        elif path.parent != images and path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
+    for path in [*pictures.iterdir()] if pictures != images else []:  # of a rig that cannot be read, and strays
+        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
             path.rename(images / path.name)
 
 
-def filed_by_other_names(root: Path) -> dict[str, dict[str, Path]]:
-    """``by_other_names`` of a capture folder; nothing where its cameras cannot be read, which ``check_capture`` tells.
-    Raises InputError."""
-    rig_file, faults = find_rig_file(root), list[str]()
-    try:
-        rig = None if rig_file is None else read_rig_file(rig_file)
-    except InputError:
-        return {}
-    found = {} if rig is None else by_other_names(root, rig, faults)
-    if faults:
-        raise InputError("capture", faults)
-    return found
+def _filed_as(root: Path, kind: str, name: str, path: Path, *, several: bool) -> Path:
+    if path.parent == root / kind and path.stem == name:
+        return path
+    if kind == "background" and (several or path.parent == root / kind / name):
+        return root / kind / name / path.name
+    return root / kind / (name + path.suffix.lower())
+
+
+def _move(path: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not target.exists():
+        path.rename(target)
 
 
 def _leave_out(root: Path, rig: Rig) -> None:
@@ -168,21 +166,21 @@ def check_capture(
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", [NO_RIG])
-    try:
-        rig = read_rig_file(rig_file)
-    except InputError as error:
-        raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+    read = read_rig_of(rig_file)
+    rig = read.rig
     check_folders(root, rig)
     faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
-    faults += [] if strays_pass else stray_faults(root, rig)
+    files = find_files(root, rig, read.left_out)
+    faults += files.faults
+    faults += [stray_sentence(files.strays, rig)] if files.strays and not strays_pass else []
     digests: dict[str, str] = {}
     empty: list[str] = []
     views: dict[str, ViewCheck] = {}
     for number, camera in enumerate(rig):
         report("check", number / len(rig))
-        of_camera = _size_faults(root, camera, image_pixels)
+        of_camera = _size_faults(root, files, camera, image_pixels)
         if not of_camera:
-            shot = read_shot(root, rig.subset([camera.name]), of_camera)
+            shot = read_shot(root, rig.subset([camera.name]), of_camera, files)
             digests |= shot.digests
             empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
             views |= _view_of(shot, camera.name, measured)
@@ -193,7 +191,7 @@ def check_capture(
     if len(empty) == len(rig):
         faults.append("every picture is its own clean plate: nobody was there, or the plates were copied; shoot again")
     if faults:
-        raise InputError("capture", faults)
+        raise InputError("capture", say_once(faults, rig.names))
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(root).as_posix()] = _sha256(path)
     return CaptureContent(
@@ -230,17 +228,17 @@ def check_features(bench: Bench, report: Progress, *, folder: str, points: Point
     faults: list[str] = []
     data = json.dumps({"format": FEATURES_FORMAT, "points": points}, indent=1).encode()
     # Points come one after the other: whether they suffice is asked when the job starts.
-    faults += unknown_landmarks(features_from_bytes(data, read_rig_file(rig_file), faults))
+    faults += unknown_landmarks(features_from_bytes(data, read_cameras(rig_file).rig, faults))
     if faults:
         raise InputError("features.json", faults)
     return data
 
 
-def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
+def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[str]:
     """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
     faults = []
     wanted = (camera.intrinsics.width, camera.intrinsics.height)
-    for path in _images_of(root, camera.name):
+    for _, path in files.of_camera(camera.name):
         name = path.relative_to(root).as_posix()
         try:
             width, height = picture_size(path)
@@ -252,13 +250,6 @@ def _size_faults(root: Path, camera: Camera, image_pixels: int) -> list[str]:
         elif (width, height) != wanted:
             faults.append(size_fault(name, (width, height), camera.intrinsics))
     return faults
-
-
-def _images_of(root: Path, camera: str) -> list[Path]:
-    folders = [picture_folder(root), root / "masks", root / "background", root / "background" / camera]
-    files = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
-    files = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
-    return [path for path in files if path.stem == camera or path.parent == folders[3]]
 
 
 def _sha256(path: Path) -> str:

@@ -25,8 +25,10 @@ from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file
 from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
-from rig.formats.capture_folder import capture_root, picture_folder, read_capture, read_shot
+from rig.formats.capture_folder import capture_root, read_capture, read_shot, unread_pictures
 from rig.formats.images import is_picture, picture_size, write_image
+from rig.formats.reading import say_once
+from rig.formats.shot_files import find_files, picture_folder
 from rig.formats.work_size import WORK_PIXELS, work_rig
 from rig.progress import Progress
 from rig.rig import Rig
@@ -59,13 +61,18 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
     Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
     if not photographs_alone(folder):
         return Prepared(*read_capture(folder, pixels_most=WORK_PIXELS), ())
+    from calibration.scene.photographs import find_photographs
+
     root = capture_root(folder)
     kept.mkdir(parents=True, exist_ok=True)
     warnings = calibrate_photographs(root, kept, front=front, report=report)
     rig, faults = read_rig(kept / CAMERAS), list[str]()
-    capture = read_shot(root, rig, faults, pixels_most=WORK_PIXELS)
+    files = find_files(root, rig, [name for name in find_photographs(root).names if name not in rig])
+    faults += files.faults
+    capture = read_shot(root, rig, faults, files, pixels_most=WORK_PIXELS)
     if faults:
-        raise InputError("capture", faults)
+        raise InputError("capture", say_once(faults, rig.names))
+    warnings += tuple(ReportWarning(remark.code, remark.message) for remark in unread_pictures(root, files, rig))
     digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
     return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
 

@@ -153,7 +153,7 @@ def feature(views: Any) -> Callable[[Path], None]:
         (remove("background/a.png"), "background/a.png is missing: a clean plate, or masks/a.png, is needed"),
         (
             damage("images/b.png", b"no picture"),
-            "images/b.png is damaged or no PNG, JPEG, TIFF, WebP, RAW or HEIC picture",
+            "images/b.png is damaged or no PNG, JPEG, TIFF, WebP, BMP, PPM, RAW or HEIC picture",
         ),
         (damage("images/b.png", png(picture())[:-40]), "images/b.png is damaged: its pixels cannot be decoded"),
         (damage("images/b.png", png(picture()[:20])), "images/b.png is 64 x 20 pixels, but its camera is 64 x 48"),

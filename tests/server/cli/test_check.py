@@ -150,11 +150,7 @@ def test_a_picture_of_no_camera_is_a_warning_as_a_reconstruction_passes_it_over(
     found = found_in(tmp_path / "shot", front="cam03")
     assert (found["faults"], found["front"]) == ([], "cam03")
     assert [(w["code"], w["message"].split(":")[0]) for w in found["warnings"]] == [
-        ("picture-unread", "images/foo.png has no camera"),
-        (
-            "picture-unread",
-            "images/goo.png has no camera; a reconstruction from here passes it over, the service refuses it",
-        ),
+        ("file-unread", "images/foo.png, images/goo.png have no camera")
     ]
 
 

@@ -1,0 +1,207 @@
+"""Which files of a capture folder are whose: each camera's picture, mask and clean plates, and those of no camera.
+
+A file belongs to the camera whose name it has. Where a camera has none of exactly that name, a name that can mean no
+other camera will do (``rig.formats.picture_names``), then the serial number of a body in EXIF
+(``rig.formats.serials``). A camera's file may also lie in a folder of the camera's name, and all
+of them in one folder more.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rig.formats.images import is_picture
+from rig.formats.picture_names import UNREAD_PICTURES, is_junk, match_names, picture_stem
+from rig.formats.reading import listed
+from rig.formats.serials import pictures_by_serial
+from rig.rig import Rig
+
+PLATES_MOST = 32  # clean plates read per camera
+BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
+READ_AS = "PNG, JPEG, TIFF, WebP, BMP or PPM"
+
+
+@dataclass(frozen=True, slots=True)
+class ShotFiles:
+    """``strays``: pictures of no camera, relative to the capture's folder; ``faults``: sentences about files that are
+    missing or cannot be told apart."""
+
+    images: Mapping[str, Path]
+    masks: Mapping[str, Path]
+    plates: Mapping[str, tuple[Path, ...]]
+    strays: tuple[str, ...]
+    faults: tuple[str, ...]
+
+    def of_camera(self, name: str) -> list[tuple[str, Path]]:
+        """Kind (the folder's name) and path of each file of a camera."""
+        found = [("images", self.images.get(name)), ("masks", self.masks.get(name))]
+        found += [("background", plate) for plate in self.plates.get(name, ())]
+        return [(kind, path) for kind, path in found if path is not None]
+
+
+def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFiles:
+    """The files of one shot. ``left_out``: cameras that take no part, whose files are nobody's and no strays."""
+    names, faults = [*rig.names, *left_out], list[str]()
+    places = {"images": picture_folder(folder), **{kind: folder / kind for kind in BESIDE_PICTURES}}
+    owned = {kind: _owned(place, names, kind, rig, faults) for kind, place in places.items()}
+    images = {name: path for name in rig.names if (path := _one(owned["images"].get(name, []), folder, faults))}
+    masks = {name: path for name in rig.names if (path := _one(owned["masks"].get(name, []), folder, faults))}
+    plates = {
+        name: tuple(listed_plates)
+        for name in rig.names
+        if (listed_plates := _flat(owned["background"].get(name, []))[:PLATES_MOST])
+    }
+    used = {path for kind in owned.values() for paths in kind.values() for path in _flat(paths)}
+    strays = {kind: _strays(place, used, names, kind) for kind, place in places.items()}
+    faults += _missing(folder, rig, images, masks, plates, places, strays)
+    if places["images"] != folder:
+        strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
+    told = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
+    return ShotFiles(images, masks, plates, tuple(told), tuple(faults))
+
+
+def picture_folder(folder: Path) -> Path:
+    """Where a capture folder's photographs lie."""
+    return folder / "images" if (folder / "images").is_dir() else folder
+
+
+def listed_pictures(folder: Path) -> list[Path]:
+    """The pictures in a folder; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if is_picture(path))
+
+
+def stray_sentence(strays: Sequence[str], rig: Rig) -> str:
+    """What is said of pictures that belong to no camera."""
+    if len(strays) == 1:
+        return f"{strays[0]} has no camera: the rig has {', '.join(rig.names)}"
+    return f"{listed(strays)} have no camera: the rig has {', '.join(rig.names)}"
+
+
+def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[str]) -> dict[str, list[Path]]:
+    """Files and folders of each camera in one of the capture's folders."""
+    if not place.is_dir():
+        return {}
+    inner = _unwrapped(place, names)
+    pictures = listed_pictures(inner)
+    beside = () if kind != "images" or inner != place or place.name == "images" else BESIDE_PICTURES
+    folders = [path for path in _folders(inner) if path.name not in beside and listed_pictures(path)]
+    found: dict[str, list[Path]] = {}
+    for path in [*pictures, *folders]:
+        own = path.stem if path in pictures and path.stem in names else path.name
+        if own in names:
+            found.setdefault(own, []).append(path)
+    paths = {path.name: path for path in [*pictures, *folders]}
+    spelled = match_names(paths, names, several=kind == "background")
+    found |= {name: [paths[file] for file in own] for name, own in spelled.items()}
+    if not spelled and kind != "masks":
+        found |= {name: [path] for name, path in pictures_by_serial(inner, rig, faults).items()}
+    return found
+
+
+def _unwrapped(place: Path, names: Sequence[str]) -> Path:
+    """The one folder in a folder without pictures, where it is no camera's: ``images/shot01/cam00.png``."""
+    folders = [path for path in _folders(place) if path.name not in (*BESIDE_PICTURES, "images")]
+    alone = len(folders) == 1 and not listed_pictures(place) and place.name in ("images", *BESIDE_PICTURES)
+    alone = alone and not match_names([folders[0].name], names) and folders[0].name not in names
+    return folders[0] if alone and len(listed_pictures(folders[0])) > 1 else place
+
+
+def _folders(place: Path) -> list[Path]:
+    return sorted(path for path in place.iterdir() if path.is_dir() and not is_junk(path.name))
+
+
+def _one(paths: Sequence[Path], root: Path, faults: list[str]) -> Path | None:
+    """A camera's one picture or mask: the file, or that in its folder."""
+    files = [path for path in paths if path.is_file()]
+    if len(files) > 1:
+        where = files[0].parent.relative_to(root).as_posix()
+        faults.append(f"{where}/ holds {' and '.join(path.name for path in files)}: which one is meant?")
+    if files:
+        return files[0]
+    inside = _flat(paths)
+    if len(inside) > 1:
+        told = f"{paths[0].name}/ holds {len(inside)} pictures; a capture is one shot: leave one of them"
+        faults.append(f"{told}, and give all to calibrate --from scene")
+    return inside[0] if inside else None
+
+
+def _flat(paths: Sequence[Path]) -> list[Path]:
+    """Files, and the pictures in folders."""
+    return [path for own in paths for path in (listed_pictures(own) if own.is_dir() else [own])]
+
+
+def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> list[Path]:
+    """Pictures, and what pictures of other kinds there are, in a folder of the capture that no camera has."""
+    if not place.is_dir():
+        return []
+    is_root = kind == "images" and place.name != "images"
+    folders = [place, *(path for path in _folders(place) if not is_root or path.name in names)]
+    here = [path for folder in folders for path in sorted(folder.iterdir()) if _shows_something(path)]
+    return [path for path in here if path not in used and not (is_root and path.suffix.lower() in (".pdf", ".npy"))]
+
+
+def _shows_something(path: Path) -> bool:
+    return is_picture(path) or (path.suffix.lower() in UNREAD_PICTURES and not is_junk(path.name) and path.is_file())
+
+
+def _missing(
+    folder: Path,
+    rig: Rig,
+    images: Mapping[str, Path],
+    masks: Mapping[str, Path],
+    plates: Mapping[str, tuple[Path, ...]],
+    places: Mapping[str, Path],
+    strays: Mapping[str, Sequence[Path]],
+) -> list[str]:
+    """What cameras lack; where no camera has a picture of its name and there are others, that is one cause."""
+    inside = "" if places["images"] == folder else "images/"
+    faults, alone = [], not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
+    lacking = [name for name in rig.names if name not in images]
+    if cause := _cause(rig, lacking, strays["images"], inside or "the folder", "picture"):
+        faults.append(cause)
+    else:
+        for name in lacking:
+            other = _of_other_kind(name, strays["images"])
+            if other is not None:
+                where = other.relative_to(folder).as_posix()
+                kind = UNREAD_PICTURES[other.suffix.lower()]
+                faults.append(f"{where} is not read: of {kind} files nothing is; save it as {READ_AS}")
+            else:
+                faults.append(f"{inside}{name}.png is missing (or .jpg, .tif, .webp, .bmp, RAW, HEIC)")
+    lacking = [] if alone else [name for name in rig.names if name not in plates and name not in masks]
+    cause = _cause(rig, lacking, strays["masks"], "masks/", "mask")
+    cause = cause or _cause(rig, lacking, strays["background"], "background/", "clean plate")
+    wanted = "is missing: a clean plate, or"
+    faults += [cause] if cause else [f"background/{name}.png {wanted} masks/{name}.png, is needed" for name in lacking]
+    return faults
+
+
+def _of_other_kind(name: str, strays: Sequence[Path]) -> Path | None:
+    return next((p for p in strays if picture_stem(p.name) == name and p.suffix.lower() in UNREAD_PICTURES), None)
+
+
+def _cause(rig: Rig, lacking: Sequence[str], strays: Sequence[Path], place: str, what: str) -> str | None:
+    """One sentence, where all cameras lack a file and as many others are there."""
+    strangers = [path for path in strays if is_picture(path)]
+    if not len(lacking) == len(rig) > 1 or len(strangers) < max(len(lacking), 2):
+        return None
+    cameras = f"{rig.names[0]} to {rig.names[-1]}"
+    parents = sorted({path.parent.name for path in strangers})
+    if len(parents) > 1 and len({path.name for path in strangers}) < len(strangers):
+        told = f"no camera has a {what} in {place}: it holds the folders {listed(parents)}, and the cameras are called"
+        return f"{told} {cameras}; a capture is one shot: leave the files of one of them in {place}"
+    found = f"{strangers[0].name} to {strangers[-1].name}"
+    doubt = _doubt(strangers, rig)
+    told = f"no camera has a {what} in {place}: the cameras are called {cameras}, the {what}s {found}"
+    return f"{told}; {doubt or 'rename either'}"
+
+
+def _doubt(strangers: Sequence[Path], rig: Rig) -> str | None:
+    """Why names that do hold the cameras' cannot be told: there are several of each."""
+    several = match_names([path.name for path in strangers], rig.names, several=True)
+    if len(several) < len(rig) or all(len(own) == 1 for own in several.values()):
+        return None
+    own = several[rig.names[0]]
+    return f"{rig.names[0]} has {len(own)} ({listed(own, 2)}): a capture is one shot, leave one of each camera"
