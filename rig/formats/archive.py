@@ -2,11 +2,18 @@
 
 An archive comes from a stranger. Nothing in it is believed: members are listed and judged by name and kind before the
 first byte is written, bytes are counted as they come out, and a refusal leaves the folder as it was. Every fault is
-named with the member that has it. Sources of the attacks: https://www.bamsoftware.com/hacks/zipbomb (overlapping
-members), CVE-2007-4559 (traversal and links in tar), https://www.unicode.org/reports/tr39 (confusable names).
+named with the member that has it.
+
+Names are UTF-8 where their bytes are, whatever the archive says: macOS writes them so without the flag that tells it.
+Bytes that are not are read as code page 437, the format's own. What nobody keeps, the folders around the capture and
+what file managers add, may have any name that can be written.
+
+Sources of the attacks: https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal and
+links in tar), https://www.unicode.org/reports/tr39 (confusable names).
 """
 
 import errno
+import gzip
 import os
 import re
 import stat
@@ -15,20 +22,34 @@ import tarfile
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BufferedIOBase
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path, PurePosixPath
 
 from rig.errors import InputError
+from rig.formats.picture_names import JUNK
 
 COPY_BYTES = 1 << 20
+UTF8_FLAG, UNICODE_PATH, DOS = 0x800, 0x7075, 0  # of zip: names are UTF-8; Info-ZIP's field; the system of MS-DOS
 FAULTS_MOST = 100  # named one by one; the rest are counted
+SAME_LEAST = 3  # members with the same fault, from which on it is said once
+COMPONENT_BYTES_MOST = 255  # of a file's or folder's name, on every usual file system
+ENCODED = "has letters in an encoding that the archive does not tell: pack it with names in UTF-8, or rename it"
+FOREIGN_KINDS = {
+    b"7z\xbc\xaf\x27\x1c": "7-Zip",
+    b"Rar!\x1a\x07": "RAR",
+    b"BZh": "bzip2",
+    b"\xfd7zXZ\x00": "xz",
+    b"\x28\xb5\x2f\xfd": "Zstandard",
+    b"\x1f\x9d": "compress",
+}
 HEADER_BYTES_MOST = 1 << 16  # a tar header's long name or pax records
 DIRECTORY_BYTES_MOST = 4 << 20  # a zip's list of members: 5000 of them with long names
-JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")  # what file managers add; never written
+
+DROPPED = frozenset(name.casefold() for name in JUNK)  # never written
 SCRIPTS = ("LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE", "COPTIC")  # alphabets whose letters look alike
 WINDOWS_NAMES = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
 
@@ -48,10 +69,38 @@ class ArchiveLimits:
 
 @dataclass(frozen=True, slots=True)
 class _Member:
+    """``guessed``: whether nothing tells the encoding of the name."""
+
     name: str
     size: int
     kind: str  # "file", "folder", or what is wrong with it
     open: Callable[[], BufferedIOBase] | None = None
+    guessed: bool = False
+
+    @property
+    def shown(self) -> str:
+        """The name as messages have it; what may be garbled is not shown."""
+        text = re.sub(r"[^\x00-\x7f]", "?", self.name) if self.guessed else self.name
+        return f"{text!r:.120}"
+
+
+@dataclass(slots=True)
+class _Faults:
+    """What is wrong with members, said once of all that have the same."""
+
+    by_text: dict[str, list[str]] = field(default_factory=dict)
+
+    def add(self, shown: str, text: str) -> None:
+        self.by_text.setdefault(text, []).append(shown)
+
+    def sentences(self) -> list[str]:
+        told: list[str] = []
+        for text, members in self.by_text.items():
+            if len(members) < SAME_LEAST:
+                told += [f"{shown} {text}".strip() for shown in members]
+            else:
+                told.append(f"{members[0]} {text} (and {len(members) - 1} more members)")
+        return _first(told)
 
 
 def is_archive(path: Path) -> bool:
@@ -90,7 +139,31 @@ def _format(path: Path) -> str | None:
         return "zip"
     if head.startswith(b"\x1f\x8b"):
         return "tar.gz"
-    return "tar" if head[257:262] == b"ustar" else None
+    return "tar" if head[257:262] == b"ustar" or _is_old_header(head) else None
+
+
+def _is_old_header(head: bytes) -> bool:
+    """Whether a tar of before POSIX begins so: it has no sign but the sum over its first member's header."""
+    if len(head) < tarfile.BLOCKSIZE or not head[0]:
+        return False
+    try:
+        return tarfile.nti(head[148:156]) in tarfile.calc_chksums(head)  # type: ignore[attr-defined]
+    except tarfile.HeaderError:
+        return False
+
+
+def _foreign_kind(path: Path) -> str | None:
+    with path.open("rb") as stream:
+        head = stream.read(8)
+    return next((kind for sign, kind in FOREIGN_KINDS.items() if head.startswith(sign)), None)
+
+
+def _decoded_name(raw: bytes) -> tuple[str, bool]:
+    """A name, and whether its encoding is a guess."""
+    try:
+        return raw.decode("utf-8"), False
+    except UnicodeDecodeError:
+        return raw.decode("cp437"), True
 
 
 @contextmanager
@@ -98,14 +171,23 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
     """The members of an archive; every way a damaged one can fail becomes an InputError."""
     kind = _format(path)
     if kind is None:
-        raise InputError("archive", ["is damaged or no .zip, .tar or .tar.gz (told by its first bytes)"])
+        foreign = _foreign_kind(path)
+        told = f"is packed by {foreign}, which is not read: pack the folder as .zip, .tar or .tar.gz"
+        plain = "is damaged or no .zip, .tar or .tar.gz (told by its first bytes)"
+        raise InputError("archive", [told if foreign else plain])
     try:
         if kind == "zip":
             _check_directory_size(path)
             with zipfile.ZipFile(path) as archive:
                 yield _zip_members(archive)
         else:
-            with tarfile.open(path, "r|gz" if kind == "tar.gz" else "r|", tarinfo=_TarInfo) as archive:
+            # tarfile's own way with gzip ends at the first of several members, as pigz and bgzip write them.
+            with (
+                gzip.open(path) if kind == "tar.gz" else path.open("rb") as stream,
+                tarfile.open(
+                    fileobj=stream, mode="r|", tarinfo=_TarInfo, encoding="utf-8", errors="surrogateescape"
+                ) as archive,
+            ):
                 yield _tar_members(archive)
     except InputError:
         raise
@@ -148,23 +230,53 @@ def _check_directory_size(path: Path) -> None:
 
 def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
     infos = archive.infolist()
-    starts = sorted((info.header_offset, info.compress_size, info.filename) for info in infos)
-    faults = [
-        f"{name!r:.120} overlaps the next member: a zip bomb"
-        for (offset, size, name), following in pairwise(starts)
-        if offset + 30 + size > following[0]
-    ]
-    for info in infos:
+    windows = not any("/" in info.orig_filename for info in infos)
+    members = [_zip_member(archive, info, windows=windows) for info in infos]
+    starts = sorted(
+        (info.header_offset, info.compress_size, member.shown) for info, member in zip(infos, members, strict=True)
+    )
+    faults = _Faults()
+    for (offset, size, shown), following in pairwise(starts):
+        if offset + 30 + size > following[0]:
+            faults.add(shown, "overlaps the next member: a zip bomb")
+    for info, member in zip(infos, members, strict=True):
         if info.flag_bits & 0x1:
-            faults.append(f"{info.filename!r:.120} is encrypted")
+            faults.add(member.shown, "is encrypted")
         elif info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
-            faults.append(f"{info.filename!r:.120} is packed with method {info.compress_type}, which is not supported")
-    if faults:
-        raise InputError("archive", _first(faults))
-    return [
-        _Member(info.orig_filename, info.file_size, _zip_kind(info), lambda info=info: _buffered(archive.open(info)))
-        for info in infos
-    ]
+            faults.add(member.shown, f"is packed with method {info.compress_type}, which is not supported")
+    if faults.by_text:
+        raise InputError("archive", faults.sentences())
+    return members
+
+
+def _zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, *, windows: bool) -> _Member:
+    """``windows``: whether no name in the archive has a slash, so that backslashes of DOS's and .NET's are slashes."""
+    name, guessed = info.orig_filename, False
+    if not info.flag_bits & UTF8_FLAG:
+        raw = name.encode("cp437")  # as zipfile decoded it
+        name, guessed = _decoded_name(_unicode_path(info.extra, raw) or raw)
+    kind = _zip_kind(info)
+    if windows and info.create_system == DOS and "\\" in name:
+        name = name.replace("\\", "/")
+        kind = "folder" if kind == "file" and name.endswith("/") and not info.file_size else kind
+    return _Member(name, info.file_size, kind, lambda: _buffered(archive.open(info)), guessed)
+
+
+def _unicode_path(extra: bytes, raw: bytes) -> bytes | None:
+    """The name in UTF-8 that Info-ZIP writes beside one in another encoding, where it belongs to ``raw``."""
+    at = 0
+    while at + 4 <= len(extra):
+        kind, size = struct.unpack_from("<HH", extra, at)
+        data = extra[at + 4 : at + 4 + size]
+        if (
+            kind == UNICODE_PATH
+            and len(data) > 5
+            and data[0] == 1
+            and data[1:5] == zlib.crc32(raw).to_bytes(4, "little")
+        ):
+            return data[5:]
+        at += 4 + size
+    return None
 
 
 def _zip_kind(info: zipfile.ZipInfo) -> str:
@@ -188,7 +300,8 @@ def _tar_members(archive: tarfile.TarFile) -> Iterator[_Member]:
             kind = "file"
         else:
             kind = "is a sparse file" if info.issparse() else "is a device or pipe"
-        yield _Member(info.name, info.size, kind, lambda info=info: _buffered(archive.extractfile(info)))
+        name, guessed = _decoded_name(info.name.encode("utf-8", "surrogateescape"))
+        yield _Member(name, info.size, kind, lambda info=info: _buffered(archive.extractfile(info)), guessed)
 
 
 def _buffered(stream: object) -> BufferedIOBase:
@@ -197,29 +310,42 @@ def _buffered(stream: object) -> BufferedIOBase:
 
 
 def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, packed_bytes: int) -> tuple[str, ...]:
-    """Writes the files while no fault is known; after the first fault only the rest of the list is judged."""
-    faults: list[str] = []
+    """Writes the files while no fault is known; after the first fault only the rest of the list is judged. Whether a
+    name is kept is known at the end, when all files lie in one folder or do not."""
+    faults = _Faults()
     seen: dict[str, tuple[str, str]] = {}
+    odd: dict[tuple[str, ...], list[tuple[str, str]]] = {}
     written: list[str] = []
     room = min(limits.total_bytes, max(limits.ratio_floor_bytes, int(limits.ratio * packed_bytes)))
     for number, member in enumerate(members, 1):
         room -= max(0, member.size)  # to pass over a tar's member means to unpack it
         if number > limits.members or room < 0 or member.size > limits.member_bytes:
-            faults.append(_too_much(number, member, limits, packed_bytes))
+            faults.add("", _too_much(number, member, limits, packed_bytes))
             break
-        name, problems = _judge(member, seen, limits)
-        faults += problems
-        if name is not None and not faults:
-            faults += _write(member, folder / name)
+        name = _judge(member, seen, odd, faults, limits)
+        if name is not None and not faults.by_text:
+            if fault := _write(member, folder / name):
+                faults.add(member.shown, fault)
             written.append(name)
-    if not written and not faults:
-        faults.append("holds no files")
-    if faults:
-        raise InputError("archive", _first(faults))
+    around = _common_folder(written)
+    for parts, told in odd.items():
+        if parts != around[: len(parts)]:
+            for shown, text in told:
+                faults.add(shown, text)
+    if not written and not faults.by_text:
+        faults.add("", "holds no files")
+    if faults.by_text:
+        raise InputError("archive", faults.sentences())
     return tuple(written)
 
 
-def _write(member: _Member, path: Path) -> list[str]:
+def _common_folder(names: Sequence[str]) -> tuple[str, ...]:
+    """The parts of the innermost folder that holds all files."""
+    folders = [tuple(name.split("/")[:-1]) for name in names] or [()]
+    return tuple(same[0] for same in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
+
+
+def _write(member: _Member, path: Path) -> str | None:
     assert member.open is not None
     path.parent.mkdir(parents=True, exist_ok=True)
     size = 0
@@ -230,41 +356,57 @@ def _write(member: _Member, path: Path) -> list[str]:
         target.flush()
         os.fsync(target.fileno())
     if size != member.size:
-        return [f"{member.name!r:.120} does not hold the {member.size:,} bytes that its header says"]
-    return []
+        return f"does not hold the {member.size:,} bytes that its header says"
+    return None
 
 
 def _too_much(number: int, member: _Member, limits: ArchiveLimits, packed_bytes: int) -> str:
     if number > limits.members:
         return f"holds more than {limits.members} members"
     if member.size > limits.member_bytes:
-        return f"{member.name!r:.120} is {member.size:,} bytes; at most {limits.member_bytes:,} are read"
+        return f"{member.shown} is {member.size:,} bytes; at most {limits.member_bytes:,} are read"
     return (
         f"unpacks to more than is allowed: {limits.total_bytes:,} bytes, or {limits.ratio:g} times its own "
         f"{packed_bytes:,} bytes"
     )
 
 
-def _judge(member: _Member, seen: dict[str, tuple[str, str]], limits: ArchiveLimits) -> tuple[str | None, list[str]]:
-    """The relative name to write to (None: nothing to write) and what is wrong with the member."""
-    shown = f"{member.name!r:.120}"
+def _judge(
+    member: _Member,
+    seen: dict[str, tuple[str, str]],
+    odd: dict[tuple[str, ...], list[tuple[str, str]]],
+    faults: _Faults,
+    limits: ArchiveLimits,
+) -> str | None:
+    """The relative name to write to (None: nothing to write). Adds what is wrong with the member to ``faults``, and to
+    ``odd`` what is wrong with a part of its name, should that be kept."""
     if member.kind not in ("file", "folder"):
-        return None, [f"{shown} {member.kind}; only files and folders are unpacked"]
-    faults = [f"{shown} {fault}" for fault in _name_faults(member.name, limits)]
-    if faults:
-        return None, faults
+        faults.add(member.shown, f"{member.kind}; only files and folders are unpacked")
+        return None
+    if wrong := _path_faults(member.name, limits):
+        for text in wrong:
+            faults.add(member.shown, text)
+        return None
     parts = [part for part in PurePosixPath(member.name).parts if part != "."]
-    if member.kind == "folder" or not parts or any(part in JUNK or part.startswith("._") for part in parts):
-        return None, []
-    name = "/".join(parts)
+    if member.kind == "folder" or not parts or any(_is_dropped(part) for part in parts):
+        return None
+    for depth, part in enumerate(parts, 1):
+        here = tuple(parts[:depth])
+        for text in _name_faults(part, limits) if here not in odd else ():
+            odd.setdefault(here, []).append((member.shown, ENCODED if member.guessed else text))
     for depth in range(1, len(parts) + 1):
-        fault = _clash(parts[:depth], "file" if depth == len(parts) else "folder", shown, seen)
+        fault = _clash(parts[:depth], "file" if depth == len(parts) else "folder", seen)
         if fault:
-            return None, [fault]
-    return name, []
+            faults.add(member.shown, fault)
+            return None
+    return "/".join(parts)
 
 
-def _clash(parts: list[str], kind: str, shown: str, seen: dict[str, tuple[str, str]]) -> str | None:
+def _is_dropped(part: str) -> bool:
+    return part.startswith("._") or part.casefold() in DROPPED
+
+
+def _clash(parts: list[str], kind: str, seen: dict[str, tuple[str, str]]) -> str | None:
     """A name that another member has already, or that some file system or reader takes for another's."""
     name = "/".join(parts)
     key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
@@ -274,18 +416,15 @@ def _clash(parts: list[str], kind: str, shown: str, seen: dict[str, tuple[str, s
         return None
     if other == (name, "folder") and kind == "folder":
         return None
-    return (
-        f"{shown} occurs twice"
-        if other[0] == name
-        else f"{shown} is the same name as {other[0]!r:.120} in other letters"
-    )
+    return "occurs twice" if other[0] == name else f"is the same name as {other[0]!r:.120} in other letters"
 
 
-def _name_faults(name: str, limits: ArchiveLimits) -> list[str]:
-    if "\0" in name or any(unicodedata.category(c) in ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp") for c in name):
-        return ["has an invisible or control character in its name"]
+def _path_faults(name: str, limits: ArchiveLimits) -> list[str]:
+    """What no member may be called, kept or not."""
+    if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
+        return ["has an invisible or control character in its name: rename it"]
     if "\\" in name or re.match(r"^[A-Za-z]:", name):
-        return ["has a backslash or a drive letter in its name"]
+        return ["has a backslash or a drive letter in its name: rename it"]
     if name.startswith("/"):
         return ["is an absolute path"]
     parts = name.rstrip("/").split("/")
@@ -294,12 +433,22 @@ def _name_faults(name: str, limits: ArchiveLimits) -> list[str]:
     faults = []
     if len(parts) > limits.depth:
         faults.append(f"lies {len(parts)} folders deep; at most {limits.depth} are unpacked")
-    if any(len(part.encode()) > limits.name_length for part in parts):
+    if any(len(part.encode()) > COMPONENT_BYTES_MOST for part in parts):
         faults.append(f"has a name longer than {limits.name_length} bytes")
-    if any(WINDOWS_NAMES.match(part) for part in parts):
+    return faults
+
+
+def _name_faults(part: str, limits: ArchiveLimits) -> list[str]:
+    """What a file or folder that is kept may not be called."""
+    faults = []
+    if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
+        faults.append("has an invisible or control character in its name: rename it")
+    if len(part.encode()) > limits.name_length:
+        faults.append(f"has a name longer than {limits.name_length} bytes")
+    if WINDOWS_NAMES.match(part):
         faults.append("has a name that Windows reserves for a device")
-    if any(len(_scripts(part)) > 1 for part in parts):
-        faults.append("mixes letters of several alphabets in its name")
+    if any(len(_scripts(word)) > 1 for word in re.findall(r"[^\W\d_]+", part)):
+        faults.append("mixes letters of several alphabets in its name: rename it")
     return faults
 
 
