@@ -4,10 +4,6 @@ An archive comes from a stranger. Nothing in it is believed: members are listed 
 first byte is written, bytes are counted as they come out, and a refusal leaves the folder as it was. Every fault is
 named with the member that has it.
 
-Names are UTF-8 where their bytes are, whatever the archive says: macOS writes them so without the flag that tells it.
-Bytes that are not are read as code page 437, the format's own. What nobody keeps, the folders around the capture and
-what file managers add, may have any name that can be written.
-
 Sources of the attacks: https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal and
 links in tar), https://www.unicode.org/reports/tr39 (confusable names).
 """
@@ -19,7 +15,6 @@ import re
 import stat
 import struct
 import tarfile
-import unicodedata
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,14 +25,20 @@ from itertools import pairwise, takewhile
 from pathlib import Path, PurePosixPath
 
 from rig.errors import InputError
-from rig.formats.picture_names import JUNK
+from rig.formats.archive_names import (
+    ENCODED,
+    decoded_name,
+    is_dropped,
+    name_clash,
+    name_faults,
+    path_faults,
+    unicode_path,
+)
 
 COPY_BYTES = 1 << 20
-UTF8_FLAG, UNICODE_PATH, DOS = 0x800, 0x7075, 0  # of zip: names are UTF-8; Info-ZIP's field; the system of MS-DOS
+UTF8_FLAG, DOS = 0x800, 0  # of zip: names are UTF-8; the system of MS-DOS
 FAULTS_MOST = 100  # named one by one; the rest are counted
 SAME_LEAST = 3  # members with the same fault, from which on it is said once
-COMPONENT_BYTES_MOST = 255  # of a file's or folder's name, on every usual file system
-ENCODED = "has letters in an encoding that the archive does not tell: pack it with names in UTF-8, or rename it"
 FOREIGN_KINDS = {
     b"7z\xbc\xaf\x27\x1c": "7-Zip",
     b"Rar!\x1a\x07": "RAR",
@@ -48,10 +49,6 @@ FOREIGN_KINDS = {
 }
 HEADER_BYTES_MOST = 1 << 16  # a tar header's long name or pax records
 DIRECTORY_BYTES_MOST = 4 << 20  # a zip's list of members: 5000 of them with long names
-
-DROPPED = frozenset(name.casefold() for name in JUNK)  # never written
-SCRIPTS = ("LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE", "COPTIC")  # alphabets whose letters look alike
-WINDOWS_NAMES = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +83,7 @@ class _Member:
 
 @dataclass(slots=True)
 class _Faults:
-    """What is wrong with members, said once of all that have the same."""
+    """What is wrong with members, said once of all that have the same: sentences with a place for the member's name."""
 
     by_text: dict[str, list[str]] = field(default_factory=dict)
 
@@ -97,9 +94,10 @@ class _Faults:
         told: list[str] = []
         for text, members in self.by_text.items():
             if len(members) < SAME_LEAST:
-                told += [f"{shown} {text}".strip() for shown in members]
+                told += [text.replace("{}", shown, 1) for shown in members]
             else:
-                told.append(f"{members[0]} {text} (and {len(members) - 1} more members)")
+                same = f"the same is true of {len(members) - 1} more members"
+                told.append(f"{text.replace('{}', members[0], 1)}; {same}")
         return _first(told)
 
 
@@ -156,14 +154,6 @@ def _foreign_kind(path: Path) -> str | None:
     with path.open("rb") as stream:
         head = stream.read(8)
     return next((kind for sign, kind in FOREIGN_KINDS.items() if head.startswith(sign)), None)
-
-
-def _decoded_name(raw: bytes) -> tuple[str, bool]:
-    """A name, and whether its encoding is a guess."""
-    try:
-        return raw.decode("utf-8"), False
-    except UnicodeDecodeError:
-        return raw.decode("cp437"), True
 
 
 @contextmanager
@@ -238,12 +228,12 @@ def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
     faults = _Faults()
     for (offset, size, shown), following in pairwise(starts):
         if offset + 30 + size > following[0]:
-            faults.add(shown, "overlaps the next member: a zip bomb")
+            faults.add(shown, "{} overlaps the next member: a zip bomb")
     for info, member in zip(infos, members, strict=True):
         if info.flag_bits & 0x1:
-            faults.add(member.shown, "is encrypted")
+            faults.add(member.shown, "{} is encrypted")
         elif info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
-            faults.add(member.shown, f"is packed with method {info.compress_type}, which is not supported")
+            faults.add(member.shown, f"{{}} is packed with method {info.compress_type}, which is not supported")
     if faults.by_text:
         raise InputError("archive", faults.sentences())
     return members
@@ -254,29 +244,12 @@ def _zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, *, windows: boo
     name, guessed = info.orig_filename, False
     if not info.flag_bits & UTF8_FLAG:
         raw = name.encode("cp437")  # as zipfile decoded it
-        name, guessed = _decoded_name(_unicode_path(info.extra, raw) or raw)
+        name, guessed = decoded_name(unicode_path(info.extra, raw) or raw)
     kind = _zip_kind(info)
     if windows and info.create_system == DOS and "\\" in name:
         name = name.replace("\\", "/")
         kind = "folder" if kind == "file" and name.endswith("/") and not info.file_size else kind
     return _Member(name, info.file_size, kind, lambda: _buffered(archive.open(info)), guessed)
-
-
-def _unicode_path(extra: bytes, raw: bytes) -> bytes | None:
-    """The name in UTF-8 that Info-ZIP writes beside one in another encoding, where it belongs to ``raw``."""
-    at = 0
-    while at + 4 <= len(extra):
-        kind, size = struct.unpack_from("<HH", extra, at)
-        data = extra[at + 4 : at + 4 + size]
-        if (
-            kind == UNICODE_PATH
-            and len(data) > 5
-            and data[0] == 1
-            and data[1:5] == zlib.crc32(raw).to_bytes(4, "little")
-        ):
-            return data[5:]
-        at += 4 + size
-    return None
 
 
 def _zip_kind(info: zipfile.ZipInfo) -> str:
@@ -300,7 +273,7 @@ def _tar_members(archive: tarfile.TarFile) -> Iterator[_Member]:
             kind = "file"
         else:
             kind = "is a sparse file" if info.issparse() else "is a device or pipe"
-        name, guessed = _decoded_name(info.name.encode("utf-8", "surrogateescape"))
+        name, guessed = decoded_name(info.name.encode("utf-8", "surrogateescape"))
         yield _Member(name, info.size, kind, lambda info=info: _buffered(archive.extractfile(info)), guessed)
 
 
@@ -356,7 +329,7 @@ def _write(member: _Member, path: Path) -> str | None:
         target.flush()
         os.fsync(target.fileno())
     if size != member.size:
-        return f"does not hold the {member.size:,} bytes that its header says"
+        return f"{{}} does not hold the {member.size:,} bytes that its header says"
     return None
 
 
@@ -381,88 +354,25 @@ def _judge(
     """The relative name to write to (None: nothing to write). Adds what is wrong with the member to ``faults``, and to
     ``odd`` what is wrong with a part of its name, should that be kept."""
     if member.kind not in ("file", "folder"):
-        faults.add(member.shown, f"{member.kind}; only files and folders are unpacked")
+        faults.add(member.shown, f"{{}} {member.kind}; only files and folders are unpacked")
         return None
-    if wrong := _path_faults(member.name, limits):
+    if wrong := path_faults(member.name, depth=limits.depth, name_length=limits.name_length):
         for text in wrong:
             faults.add(member.shown, text)
         return None
     parts = [part for part in PurePosixPath(member.name).parts if part != "."]
-    if member.kind == "folder" or not parts or any(_is_dropped(part) for part in parts):
+    if member.kind == "folder" or not parts or any(is_dropped(part) for part in parts):
         return None
     for depth, part in enumerate(parts, 1):
         here = tuple(parts[:depth])
-        for text in _name_faults(part, limits) if here not in odd else ():
+        for text in name_faults(part, name_length=limits.name_length) if here not in odd else ():
             odd.setdefault(here, []).append((member.shown, ENCODED if member.guessed else text))
     for depth in range(1, len(parts) + 1):
-        fault = _clash(parts[:depth], "file" if depth == len(parts) else "folder", seen)
+        fault = name_clash(parts[:depth], "file" if depth == len(parts) else "folder", seen)
         if fault:
             faults.add(member.shown, fault)
             return None
     return "/".join(parts)
-
-
-def _is_dropped(part: str) -> bool:
-    return part.startswith("._") or part.casefold() in DROPPED
-
-
-def _clash(parts: list[str], kind: str, seen: dict[str, tuple[str, str]]) -> str | None:
-    """A name that another member has already, or that some file system or reader takes for another's."""
-    name = "/".join(parts)
-    key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
-    other = seen.get(key)
-    if other is None:
-        seen[key] = (name, kind)
-        return None
-    if other == (name, "folder") and kind == "folder":
-        return None
-    return "occurs twice" if other[0] == name else f"is the same name as {other[0]!r:.120} in other letters"
-
-
-def _path_faults(name: str, limits: ArchiveLimits) -> list[str]:
-    """What no member may be called, kept or not."""
-    if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
-        return ["has an invisible or control character in its name: rename it"]
-    if "\\" in name or re.match(r"^[A-Za-z]:", name):
-        return ["has a backslash or a drive letter in its name: rename it"]
-    if name.startswith("/"):
-        return ["is an absolute path"]
-    parts = name.rstrip("/").split("/")
-    if ".." in parts:
-        return ["leads out of the archive ('..')"]
-    faults = []
-    if len(parts) > limits.depth:
-        faults.append(f"lies {len(parts)} folders deep; at most {limits.depth} are unpacked")
-    if any(len(part.encode()) > COMPONENT_BYTES_MOST for part in parts):
-        faults.append(f"has a name longer than {limits.name_length} bytes")
-    return faults
-
-
-def _name_faults(part: str, limits: ArchiveLimits) -> list[str]:
-    """What a file or folder that is kept may not be called."""
-    faults = []
-    if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
-        faults.append("has an invisible or control character in its name: rename it")
-    if len(part.encode()) > limits.name_length:
-        faults.append(f"has a name longer than {limits.name_length} bytes")
-    if WINDOWS_NAMES.match(part):
-        faults.append("has a name that Windows reserves for a device")
-    if any(len(_scripts(word)) > 1 for word in re.findall(r"[^\W\d_]+", part)):
-        faults.append("mixes letters of several alphabets in its name: rename it")
-    return faults
-
-
-def _scripts(text: str) -> set[str]:
-    found = set()
-    for character in text:
-        if character.isascii():
-            if character.isalpha():
-                found.add("LATIN")
-            continue
-        words = unicodedata.name(character, "").split(" ", 1)
-        if words[0] in SCRIPTS:
-            found.add(words[0])
-    return found
 
 
 def _first(faults: list[str]) -> list[str]:

@@ -25,7 +25,7 @@ from rig.formats.work_size import at_share, halvings
 from rig.image import ImageRgb
 
 # Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.
-IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "DIB", "PPM")
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM")
 
 
 PictureKind = Literal["colour", "grey", "mask"]

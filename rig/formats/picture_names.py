@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 HEIC_SUFFIXES = (".heic", ".heif")
 # Uncompressed files of machine vision software: Windows bitmaps, and Netpbm's grey and colour maps.
-PLAIN_SUFFIXES = (".bmp", ".dib", ".pbm", ".pgm", ".ppm", ".pnm")
+PLAIN_SUFFIXES = (".bmp", ".pbm", ".pgm", ".ppm", ".pnm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES, *RAW_SUFFIXES, *HEIC_SUFFIXES)
 UNREAD_PICTURES = {
     ".gif": "GIF",
@@ -121,7 +121,7 @@ def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Fo
     """Files that name one camera alone, whatever else each says: times, exposures, counters."""
     pairs = []
     for name, words in strays.items():
-        said = [camera for camera, own in cameras.items() if _is_telling(own) and any(_places(own, words))]
+        said = [camera for camera, own in cameras.items() if _is_telling(own) and _places(own, words)]
         longest = [camera for camera in said if not any(_within(cameras[camera], cameras[other]) for other in said)]
         pairs += [(longest[0], name)] if len(longest) == 1 else []
     return _by_owner(pairs)

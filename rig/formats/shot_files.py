@@ -173,9 +173,9 @@ def _missing(
     lacking = [] if alone else [name for name in rig.names if name not in plates and name not in masks]
     cause = _cause(rig, lacking, strays["masks"], "masks/", "mask")
     cause = cause or _cause(rig, lacking, strays["background"], "background/", "clean plate")
-    wanted = "is missing: a clean plate, or"
-    faults += [cause] if cause else [f"background/{name}.png {wanted} masks/{name}.png, is needed" for name in lacking]
-    return faults
+    for name in () if cause else lacking:
+        faults.append(f"background/{name}.png is missing: a clean plate, or masks/{name}.png, is needed")
+    return [*faults, cause] if cause else faults
 
 
 def _of_other_kind(name: str, strays: Sequence[Path]) -> Path | None:

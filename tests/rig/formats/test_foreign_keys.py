@@ -20,7 +20,7 @@ from rig.formats.cameras_file import find_rig_file, read_cameras, write_rig_file
 from rig.formats.colmap import COLMAP_MODELS, REFUSED_MODELS
 from rig.formats.foreign_keys import FOREIGN_KEYS, ForeignKey, markdown_table, says_nothing
 from rig.formats.images import write_image
-from rig.formats.reading import CamerasRead, shown
+from rig.formats.reading import CamerasRead
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from tests.rig.formats.test_other_cameras import NAMES, POINTS, fan, square
@@ -339,12 +339,6 @@ def test_values_that_say_nothing(value: object) -> None:
 @pytest.mark.parametrize("value", [1, "x", [0, 1e-9], "0 0 1", True, float("nan")])
 def test_values_that_say_something(value: object) -> None:
     assert not says_nothing(value, ForeignKey("refused", "", (0,)))
-
-
-@pytest.mark.parametrize("text", ["a" * 99, "it's " * 20])
-def test_a_long_value_keeps_its_quotation_marks(text: str) -> None:
-    assert shown(text)[0] == shown(text)[-1]
-    assert len(shown(text)) <= 42
 
 
 def with_lens(rig: Rig, coefficients: tuple[float, ...]) -> Rig:

@@ -154,6 +154,44 @@ def test_whatever_is_not_zero_or_not_cut_out_is_the_subject(picture: Image.Image
     np.testing.assert_array_equal(found, half(255))
 
 
+@pytest.mark.parametrize("ending", [".bmp", ".ppm", ".pnm"])
+def test_uncompressed_pictures_come_out_as_they_are(ending: str, tmp_path: Path) -> None:
+    picture = np.random.default_rng(3).integers(0, 256, (12, 17, 3), dtype=np.uint8)
+    kept = Image.fromarray(picture)
+    kept.save(tmp_path / f"a{ending}", format="PPM" if ending == ".pnm" else None)
+    assert is_picture(tmp_path / f"a{ending}")
+    assert picture_size(tmp_path / f"a{ending}") == (17, 12)
+    assert open_picture(tmp_path / f"a{ending}").size == (17, 12)
+    np.testing.assert_array_equal(read_image(tmp_path / f"a{ending}"), picture)
+
+
+@pytest.mark.parametrize("bits", [1, 4, 7, 10, 12, 14, 16])
+def test_the_header_of_a_netpbm_map_says_which_value_is_white(bits: int, tmp_path: Path) -> None:
+    white = (1 << bits) - 1
+    grey = np.linspace(0, white, 48 * 16).round().reshape(16, 48)
+    data = grey.astype(np.uint8 if white < 256 else ">u2").tobytes()
+    (tmp_path / "a.pgm").write_bytes(b"P5 # of a machine's camera\n48 16\n%d\n" % white + data)
+    pixels = read_image(tmp_path / "a.pgm")
+    assert (pixels.min(), pixels.max()) == (0, 255)
+    # of 16 bits the lower eight are cut off, of others the nearest level is taken
+    np.testing.assert_allclose(pixels[..., 0], grey * 255 / white, atol=1.0 if bits == 16 else 0.5001)
+    found, _, fault = decode_image_file(tmp_path / "a.pgm", "a.pgm", "grey")
+    assert not fault
+    np.testing.assert_array_equal(found, pixels[..., 0])
+    masked, _, fault = decode_image_file(tmp_path / "a.pgm", "masks/a.pgm", "mask")
+    assert not fault
+    assert masked is not None
+    assert masked.dtype == np.uint8
+
+
+@pytest.mark.parametrize("header", [b"P5\n48 16\n0\n", b"P5\n48 16\n70000\n", b"P6\n48 16\n4095\n", b"P5\n48", b"BM"])
+def test_a_damaged_map_is_a_fault(header: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.ppm").write_bytes(header + bytes(20))
+    pixels, _, fault = decode_image_file(tmp_path / "a.ppm", "images/a.ppm", "colour")
+    assert pixels is None
+    assert fault.startswith("images/a.ppm is damaged")
+
+
 def test_folders_pipes_and_links_to_nothing_are_no_pictures(tmp_path: Path) -> None:
     (tmp_path / "folder.png").mkdir()
     os.mkfifo(tmp_path / "pipe.png")

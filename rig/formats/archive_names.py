@@ -1,0 +1,108 @@
+"""Names of an archive's members: how their bytes are read, and which names are not written.
+
+Names are UTF-8 where their bytes are, whatever the archive says: macOS writes them so without the flag that tells it.
+Bytes that are not are read as code page 437, the format's own. What nobody keeps, the folders around the capture and
+what file managers add, may have any name that can be written.
+"""
+
+import re
+import struct
+import unicodedata
+import zlib
+
+from rig.formats.picture_names import JUNK
+
+UNICODE_PATH = 0x7075  # Info-ZIP's field of zip
+COMPONENT_BYTES_MOST = 255  # of a file's or folder's name, on every usual file system
+ENCODED = "{} has letters in an encoding that the archive does not tell: pack it with names in UTF-8, or rename it"
+DROPPED = frozenset(name.casefold() for name in JUNK)  # never written
+SCRIPTS = ("LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE", "COPTIC")  # alphabets whose letters look alike
+WINDOWS_NAMES = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
+
+
+def decoded_name(raw: bytes) -> tuple[str, bool]:
+    """A name, and whether its encoding is a guess."""
+    try:
+        return raw.decode("utf-8"), False
+    except UnicodeDecodeError:
+        return raw.decode("cp437"), True
+
+
+def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
+    """The name in UTF-8 that Info-ZIP writes beside one in another encoding, where it belongs to ``raw``."""
+    at = 0
+    while at + 4 <= len(extra):
+        kind, size = struct.unpack_from("<HH", extra, at)
+        data = extra[at + 4 : at + 4 + size]
+        if (
+            kind == UNICODE_PATH
+            and len(data) > 5
+            and data[0] == 1
+            and data[1:5] == zlib.crc32(raw).to_bytes(4, "little")
+        ):
+            return data[5:]
+        at += 4 + size
+    return None
+
+
+def is_dropped(part: str) -> bool:
+    return part.startswith("._") or part.casefold() in DROPPED
+
+
+def name_clash(parts: list[str], kind: str, seen: dict[str, tuple[str, str]]) -> str | None:
+    """A name that another member has already, or that some file system or reader takes for another's."""
+    name = "/".join(parts)
+    key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
+    other = seen.get(key)
+    if other is None:
+        seen[key] = (name, kind)
+        return None
+    if other == (name, "folder") and kind == "folder":
+        return None
+    return "{} occurs twice" if other[0] == name else f"{{}} is the same name as {other[0]!r:.120} in other letters"
+
+
+def path_faults(name: str, *, depth: int, name_length: int) -> list[str]:
+    """What no member may be called, kept or not."""
+    if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
+        return ["{} has an invisible or control character in its name: rename it"]
+    if "\\" in name or re.match(r"^[A-Za-z]:", name):
+        return ["{} has a backslash or a drive letter in its name: rename it"]
+    if name.startswith("/"):
+        return ["{} is an absolute path"]
+    parts = name.rstrip("/").split("/")
+    if ".." in parts:
+        return ["{} leads out of the archive ('..')"]
+    faults = []
+    if len(parts) > depth:
+        faults.append(f"{{}} lies {len(parts)} folders deep; at most {depth} are unpacked")
+    if any(len(part.encode()) > COMPONENT_BYTES_MOST for part in parts):
+        faults.append(f"{{}} has a name longer than {name_length} bytes")
+    return faults
+
+
+def name_faults(part: str, *, name_length: int) -> list[str]:
+    """What a file or folder that is kept may not be called."""
+    faults = []
+    if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
+        faults.append("{} has an invisible or control character in its name: rename it")
+    if len(part.encode()) > name_length:
+        faults.append(f"{{}} has a name longer than {name_length} bytes")
+    if WINDOWS_NAMES.match(part):
+        faults.append("{} has a name that Windows reserves for a device")
+    if any(len(_scripts(word)) > 1 for word in re.findall(r"[^\W\d_]+", part)):
+        faults.append("{} mixes letters of several alphabets in its name: rename it")
+    return faults
+
+
+def _scripts(text: str) -> set[str]:
+    found = set()
+    for character in text:
+        if character.isascii():
+            if character.isalpha():
+                found.add("LATIN")
+            continue
+        words = unicodedata.name(character, "").split(" ", 1)
+        if words[0] in SCRIPTS:
+            found.add(words[0])
+    return found
