@@ -206,12 +206,15 @@ def convert(
 ) -> None:
     """Convert calibrations to and from other programs."""
     from rig.errors import InputError
-    from rig.formats.cameras_file import FOLDER_FORMATS, NO_RIG, find_rig_file, read_rig_file, write_rig_file
+    from rig.formats.cameras_file import FOLDER_FORMATS, NO_RIG, find_rig_file, read_cameras, write_rig_file
 
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:
         raise InputError(str(source), [NO_RIG])
-    rig = read_rig_file(file)
+    read = read_cameras(file)
+    rig = read.rig
+    for remark in read.remarks:
+        warn(f"{remark.code}: {remark.message}")
     prepare = prepare_folder if to in FOLDER_FORMATS else prepare_file
     prepare(out)
     write_rig_file(rig, out, to)

@@ -1,4 +1,4 @@
-"""What readers of other programs' files say: once for one cause, with whole quotation marks, of all cameras together."""
+"""What readers of other programs' files say: once for one cause, whole quotation marks, all cameras together."""
 
 import pytest
 
@@ -52,7 +52,7 @@ def test_cameras_that_take_no_part_are_named_where_too_few_are_left() -> None:
     reading = Reading("rig.xml")
     for name in ("a", "b"):
         reading.leave_out(name, "not aligned")
-    with pytest.raises(InputError, match="a, b not aligned in rig.xml: taking no part"):
+    with pytest.raises(InputError, match=r"a, b not aligned in rig\.xml: taking no part"):
         reading.finish([])
 
 

@@ -79,6 +79,17 @@ def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: 
     assert told in str(done.exception)
 
 
+def test_cameras_that_take_no_part_are_told_where_a_file_is_converted(tmp_path: Path) -> None:
+    write_rig_file(wedge_rig(), tmp_path / "rig.xml", "metashape")
+    text = (tmp_path / "rig.xml").read_text()
+    name = wedge_rig().names[0]
+    (tmp_path / "rig.xml").write_text(text.replace(f'label="{name}">', f'label="{name}" enabled="false">'))
+    done = CliRunner().invoke(app, ["convert", str(tmp_path / "rig.xml"), "--out", str(tmp_path / "out.json")])
+    assert done.exit_code == 0, done.output
+    assert f'view-left-out: {name} switched off (enabled="false") in rig.xml' in done.stderr
+    assert f"{len(wedge_rig()) - 1} cameras" in done.stdout
+
+
 def test_formats_of_several_files_are_told_from_those_of_one(tmp_path: Path) -> None:
     for kind in FORMATS:
         write_rig_file(wedge_rig(), tmp_path / kind, kind)

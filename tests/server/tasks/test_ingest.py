@@ -1,5 +1,6 @@
 """Faults of captures that the door names without a service around it."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from rig.formats.archive import ArchiveLimits, pack_folder
 from rig.formats.cameras_file import write_rig_file
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture, write_capture
+from rig.formats.images import read_image, write_image
 from server.storage.records import CaptureContent
 from server.tasks.child import Bench
 from server.tasks.ingest import check_capture, ingest_archive
@@ -85,6 +87,63 @@ def test_an_upload_keeps_every_file_of_another_programs_cameras(tmp_path: Path, 
     ingest_archive(Bench(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST)
     _, read = read_capture(kept)  # as a job reads it
     assert sorted(read.names) == sorted(rig.names)
+
+
+def kept_of(folder: Path, tmp_path: Path) -> tuple[CaptureContent, Path]:
+    """What an upload of ``folder`` leaves."""
+    pack_folder(folder, tmp_path / "capture.tar")
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    archive = {"archive": str(tmp_path / "capture.tar"), "folder": str(kept), "limits": ArchiveLimits()}
+    return ingest_archive(Bench(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST), kept
+
+
+def test_an_upload_is_kept_under_its_cameras_names(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    (folder / "background").rename(folder / "plates")
+    (folder / "background").mkdir()
+    (folder / "masks").mkdir()
+    mask = np.zeros((24, 24), np.uint8)
+    mask[6:20, 6:20] = 255
+    for path in sorted((folder / "images").iterdir()):
+        write_image(folder / "masks" / f"{path.stem}.png.png", mask)
+        write_image(folder / "images" / f"shot.0001.{path.stem}.BMP", read_image(path))
+        for number in (1, 2):
+            shutil.copy(folder / "plates" / path.name, folder / "background" / f"{path.stem}_{number}.png")
+        path.unlink()
+    shutil.rmtree(folder / "plates")
+    content, kept = kept_of(folder, tmp_path)
+    wanted = {"cameras.json"}
+    for name in ("cam00", "cam01", "cam02"):
+        wanted |= {f"images/{name}.bmp", f"masks/{name}.png"}
+        wanted |= {f"background/{name}/{name}_{number}.png" for number in (1, 2)}
+    assert {*content.inputs} == wanted
+    assert {path.relative_to(kept).as_posix() for path in kept.rglob("*") if path.is_file()} == wanted
+    assert {len(plates) for plates in read_capture(kept)[0].backgrounds.values()} == {2}
+
+
+def test_an_upload_with_cameras_switched_off_is_taken_without_their_files(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture", cameras=5)
+    write_rig_file(read_rig(folder / "cameras.json"), folder / "cameras.xml", "metashape")
+    (folder / "cameras.json").unlink()
+    text = (folder / "cameras.xml").read_text()
+    (folder / "cameras.xml").write_text(text.replace('label="cam01">', 'label="cam01" enabled="false">'))
+    content, kept = kept_of(folder, tmp_path)
+    assert [camera.name for camera in content.cameras] == ["cam00", "cam02", "cam03", "cam04"]
+    assert not [*kept.rglob("cam01.png")]
+    (remark,) = read_capture(kept)[0].remarks
+    assert remark.code == "view-left-out"
+
+
+def test_what_is_missing_everywhere_is_one_fault(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture", cameras=12)
+    shutil.rmtree(folder / "images")
+    (folder / "images").mkdir()
+    with pytest.raises(InputError) as refused:
+        checked(folder)
+    (fault,) = refused.value.faults
+    assert fault.startswith("images/cam00.png is missing")
+    assert "the same is true of 11 more files" in fault
 
 
 def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:
