@@ -32,8 +32,6 @@ WARNING_CODES = (
     "views-many",
 )
 """Codes that a result's warnings may have; docs/operator.md says what each means and what to do."""
-CHECK_CODES = ("picture-unread",)
-"""Codes of what ``eigenhead check`` alone warns of, as a reconstruction passes it over; documented there, too."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Endings of picture files, and whose picture a file is by its name alone. Knows no decoder, so that it costs nothing.
 
-Programs call the mask of ``cam00.png`` ``cam00.png.png`` (COLMAP), ``cam00.png.mask.png`` (RealityScan) or
-``cam00_mask.png``, and number a picture of ``cam00`` ``shot_0001_cam00.tif``. Such names are read as words: runs of
+Programs call the mask of "cam00.png" "cam00.png.png" (COLMAP), "cam00.png.mask.png" (RealityScan) or
+"cam00_mask.png", and number a picture of "cam00" "shot_0001_cam00.tif". Such names are read as words: runs of
 letters, and numbers without their leading zeros. Signs between them, their case and endings of pictures do not count.
 """
 
@@ -92,7 +92,7 @@ def _words(name: str) -> Words:
 
 
 def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Files that say the camera's words and no more: ``CAM_0.png`` of cam00."""
+    """Files that say the camera's words and no more: "CAM_0.png" of cam00."""
     times = Counter(cameras.values())
     owners = {words: camera for camera, words in cameras.items() if words and times[words] == 1}
     return _by_owner((owners[words], name) for name, words in strays.items() if words in owners)
@@ -128,7 +128,7 @@ def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Fo
 
 
 def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Files that say only what tells the cameras apart (``00.png`` of cam00), where every camera has one."""
+    """Files that say only what tells the cameras apart ("00.png" of cam00), where every camera has one."""
     ways = list(cameras.values())
     head = next((i for i, said in enumerate(zip(*ways, strict=False)) if len(set(said)) > 1), None)
     if head is None or len(cameras) < 2:

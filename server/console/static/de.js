@@ -889,7 +889,6 @@ export default {
   "{1} is not read: the cameras come from {2}": "{1} wird nicht gelesen: Die Kameras kommen aus {2}",
   "scale.json is not read: the cameras of {1} are taken as millimetres; without that file the cameras are found from the photographs, and scaled": "scale.json wird nicht gelesen: Die Kameras aus {1} gelten als Millimeter; ohne jene Datei werden die Kameras aus den Fotos gefunden und skaliert",
   "{1} has no camera: the rig has {2}": "{1} hat keine Kamera: Das Rig hat {2}",
-  "a reconstruction from here passes it over, the service refuses it": "eine Rekonstruktion von hier übergeht es, der Dienst weist es ab",
   "{1}/ holds {2}: which one is meant?": "{1}/ enthält {2}: Welches ist gemeint?",
   "{1}{2}.png is missing (or .jpg, .tif, .webp, .bmp, RAW, HEIC)": "{1}{2}.png fehlt (oder .jpg, .tif, .webp, .bmp, RAW, HEIC)",
   "the same is true of {1} more files ({2})": "ebenso {1} weitere Dateien ({2})",
