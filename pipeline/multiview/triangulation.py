@@ -17,7 +17,8 @@ from rig.errors import EigenheadError
 from rig.rig import Rig
 
 LIMITS = Limits(steps=50, tolerance=1e-12, tries=6)  # a step of 1e-6 standard deviations
-STEPS = 10  # of many points at once; noisy ones move by less than 1e-6 of their deviation after five
+STEPS = 10  # of many points at once; three are usual
+SETTLED = 1e-9  # share of the misfit that a last step still takes away
 RAYS_APART_LEAST = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
 
 
@@ -123,7 +124,8 @@ def triangulate_many(
         matrix = np.einsum("vnki,vnkj->nij", slopes, slopes)
         step = np.linalg.solve(matrix, -np.einsum("vnki,vnk->ni", slopes, residual)[..., None])[..., 0]
         moved = _whitened(points + step, pixels, cameras, weights)
-        better = (moved[0] ** 2).sum(axis=(0, 2)) < (residual**2).sum(axis=(0, 2))
+        before, after = (residual**2).sum(axis=(0, 2)), (moved[0] ** 2).sum(axis=(0, 2))
+        better = after < before
         if not better.any():
             break
         points = np.where(better[:, None], points + step, points)
@@ -131,6 +133,8 @@ def triangulate_many(
             np.where(better[None, :, None], moved[0], residual),
             np.where(better[None, :, None, None], moved[1], slopes),
         )
+        if ((before - after)[better] <= SETTLED * before[better]).all():
+            break
     covariances = np.linalg.inv(np.einsum("vnki,vnkj->nij", at_points[1], at_points[1]))
     projected = np.stack([camera.project(points) for camera in cameras])
     return TriangulatedPoints(points, covariances, pixels - projected)

@@ -1,0 +1,105 @@
+"""Faces found in one picture: drawn ones however they are turned, and none where there is none."""
+
+import numpy as np
+import pytest
+
+from pipeline.faces.crops import make_pyramid
+from pipeline.faces.detection import crop_around, find_face_at, find_faces
+from pipeline.faces.eyes import find_eyes
+from pipeline.faces.networks import FaceNetworks, load_networks
+from tests.support.drawn_faces import OUTER_EYE_CORNERS, drawn_face, turned_about
+
+
+@pytest.fixture(scope="module")
+def networks() -> FaceNetworks:
+    return load_networks()
+
+
+@pytest.mark.parametrize("roll", [0.0, 30.0, 90.0, 135.0, 180.0, 250.0, -45.0])
+def test_a_face_is_found_however_it_is_turned(networks: FaceNetworks, roll: float) -> None:
+    (face,) = find_faces(drawn_face(roll_deg=roll), networks)
+    assert face.score > 20.0
+    assert abs((face.roll_deg - roll + 180.0) % 360.0 - 180.0) < 2.0
+    corners = turned_about(np.array(OUTER_EYE_CORNERS), roll) + 319.5 - (0.0, 80.0)
+    assert np.abs(face.landmarks_px[[33, 263]] - corners).max() < 0.03 * face.size_px
+    low, high = face.box_px[:2], face.box_px[2:]
+    assert (low <= face.landmarks_px.min(axis=0)).all()
+    assert (high >= face.landmarks_px.max(axis=0)).all()
+
+
+def test_turning_the_picture_by_a_quarter_turns_the_points(networks: FaceNetworks) -> None:
+    image = drawn_face(scale=1.2, roll_deg=8.0)
+    (upright,), (turned,) = (find_faces(np.ascontiguousarray(i), networks) for i in (image, np.rot90(image, -1)))
+    height = image.shape[0]
+    expected = np.stack([height - 1 - upright.landmarks_px[:, 1], upright.landmarks_px[:, 0]], axis=1)
+    # The crop follows the face: what is left is its sampling, and the last round's step.
+    assert np.abs(turned.landmarks_px - expected).max() < 0.01 * upright.size_px
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 2.0])
+def test_small_and_large_faces_are_found(networks: FaceNetworks, scale: float) -> None:
+    size = (640, 480) if scale < 1.0 else (800, 900)
+    middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    (face,) = find_faces(drawn_face(*size, (middle,), scale=scale), networks)
+    corners = np.array(OUTER_EYE_CORNERS) * scale + middle
+    assert np.abs(face.landmarks_px[[33, 263]] - corners).max() < 0.03 * face.size_px
+
+
+def test_a_face_of_a_twentieth_of_a_picture_is_found(networks: FaceNetworks) -> None:
+    middle = (300.0, 600.0)
+    (face,) = find_faces(drawn_face(1000, 800, (middle,), scale=0.24), networks)
+    assert np.abs(face.landmarks_px.mean(axis=0) - middle).max() < 0.3 * face.size_px
+
+
+def test_two_faces_are_two(networks: FaceNetworks) -> None:
+    image = drawn_face(900, 480, ((220.0, 240.0), (660.0, 240.0)))
+    faces = find_faces(image, networks)
+    middles = sorted(float(face.landmarks_px[:, 0].mean()) for face in faces)
+    assert np.allclose(middles, [220.0, 660.0], atol=15.0)
+
+
+def test_results_are_the_same_byte_for_byte(networks: FaceNetworks) -> None:
+    image = drawn_face(roll_deg=20.0)
+    first, second = find_faces(image, networks)[0], find_faces(image, load_networks())[0]
+    assert first.landmarks_px.tobytes() == second.landmarks_px.tobytes()
+    assert (first.score, first.roll_deg) == (second.score, second.roll_deg)
+
+
+@pytest.mark.parametrize("grain_px", [0, 4, 16])
+def test_noise_is_no_face(networks: FaceNetworks, grain_px: int) -> None:
+    rng = np.random.default_rng(grain_px)
+    cells = rng.uniform(0, 255, (480 // max(grain_px, 1), 640 // max(grain_px, 1), 3)).astype(np.uint8)
+    assert find_faces(np.kron(cells, np.ones((max(grain_px, 1), max(grain_px, 1), 1), np.uint8)), networks) == ()
+
+
+def test_a_tiny_and_a_narrow_picture_hold_no_face(networks: FaceNetworks) -> None:
+    assert find_faces(np.full((8, 8, 3), 128, np.uint8), networks) == ()
+    assert find_faces(np.full((900, 30, 3), 128, np.uint8), networks) == ()
+
+
+def test_a_place_without_a_face_has_a_low_score(networks: FaceNetworks) -> None:
+    image = drawn_face(900, 480, ((220.0, 240.0),))
+    (face,) = find_faces(image, networks)
+    pyramid, crop = make_pyramid(image), crop_around(face.landmarks_px)
+    assert find_face_at(pyramid, crop, networks).score > 20.0
+    crop.centre_px[0] += 420.0
+    assert find_face_at(pyramid, crop, networks).score < 0.0
+
+
+def test_irises_and_lids_are_where_they_are_drawn(networks: FaceNetworks) -> None:
+    image = drawn_face(scale=1.6)
+    (face,) = find_faces(image, networks)
+    face = find_eyes(make_pyramid(image), face, networks)
+    assert face.irises_px is not None
+    assert face.lids_px is not None
+    middles = np.array([[-33.0, -20.0], [33.0, -20.0]]) * 1.6 + (319.5, 239.5)
+    assert np.abs(face.irises_px[[0, 5]] - middles).max() < 3.0
+    radii = np.linalg.norm(face.irises_px[[1, 2, 3, 4]] - face.irises_px[0], axis=1)
+    assert np.abs(radii - 7.5 * 1.6).max() < 0.3 * 7.5 * 1.6
+    # The subject's right eye comes first; its second iris point lies towards the nose, its third above.
+    assert face.irises_px[1, 0] > face.irises_px[0, 0] > face.irises_px[3, 0]
+    assert face.irises_px[6, 0] < face.irises_px[5, 0] < face.irises_px[8, 0]
+    assert face.irises_px[2, 1] < face.irises_px[0, 1] < face.irises_px[4, 1]
+    lids = face.lids_px[:16]
+    assert lids[12, 1] < middles[0, 1] < lids[4, 1]
+    assert np.abs(lids[[12, 4], 1] - middles[0, 1]).max() < 1.5 * 8.0 * 1.6
