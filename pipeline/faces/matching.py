@@ -1,10 +1,10 @@
-"""Which faces in several pictures are one subject's, and where its points lie in the world.
+"""Which faces in several pictures are one subject's.
 
 Enters: the faces found in each view. Leaves: ``MatchedFaces``, or None where no two views show one face. Two
 detections that may be one face are triangulated; what comes out must be of a face's size (mm), have a face's relief
 (a poster is flat), and look towards its cameras; other views join where their points project (epipolar consistency).
-Of several faces that rig sees the one is taken that is large in the pictures and near to their middles: others stand
-behind.
+Of several faces that the rig sees the one is taken that is large in the pictures and near to their middles: others
+stand behind.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,70 +15,62 @@ from jaxtyping import Float
 
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS, point_table
-from pipeline.multiview.triangulation import NoPoint, TriangulatedPoints, triangulate_many
+from pipeline.faces.triangulated_face import (
+    SOME_POINTS,
+    TriangulatedFace,
+    point_noise_px,
+    shared_modes,
+    triangulate_face,
+    unbiased_px,
+    view_noise_px,
+)
 from rig.camera import Camera
-from rig.geometry import Similarity, rigid_fit
+from rig.geometry import Similarity
 from rig.rig import Rig
 
 EYE_DISTANCE_MM = (35.0, 90.0)  # between eyes' middles: infants 40, adults 50 to 75, and a rig's error of scale
 RELIEF = (0.4, 1.8)  # depth of a face by the mean one's, at its size; a poster has none
-NOISE_OF_SIZE = 0.012  # of the points of a face that looks at the camera, by the face's size
-NOISE_GROWTH = 1.6  # its logarithm grows so by ``1 - cos`` of the angle from a point's normal to the camera
 MAX_VIEW_MISFIT = 3.0  # RMS of a view's residuals by their noise
-MAX_POINT_MISFIT = 3.0  # a residual by its noise, beyond which it counts as this much
 MAX_SEEDS = 60  # pairs of detections that are tried
-ALL_POINTS = slice(None)
-SEED_POINTS = slice(0, None, 13)  # of the 468, for a first look at a pair
 FEW_POINTS = [33, 133, 362, 263, 1, 168, 61, 291, 10, 152]  # eyes, nose, mouth, forehead and chin
 MIN_SINE = 1e-3  # of the angle between two rays
 MAX_GAP = 0.5  # between two rays of a point, by the points' mean distance from their middle
 LOOSE = 1.5  # a first look at a size, from two views that may be wrong, is right to this factor
 GROWING_ROUNDS = 5
-REWEIGHTINGS = 2
 MIN_FACING = -0.25  # cosine between where a face looks and a camera that may see it
 DISSENTING_FACING = 0.5  # the same of a camera that must see it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFaces:
-    """One face in several views.
+    """One face in several views, and its points in the world (mm).
 
-    ``noise_px`` is the standard deviation that was taken for a coordinate of each point, and what the covariances
-    follow from; errors that all views share (of the network's idea of a face) are not in them but in a model's
-    ``landmark_map.LandmarkMap``.
+    An error of the points is the sum of three: one of each point by its own (``covariances``), one of each view
+    (``shared_mm``: each mode times a standard normal number), and the network's idea of a face, which all views share
+    (a model's ``landmark_map.LandmarkMap``).
     """
 
     detections: Mapping[str, FaceDetection]  # by view
     outliers: Mapping[str, FaceDetection]  # of views where the face is seen, but the points are elsewhere
+    pixels: Mapping[str, Float[np.ndarray, "468 2"]]  # the detections' points without the network's bias
+    noise_px: Mapping[str, Float[np.ndarray, " 468"]]  # of a coordinate of each pixel, by its own
+    view_noise_px: Mapping[str, float]  # of all pixels of a view together, along each axis
     points_world: Float[np.ndarray, "468 3"]
     covariances: Float[np.ndarray, "468 3 3"]  # mm^2
-    residuals_px: Mapping[str, Float[np.ndarray, "468 2"]]  # found minus projected, of ``detections``
-    noise_px: Mapping[str, Float[np.ndarray, " 468"]]
+    shared_mm: Float[np.ndarray, "m 468 3"]  # two modes a view
+    residuals_px: Mapping[str, Float[np.ndarray, "468 2"]]  # ``pixels`` minus projected points
     world_from_face: Similarity  # of a mean adult's points (``points.PointTable``)
     relief: float  # 1 for a mean face, 0 for a poster
 
     @property
     def eye_distance_mm(self) -> float:
         """Between the middles of the eyes."""
-        right, left = (self.points_world[list(pair)].mean(axis=0) for pair in (RIGHT_EYE_CORNERS, LEFT_EYE_CORNERS))
-        return float(np.linalg.norm(left - right))
+        return _eye_distance_mm(self.points_world)
 
     @property
     def facing_world(self) -> Float[np.ndarray, " 3"]:
         """Unit vector along which the face looks."""
         return self.world_from_face.rotation[:, 2]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Face:
-    """Detections by view that may be one face, its points, and how it lies."""
-
-    members: Mapping[str, FaceDetection]
-    points: TriangulatedPoints
-    noise_px: Float[np.ndarray, "v n"]
-    world_from_face: Similarity
-    relief: float
-    misfits: Mapping[str, float]
 
 
 def match_faces(
@@ -98,12 +90,13 @@ def match_faces(
     if not faces:
         return None
     best = max(faces, key=lambda face: _prominence(face, rig))
-    return _finished(best, candidates, rig)
+    whole = triangulate_face(best.detections, rig)
+    return whole and _matched(whole, rig, _outliers(best, candidates, rig))
 
 
 def _consistent(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
-) -> Iterator[_Face]:
+) -> Iterator[TriangulatedFace]:
     """Faces that two views or more agree on, each grown to all views that do."""
     detections = [(name, face) for name, faces in candidates.items() for face in faces]
     pairs = [(a, b) for k, a in enumerate(detections) for b in detections[k + 1 :] if a[0] != b[0]]
@@ -117,16 +110,16 @@ def _consistent(
         if not _may_be_one(pair, rig, eye_distance_mm):
             continue
         tried += 1
-        seed = _face(dict(pair), rig, SEED_POINTS)
+        seed = triangulate_face(dict(pair), rig, SOME_POINTS)
         if seed is None or not _is_face(seed, rig, eye_distance_mm):
             continue
-        grown = _grown(dict(pair), candidates, rig)
+        grown = _grown(seed, candidates, rig)
         if (
             grown is not None
             and _is_face(grown, rig, eye_distance_mm)
-            and _dissenting(grown, candidates, rig) <= len(grown.members)
+            and _dissenting(grown, candidates, rig) <= len(grown.detections)
         ):
-            joined.append({id(face) for face in grown.members.values()})
+            joined.append({id(face) for face in grown.detections.values()})
             yield grown
 
 
@@ -153,79 +146,53 @@ def _may_be_one(
     scale = size / float(np.linalg.norm(mean - mean.mean(axis=0), axis=1).mean())
     low, high = eye_distance_mm or (0.0, np.inf)
     gaps = np.linalg.norm(points - others, axis=1)
-    in_limits = low / LOOSE < scale * _mean_eye_distance() < LOOSE * high
+    in_limits = low / LOOSE < scale * mean_eye_distance_mm() < LOOSE * high
     return in_limits and float(np.median(gaps)) < MAX_GAP * size
 
 
 def _grown(
-    members: Mapping[str, FaceDetection], candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
-) -> _Face | None:
+    face: TriangulatedFace | None, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
+) -> TriangulatedFace | None:
     """The face of a pair, with the detections of all views in which its points project to what was found there."""
-    face = _face(members, rig)
     for _ in range(GROWING_ROUNDS):
         if face is None:
             return None
         nearest = {name: _nearest(face, faces, rig[name]) for name, faces in candidates.items() if faces}
         joining = {name: found for name, (found, misfit) in nearest.items() if misfit < MAX_VIEW_MISFIT}
-        if len(joining) < 2 or joining == face.members:
+        if len(joining) < 2 or joining == face.detections:
             return face
-        face = _face(joining, rig)
+        face = triangulate_face(joining, rig, SOME_POINTS)
     return face
 
 
-def _face(members: Mapping[str, FaceDetection], rig: Rig, points: slice = ALL_POINTS) -> _Face | None:
-    """Triangulates a face: with equal noise first, then, as it is known which points each view sees how steeply, again.
-    None where the points are not determined."""
-    cameras = [rig[name] for name in members]
-    pixels = np.stack([face.landmarks_px[points] for face in members.values()])
-    sizes = np.array([face.size_px for face in members.values()])
-    noise = np.tile(NOISE_OF_SIZE * sizes[:, None], pixels.shape[1])
-    table = point_table()
-    try:
-        found = triangulate_many(pixels, cameras, noise)
-        for _ in range(REWEIGHTINGS):
-            world_from_face, _ = _place(found.positions_world, table.shape_mm[points])
-            normals = table.normals[points] @ world_from_face.rotation.T
-            noise = np.stack(
-                [_noise_px(size, found.positions_world, normals, c) for size, c in zip(sizes, cameras, strict=True)]
-            )
-            beyond = np.linalg.norm(found.residuals_px, axis=2) / (np.sqrt(2.0) * MAX_POINT_MISFIT * noise)
-            noise = noise * np.maximum(beyond, 1.0)
-            found = triangulate_many(pixels, cameras, noise)
-    except NoPoint:
-        return None
-    world_from_face, relief = _place(found.positions_world, table.shape_mm[points])
-    misfits = np.sqrt((found.residuals_px**2).mean(axis=2) / noise**2)
-    by_view = {name: float(np.sqrt((misfit**2).mean())) for name, misfit in zip(members, misfits, strict=True)}
-    return _Face(dict(members), found, noise, world_from_face, relief, by_view)
+def _nearest(
+    face: TriangulatedFace, detections: Sequence[FaceDetection], camera: Camera
+) -> tuple[FaceDetection, float]:
+    """Of a view's detections the one nearest to where the face's points project, and its misfit: the RMS of residuals
+    by what the points' noise there and their uncertainty lead to expect; infinite behind the camera."""
+    points, placed = face.points.positions_world, face.world_from_face
+    pixels, slopes = camera.project_with_jacobian(points)
+    if not np.isfinite(pixels).all():
+        return detections[0], np.inf
+    uncertain = np.einsum("nki,nij,nkj->nk", slopes, face.points.covariances, slopes)
+
+    def misfit(detection: FaceDetection) -> float:
+        noise = point_noise_px(detection.size_px, points, placed, camera, SOME_POINTS)
+        view_noise = view_noise_px(detection.size_px, placed, camera)
+        miss = unbiased_px(detection, placed, camera)[SOME_POINTS] - pixels
+        return float(np.sqrt((miss**2 / (noise[:, None] ** 2 + view_noise**2 + uncertain)).mean()))
+
+    misfits = [misfit(detection) for detection in detections]
+    best = int(np.argmin(misfits))
+    return detections[best], misfits[best]
 
 
-def _place(points_world: Float[np.ndarray, "n 3"], shape: Float[np.ndarray, "n 3"]) -> tuple[Similarity, float]:
-    """Where a mean face lies that is most like the points, by its breadth and height, and their depth by its own."""
-    mean, middle = shape.mean(axis=0), points_world.mean(axis=0)
-    rotation = rigid_fit(shape, points_world).rotation
-    within = (points_world - middle) @ rotation
-    flat, shape = within[:, :2], shape - mean
-    scale = float((flat * shape[:, :2]).sum() / (shape[:, :2] ** 2).sum())
-    relief = float((within[:, 2] @ shape[:, 2]) / (shape[:, 2] @ shape[:, 2]) / scale) if scale > 0.0 else 0.0
-    return Similarity(scale, rotation, middle - scale * rotation @ mean), relief
-
-
-def _noise_px(
-    size_px: float, points_world: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Camera
-) -> Float[np.ndarray, " n"]:
-    """Standard deviation of a coordinate of each point in a view."""
-    towards = camera.centre_world - points_world
-    cosine = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
-    return NOISE_OF_SIZE * size_px * np.exp(NOISE_GROWTH * (1.0 - cosine))
-
-
-def _is_face(face: _Face, rig: Rig, eye_distance_mm: tuple[float, float] | None) -> bool:
+def _is_face(face: TriangulatedFace, rig: Rig, eye_distance_mm: tuple[float, float] | None) -> bool:
     """Whether the points are a face's: of its size and relief, and turned towards its cameras."""
     low, high = eye_distance_mm or (0.0, np.inf)
-    scaled_mm = face.world_from_face.scale * _mean_eye_distance()
+    scaled_mm = face.world_from_face.scale * mean_eye_distance_mm()
     middle, facing = face.world_from_face.translation, face.world_from_face.rotation[:, 2]
-    towards = np.stack([rig[name].centre_world - middle for name in face.members])
+    towards = np.stack([rig[name].centre_world - middle for name in face.detections])
     cosines = towards @ facing / np.linalg.norm(towards, axis=1)
     return (
         low <= scaled_mm <= high
@@ -235,12 +202,12 @@ def _is_face(face: _Face, rig: Rig, eye_distance_mm: tuple[float, float] | None)
     )
 
 
-def _dissenting(face: _Face, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig) -> int:
+def _dissenting(face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig) -> int:
     """How many views that should show the face show faces, but not this one."""
     middle, facing = face.world_from_face.translation, face.world_from_face.rotation[:, 2]
     count = 0
     for name, faces in candidates.items():
-        if not faces or name in face.members:
+        if not faces or name in face.detections:
             continue
         camera = rig[name]
         towards = camera.centre_world - middle
@@ -251,32 +218,17 @@ def _dissenting(face: _Face, candidates: Mapping[str, Sequence[FaceDetection]], 
     return count
 
 
-def _mean_eye_distance() -> float:
-    """Of the mean adult, mm."""
-    shape = point_table().shape_mm
-    right, left = (shape[list(pair)].mean(axis=0) for pair in (RIGHT_EYE_CORNERS, LEFT_EYE_CORNERS))
+def mean_eye_distance_mm() -> float:
+    """Returns how far the eyes' middles are apart in the mean adult."""
+    return _eye_distance_mm(point_table().shape_mm)
+
+
+def _eye_distance_mm(points: Float[np.ndarray, "468 3"]) -> float:
+    right, left = (points[list(pair)].mean(axis=0) for pair in (RIGHT_EYE_CORNERS, LEFT_EYE_CORNERS))
     return float(np.linalg.norm(left - right))
 
 
-def _nearest(face: _Face, detections: Sequence[FaceDetection], camera: Camera) -> tuple[FaceDetection, float]:
-    """Of a view's detections the one nearest to where the face's points project, and its misfit: the RMS of residuals
-    by what the points' noise there and their uncertainty lead to expect; infinite behind the camera."""
-    pixels, slopes = camera.project_with_jacobian(face.points.positions_world)
-    if not np.isfinite(pixels).all():
-        return detections[0], np.inf
-    uncertain = np.einsum("nki,nij,nkj->nk", slopes, face.points.covariances, slopes)
-    normals = point_table().normals @ face.world_from_face.rotation.T
-
-    def misfit(detection: FaceDetection) -> float:
-        noise = _noise_px(detection.size_px, face.points.positions_world, normals, camera)
-        return float(np.sqrt(((detection.landmarks_px - pixels) ** 2 / (noise[:, None] ** 2 + uncertain)).mean()))
-
-    misfits = [misfit(detection) for detection in detections]
-    best = int(np.argmin(misfits))
-    return detections[best], misfits[best]
-
-
-def _prominence(face: _Face, rig: Rig) -> float:
+def _prominence(face: TriangulatedFace, rig: Rig) -> float:
     """Over the views, how large the face is in the picture and how near to its middle."""
 
     def of_view(name: str, detection: FaceDetection) -> float:
@@ -286,26 +238,36 @@ def _prominence(face: _Face, rig: Rig) -> float:
         off_middle = float(np.linalg.norm(middle - half + 0.5) / np.linalg.norm(half))
         return detection.size_px / max(k.width, k.height) * (1.0 - min(off_middle, 0.9))
 
-    return sum(of_view(name, detection) for name, detection in face.members.items())
+    return sum(of_view(name, detection) for name, detection in face.detections.items())
 
 
-def _finished(face: _Face, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig) -> MatchedFaces:
-    """The face as it is handed on."""
-    outliers = {}
+def _outliers(
+    face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
+) -> dict[str, FaceDetection]:
+    """Of views that are left out, the detections that lie where the face is but do not fit it."""
+    found = {}
     for name, faces in candidates.items():
-        if name not in face.members and faces:
-            found, _ = _nearest(face, faces, rig[name])
-            pixels = rig[name].project(face.points.positions_world)
-            if np.linalg.norm(pixels.mean(axis=0) - found.landmarks_px.mean(axis=0)) < found.size_px / 2:
-                outliers[name] = found
-    names = list(face.members)
+        if name not in face.detections and faces:
+            nearest, _ = _nearest(face, faces, rig[name])
+            middle = rig[name].project(face.points.positions_world).mean(axis=0)
+            if np.linalg.norm(middle - nearest.landmarks_px.mean(axis=0)) < nearest.size_px / 2:
+                found[name] = nearest
+    return found
+
+
+def _matched(face: TriangulatedFace, rig: Rig, outliers: Mapping[str, FaceDetection]) -> MatchedFaces:
+    """The face as it is handed on."""
+    names = list(face.detections)
     return MatchedFaces(
-        face.members,
-        outliers,
-        face.points.positions_world,
-        face.points.covariances,
-        dict(zip(names, face.points.residuals_px, strict=True)),
-        dict(zip(names, face.noise_px, strict=True)),
-        face.world_from_face,
-        face.relief,
+        detections=face.detections,
+        outliers=outliers,
+        pixels=dict(zip(names, face.pixels, strict=True)),
+        noise_px=dict(zip(names, face.noise_px, strict=True)),
+        view_noise_px=dict(zip(names, face.view_noise_px.tolist(), strict=True)),
+        points_world=face.points.positions_world,
+        covariances=face.points.covariances,
+        shared_mm=shared_modes(face, rig),
+        residuals_px=dict(zip(names, face.points.residuals_px, strict=True)),
+        world_from_face=face.world_from_face,
+        relief=face.relief,
     )

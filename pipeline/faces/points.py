@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from rig.camera import Camera
+from rig.geometry import Similarity, rigid_fit
+
 RIGHT_EYE_CORNERS, LEFT_EYE_CORNERS = (33, 133), (263, 362)  # outer, inner
 NOSE_TIP, CHIN, FOREHEAD = 1, 152, 10
 RIGHT_EYE_OUTLINE = (33, 7, 163, 144, 145, 153, 154, 155, 133, 246, 161, 160, 159, 158, 157, 173)
@@ -20,18 +23,59 @@ inner one, then along the upper lid."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
-    """What was measured of the points; arrays are read-only. Face frame: x to the subject's left, y up, z out."""
+    """What was measured of the points; arrays are read-only. Face frame: x to the subject's left, y up, z out.
+
+    Noise is in shares of a face's size, and its logarithm grows with ``1 - cos`` of an angle.
+    """
 
     mirror_images: Int[np.ndarray, " 468"]  # of each point; those of the midline are their own
     shape_mm: Float[np.ndarray, "468 3"]  # on a mean adult, about the mean of the points
     normals: Float[np.ndarray, "468 3"]  # of the skin there, unit
+    view_bias: Float[np.ndarray, "8 468 2"]  # coefficients of ``view_terms``
+    point_noise: Float[np.ndarray, " 2"]  # of each point by its own: seen straight on, growth from its normal on
+    view_noise: Float[np.ndarray, " 2"]  # of a view's points together: of a face that looks here, growth as it turns
 
 
 @cache
 def point_table() -> PointTable:
     """Reads the table that ships with the networks."""
     with np.load(Path(__file__).parent / "packs" / "points.npz", allow_pickle=False) as table:
-        arrays = (table["mirror_images"].astype(int), table["shape_mm"].astype(float), table["normals"].astype(float))
-    for array in arrays:
+        arrays = {name: table[name].astype(int if name == "mirror_images" else float) for name in table.files}
+    for array in arrays.values():
         array.flags.writeable = False
-    return PointTable(*arrays)
+    return PointTable(**arrays)
+
+
+def view_terms(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 8"]:
+    """Returns what a point's error depends on: terms to the third order of the direction from the face to the camera
+    (unit, face frame). ``VIEW_TERMS_MIRRORED`` are their signs for a mirror image."""
+    x, y, _ = direction
+    return np.array([1.0, x, y, x * x, x * y, y * y, x**3, x * x * y])
+
+
+VIEW_TERMS_MIRRORED = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
+
+
+def view_bias(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "468 2"]:
+    """Returns how far the network puts each point from where it is, seen from a direction: shares of the face's size,
+    right and down in a picture that is level with the face."""
+    return np.tensordot(view_terms(direction), point_table().view_bias, axes=1)
+
+
+def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None)) -> tuple[Similarity, float]:
+    """Returns where a mean face lies that is most like some of the points, by its breadth and height, and their depth
+    by its own."""
+    shape = point_table().shape_mm[which]
+    mean, middle = shape.mean(axis=0), points_world.mean(axis=0)
+    rotation = rigid_fit(shape, points_world).rotation
+    within = (points_world - middle) @ rotation
+    flat, shape = within[:, :2], shape - mean
+    scale = float((flat * shape[:, :2]).sum() / (shape[:, :2] ** 2).sum())
+    relief = float((within[:, 2] @ shape[:, 2]) / (shape[:, 2] @ shape[:, 2]) / scale) if scale > 0.0 else 0.0
+    return Similarity(scale, rotation, middle - scale * rotation @ mean), relief
+
+
+def direction_from_face(world_from_face: Similarity, camera: Camera) -> Float[np.ndarray, " 3"]:
+    """Returns the unit direction from a face to a camera, in the face's frame."""
+    towards = (camera.centre_world - world_from_face.translation) @ world_from_face.rotation
+    return towards / np.linalg.norm(towards)
