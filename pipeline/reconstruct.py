@@ -7,8 +7,10 @@ from pipeline.stages.bust import fuse_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import measure_depth
 from pipeline.stages.evidence import judge_head
+from pipeline.stages.faces import find_faces
 from pipeline.stages.head_fit import HeadFit, fit_head, fit_outlines
 from pipeline.stages.part_labels import PartLabels, label_parts
+from pipeline.stages.pose_check import check_pose
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
 from pipeline.stages.texturing import texture_head
@@ -35,12 +37,14 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         check_usd()
     run = Recorder(context.progress)
     views = run(find_views, context)
-    alignment = run(align_head, context, views)
+    faces = run(find_faces, context, views.capture)
+    alignment = run(align_head, context, views, faces)
     labels, head = fit_shape(run, context, views, alignment)
     depth = run(measure_depth, context, views, head, labels)
     refined = run(refine_head, context, views, head, labels, depth)
     texturing = run(texture_head, context, views, head, refined)
     bust = run(fuse_bust, context, views, depth, refined, texturing.capture)
+    pose = run(check_pose, context, faces, alignment, head, refined)
     evidence = run(judge_head, context, views, alignment, head, refined, texturing)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
@@ -50,12 +54,14 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         context.settings,
         context.capture.digests,
         views,
+        faces,
         alignment,
         labels,
         head,
         refined,
         texturing,
         bust,
+        pose,
         evidence,
         warnings=run.warnings,
         seconds=run.seconds(),

@@ -54,6 +54,13 @@ class SegmentationSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class FaceSettings:
+    """Faces found in the photographs."""
+
+    find: bool = True  # false: outlines alone say where the head is, unless feature points are given
+
+
+@dataclass(frozen=True, slots=True)
 class AlignmentSettings:
     """Section 4.2, and the search that replaces it when there are no feature points."""
 
@@ -249,6 +256,7 @@ class Settings:
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
     fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.diagnostics.WARNING_CODES) that are failures here
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
+    faces: FaceSettings = field(default_factory=FaceSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
     fitting: FittingSettings = field(default_factory=FittingSettings)
     parts: PartSettings = field(default_factory=PartSettings)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import locate_features
-from pipeline.alignment.procrustes import generalised_procrustes, procrustes
+from pipeline.alignment.procrustes import block_diagonal, generalised_procrustes, procrustes
 from pipeline.eigenheads.model import HeadModel
 from pipeline.multiview.triangulation import TriangulatedPoint
 from pipeline.settings import AlignmentSettings
@@ -87,7 +87,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     procrustes_only = procrustes(source[kept], target[kept])
     rows = np.flatnonzero(np.repeat(kept, 3))
     aligned = generalised_procrustes(
-        source[kept], target[kept], spread[np.ix_(rows, rows)], noise[kept], start=procrustes_only
+        source[kept], target[kept], spread[np.ix_(rows, rows)], block_diagonal(noise[kept]), start=procrustes_only
     )
     distances = np.linalg.norm(target - aligned.apply(source), axis=1)
     remarks += tuple(

@@ -33,21 +33,20 @@ def generalised_procrustes(
     source: Float[np.ndarray, "n 3"],
     target: Float[np.ndarray, "n 3"],
     source_covariance: Float[np.ndarray, "p p"],
-    target_covariances: Float[np.ndarray, "n 3 3"],
+    target_covariance: Float[np.ndarray, "p p"],
     *,
     start: Similarity,
     scale_spread: float = SCALE_SPREAD,
 ) -> Similarity:
-    """Maximum likelihood of ``target = T(source + e) + f``: ``e`` correlated over the points, ``f`` independent.
+    """Maximum likelihood of ``target = T(source + e) + f``: ``e`` (head frame) and ``f`` (world frame) correlated.
 
     Iterated generalised least squares from ``start``: the residual's covariance is ``s^2 R C R^T + F``, taken at the
     last estimate. log s has the prior N(0, ``scale_spread``^2).
     """
     scale, rotation, translation = start.scale, start.rotation, start.translation
-    noise = _block_diagonal(target_covariances)
     for _ in range(ITERATIONS):
         turn = scale * np.kron(np.eye(len(source)), rotation)
-        whiten = np.linalg.inv(np.linalg.cholesky(turn @ source_covariance @ turn.T + noise))
+        whiten = np.linalg.inv(np.linalg.cholesky(turn @ source_covariance @ turn.T + target_covariance))
         turned = scale * source @ rotation.T
         residual = (target - turned - translation).ravel()
         # columns: left turn about the head's origin, shift, log scale
@@ -62,7 +61,8 @@ def generalised_procrustes(
     return Similarity(scale, rotation, translation)
 
 
-def _block_diagonal(blocks: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "p p"]:
+def block_diagonal(blocks: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "p p"]:
+    """Returns the covariance of points that err independently of each other."""
     whole = np.zeros((len(blocks), 3, len(blocks), 3))
     whole[np.arange(len(blocks)), :, np.arange(len(blocks)), :] = blocks
     return whole.reshape(3 * len(blocks), -1)

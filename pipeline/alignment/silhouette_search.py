@@ -1,16 +1,19 @@
-"""Alignment without feature points, which the paper leaves open (section 6).
+"""Alignment without feature points or a found face, which the paper leaves open (section 6).
 
-Enters: silhouettes, the rig, which camera the subject faces. Leaves: world_from_head of the mean head.
+Enters: silhouettes, the rig, which camera the subject is thought to face. Leaves: world_from_head of the mean head, and
+how far the best other pose is behind.
 
-The subject's crown and the middle of its head come from the visual hull, up and front from the cameras; nothing leans
-on the axes of the world frame. From there the contour solver is started at several turns of the head with pose and a
-few modes on the coarsest mesh, the best few go on with a finer one, and the one that all eigenheads explain most
-closely wins: under thick hair 15 modes cannot tell the right pose from one that is 50 degrees off. A start 10 mm off
-ends in a local minimum under hair (docs/results.md), so the robust scale begins at 40 px.
+The subject's crown and the middle of its head come from the visual hull. Down is where the body leaves the pictures;
+where it does not, or the views disagree, every quarter turn about the line of sight is tried. Where cameras stand all
+around there is no middle of a fan to be guessed, and every way to face is tried. Nothing leans on the axes of the world
+frame. From each start the contour solver takes pose and a few modes on the coarsest mesh, the best few go on with a
+finer one, and the one that all eigenheads explain most closely wins: under thick hair 15 modes cannot tell the right
+pose from one that is 50 degrees off. A start 10 mm off ends in a local minimum under hair (docs/results.md), so the
+robust scale begins at 40 px.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -32,7 +35,12 @@ SPACING_MM, REACH_MM = 12.0, 264.0  # hull grid about the middle of the rig
 HEAD_SLAB_MM = (30.0, 150.0)  # below the crown: cranium and face, above any shoulder
 HAIR_MM = 12.0  # what hair adds to the crown, in the middle of what people wear
 YAWS_DEG, PITCHES_DEG = (-40.0, -20.0, 0.0, 20.0, 40.0), (-15.0, 0.0, 15.0)
-FINALISTS = 4
+YAWS_AROUND_DEG = tuple(np.arange(-180.0, 180.0, 30.0).tolist())
+ROLLS_DEG = (0.0, 90.0, 180.0, -90.0)
+FINALISTS, MANY_FINALISTS = 4, 8  # of starts about one guess, and of starts all around
+SAME_POSE_DEG, OTHER_POSE_DEG = 10.0, 20.0  # poses nearer than the first are one, beyond the second they are rivals
+MIN_AGREEMENT = 0.5  # of the borders where the body leaves the pictures: 1 where all say the same
+MIN_FAN = 0.3  # a ring has 0, cameras over half a circle 0.64
 COARSE = Stage("p99", 6, False, (40.0, 20.0, 10.0), False, True, 4)
 FINE = Stage("p95", 15, False, (20.0, 10.0, 6.0), False, True, 4)
 DEEP = Stage("p95", 60, True, (6.0, 4.0, 2.0), False, True, 4)
@@ -53,6 +61,14 @@ class NoSubject(EigenheadError):
         )
 
 
+@dataclass(frozen=True, slots=True)
+class FoundPose:
+    """``rival``: how much more the best pose that is turned otherwise costs, as a share; None where there is none."""
+
+    world_from_head: Similarity
+    rival: float | None
+
+
 def search_alignment(
     model: HeadModel,
     silhouettes: Mapping[str, Silhouette],
@@ -60,39 +76,100 @@ def search_alignment(
     settings: Settings,
     *,
     front: str,
+    stated: bool = False,
     report: Progress,
-) -> Similarity:
-    """world_from_head of the mean head, found from the silhouettes alone. Raises NoSubject."""
-    axes = subject_axes(rig, front)
-    origin = head_origin(model, silhouettes, rig, axes)
-    first = Similarity(1.0, axes, origin)
-    problem = make_problem(model, first, silhouettes, rig, settings.fitting, {}, levels=("p99", "p95"))
-    starts = [turned(first, yaw, pitch) for yaw, pitch in product(YAWS_DEG, PITCHES_DEG)]
+) -> FoundPose:
+    """Finds the pose of the mean head from the silhouettes alone. ``stated``: somebody said which camera is the front.
+
+    Raises NoSubject.
+    """
+    starts = list(start_poses(model, silhouettes, rig, front, stated=stated))
+    problem = make_problem(model, starts[0], silhouettes, rig, settings.fitting, {}, levels=("p99", "p95"))
     found = []
     for i, start in enumerate(starts):
         report("alignment", 0.7 * i / len(starts))
         found.append(_descended(problem, start_state(problem, start), COARSE))
     finalists = [state for _, state in sorted(found, key=lambda pair: pair[0])[:FINALISTS]]
-    close = max(JUDGED_PX, JUDGED_MM * float(pixels_per_mm(tuple(problem.rig), origin).mean()))
+    if len(starts) > len(YAWS_DEG) * len(PITCHES_DEG):
+        finalists = _differently_turned([state for _, state in sorted(found, key=lambda pair: pair[0])])
+    close = max(JUDGED_PX, JUDGED_MM * float(pixels_per_mm(tuple(problem.rig), starts[0].translation).mean()))
     judged = []
     for i, state in enumerate(finalists):
         report("alignment", 0.7 + 0.3 * i / len(finalists))
         _, fine = _descended(problem, state, FINE)
         cost, _ = _descended(problem, fine, replace(DEEP, modes=min(DEEP.modes, len(model.modes))), close)
-        judged.append((cost, fine))
-    return min(judged, key=lambda pair: pair[0])[1].world_from_head
+        judged.append((cost, fine.world_from_head))
+    least, best = min(judged, key=lambda pair: pair[0])
+    others = [cost for cost, pose in judged if turn_between_deg(pose, best) > OTHER_POSE_DEG]
+    return FoundPose(best, min(others) / least - 1.0 if others and least > 0 else None)
 
 
-def subject_axes(rig: Rig, front: str) -> Float[np.ndarray, "3 3"]:
-    """world_from_head rotation of a subject who sits upright and looks at the front camera.
-
-    Up is the mean of the images' up: cameras around a head are mounted alike, or in mirrored pairs.
-    """
-    up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
+def start_poses(
+    model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, front: str, *, stated: bool
+) -> Iterator[Similarity]:
+    """Yields where the descents begin: upright as the body stands or turned by quarters, looking to the front or,
+    where no front can be guessed, all around."""
     forward = rig[front].centre_world - rig.centre_world()
-    up -= forward * (up @ forward) / (forward @ forward)
-    y, z = up / np.linalg.norm(up), forward / np.linalg.norm(forward)
+    up = body_up(silhouettes, rig)
+    pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
+    axes = upright_axes(pictures_up if up is None else up, forward)
+    surrounded = not stated and fan_strength(rig) < MIN_FAN
+    rolls = (0.0,) if up is not None else ROLLS_DEG
+    for roll in rolls:
+        turn = rotation_from_vector(np.radians([0.0, 0.0, roll]))
+        rolled = axes @ turn
+        first = Similarity(1.0, rolled, head_origin(model, silhouettes, rig, rolled))
+        for yaw, pitch in product(YAWS_AROUND_DEG if surrounded else YAWS_DEG, PITCHES_DEG):
+            yield turned(first, yaw, pitch)
+
+
+def upright_axes(up_world: Float[np.ndarray, " 3"], forward_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """Returns the world_from_head rotation of a subject who sits upright and looks forward."""
+    up = up_world - forward_world * (up_world @ forward_world) / (forward_world @ forward_world)
+    y, z = up / np.linalg.norm(up), forward_world / np.linalg.norm(forward_world)
     return nearest_rotation(np.stack([np.cross(y, z), y, z], axis=1))
+
+
+def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray, " 3"] | None:
+    """Returns the world's direction away from where the body leaves the pictures; None where it leaves none, or views
+    disagree."""
+    total, weight = np.zeros(3), 0.0
+    for camera in rig:
+        silhouette = silhouettes.get(camera.name)
+        if silhouette is None or not silhouette.quality.usable:
+            continue
+        mask = silhouette.mask
+        crossed = {(-1.0, 0.0): mask[:, 0], (1.0, 0.0): mask[:, -1], (0.0, -1.0): mask[0], (0.0, 1.0): mask[-1]}
+        for (right, down), border in crossed.items():
+            share = float(border.mean())
+            total += share * (np.array([right, down, 0.0]) @ camera.camera_from_world.rotation)
+            weight += share
+    if weight == 0.0 or np.linalg.norm(total) < MIN_AGREEMENT * weight:
+        return None
+    return -total / np.linalg.norm(total)
+
+
+def fan_strength(rig: Rig) -> float:
+    """Returns 1 where all cameras stand on one side, 0 where they stand evenly around."""
+    directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
+    return float(np.linalg.norm((directions / np.linalg.norm(directions, axis=1, keepdims=True)).mean(axis=0)))
+
+
+def turn_between_deg(one: Similarity, other: Similarity) -> float:
+    """Returns the angle by which two poses are turned against each other."""
+    cosine = (np.trace(one.rotation.T @ other.rotation) - 1.0) / 2.0
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _differently_turned(states: Sequence[State]) -> list[State]:
+    """The best states of ``MANY_FINALISTS`` different poses, best first."""
+    chosen: list[State] = []
+    for state in states:
+        if all(turn_between_deg(state.world_from_head, other.world_from_head) > SAME_POSE_DEG for other in chosen):
+            chosen.append(state)
+        if len(chosen) == MANY_FINALISTS:
+            break
+    return chosen
 
 
 def head_origin(

@@ -66,7 +66,9 @@ def draw(model: HeadModel, seed: int, renderer: Renderer) -> Row:
     foreign = Rig(tuple(replace(c, camera_from_world=c.camera_from_world @ other.inverse()) for c in rig))
     began = time.perf_counter()
     try:
-        start = search_alignment(model, silhouettes, foreign, Settings(), front="cam00", report=lambda s, f: None)
+        start = search_alignment(
+            model, silhouettes, foreign, Settings(), front="cam00", stated=True, report=lambda s, f: None
+        ).world_from_head
     except EigenheadError as error:
         return {"right": False, "error": str(error), "seconds": time.perf_counter() - began}
     seconds = time.perf_counter() - began

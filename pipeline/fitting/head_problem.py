@@ -1,4 +1,4 @@
-"""The complete problem of one stage at one robust scale: rim, feature points, landmarks, photographs and priors as terms."""
+"""The complete problem of one stage at one robust scale: rim, points, photographs and priors as terms."""
 
 import numpy as np
 from jaxtyping import Float

@@ -1,13 +1,13 @@
 """The landmark term: where places of the face were found in the world, against where the head has them.
 
-With a place ``X(theta)`` of the head, its found position ``x`` and the covariance ``S`` of the difference (the
-triangulation's, and how far a network's idea of the place is off on other heads),
+With the places ``X(theta)`` of the head, stacked, their found positions ``x`` and the covariance ``S`` of the
+difference (of the triangulation, and of a network's idea of a face, in which all places err together),
 
     r = W (X(theta) - x),    W^T W = S^-1
     dr / d(coefficients) = W s R B,    dr / d(rotation, translation, log s) = W [-[X - t]x, I, X - t]
 
-under Geman and McClure's loss of ``|r|``. All places are found by one network, whose errors on one face hang together
-(an open mouth, a turned head): n places count as ``INDEPENDENT`` ones.
+as one residual under Geman and McClure's loss: a face that is another's loses its weight as a whole. Places that
+contradict the others have a larger variance in ``S`` already (``pipeline.alignment.face_alignment``).
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,7 @@ from pipeline.estimation.terms import Residuals
 from pipeline.fitting.problem import PER_CAMERA, POSE, LandmarkObservations, Stage, State, blended_basis
 from rig.geometry import cross_matrix
 
-FORGIVEN_SIGMAS = 4.0  # Geman-McClure scale, in standard deviations: a jaw that moved, a brow under hair
-INDEPENDENT = 12.0  # landmarks that tell as much as all of them: eyes, brows, nose, mouth, cheeks, chin by side
+FORGIVEN_SIGMAS = 3.0  # RMS of all coordinates, beyond which the landmarks are another face's
 
 
 def observe_landmarks(
@@ -30,7 +29,7 @@ def observe_landmarks(
     corner: Int[np.ndarray, "n 3"],
     blend: Float[np.ndarray, "n 3"],
     position_world: Float[np.ndarray, "n 3"],
-    covariance_world: Float[np.ndarray, "n 3 3"],
+    covariance_world: Float[np.ndarray, "p p"],
 ) -> LandmarkObservations:
     """Returns landmarks as the solver reads them.
 
@@ -39,10 +38,9 @@ def observe_landmarks(
         corner: vertices of the full level about each place.
         blend: their weights, which sum to 1.
         position_world: where the place was found, mm.
-        covariance_world: of the found position and of the place on other heads together, mm^2.
+        covariance_world: of all coordinates of the difference, x y z of the first place, then of the second, mm^2.
     """
-    shared = max(len(corner) / INDEPENDENT, 1.0)
-    whiten = np.linalg.cholesky(np.linalg.inv(shared * covariance_world)).transpose(0, 2, 1)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance_world))
     mean, basis = blended_basis(model, corner, blend)
     return LandmarkObservations(corner, blend, position_world, whiten, mean, basis)
 
@@ -57,21 +55,20 @@ class LandmarkTerm:
 
     def at(self, state: State) -> Residuals:
         points = landmark_points(self.observed, state)
-        residual = np.einsum("nij,nj->ni", self.observed.whiten, points - self.observed.position_world)
-        return Residuals(residual, lambda: self._rows(state, points), GemanMcClure(FORGIVEN_SIGMAS))
+        residual = self.observed.whiten @ (points - self.observed.position_world).ravel()
+        loss = GemanMcClure(FORGIVEN_SIGMAS * np.sqrt(len(residual)))
+        return Residuals(residual[None], lambda: self._rows(state, points)[None], loss)
 
-    def _rows(self, state: State, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 p"]:
+    def _rows(self, state: State, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "p u"]:
         observed, stage, pose = self.observed, self.stage, state.world_from_head
         cameras = PER_CAMERA * self.cameras if stage.cameras else 0
         rows = np.zeros((len(points), 3, stage.modes + POSE + cameras))
-        turned = pose.scale * observed.whiten @ pose.rotation
-        rows[:, :, : stage.modes] = np.einsum("nad,mnd->nam", turned, observed.basis[: stage.modes], optimize=True)
+        turned = pose.scale * (observed.basis[: stage.modes] @ pose.rotation.T)
+        rows[:, :, : stage.modes] = turned.transpose(1, 2, 0)
         arm = points - pose.translation
-        by_pose = np.concatenate(
-            [np.stack([-cross_matrix(x) for x in arm]), np.tile(np.eye(3), (len(arm), 1, 1)), arm[:, :, None]], axis=2
-        )
-        rows[:, :, stage.modes : stage.modes + POSE] = observed.whiten @ by_pose
-        return rows
+        by_pose = [np.stack([-cross_matrix(x) for x in arm]), np.tile(np.eye(3), (len(arm), 1, 1)), arm[:, :, None]]
+        rows[:, :, stage.modes : stage.modes + POSE] = np.concatenate(by_pose, axis=2)
+        return observed.whiten @ rows.reshape(3 * len(points), -1)
 
 
 def landmark_points(observed: LandmarkObservations, state: State) -> Float[np.ndarray, "n 3"]:

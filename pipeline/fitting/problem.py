@@ -58,13 +58,13 @@ class Observed:
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkObservations:
     """Places of the face that were found in the world (mm). ``corner`` and ``blend``: vertices of the full level and
-    their weights; ``whiten``: takes a difference (mm) to standard deviations; ``mean`` and ``basis``: the places of the
-    mean head and what the modes do to them, head frame."""
+    their weights; ``whiten``: takes all differences (mm, stacked) to standard deviations; ``mean`` and ``basis``: the
+    places of the mean head and what the modes do to them, head frame."""
 
     corner: Int[np.ndarray, "n 3"]
     blend: Float[np.ndarray, "n 3"]
     position_world: Float[np.ndarray, "n 3"]
-    whiten: Float[np.ndarray, "n 3 3"]
+    whiten: Float[np.ndarray, "p p"]
     mean: Float[np.ndarray, "n 3"]
     basis: Float32[np.ndarray, "m n 3"]
 

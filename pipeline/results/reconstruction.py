@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.diagnostics import ReportWarning
+from pipeline.evidence.pose import PoseEvidence
 from pipeline.settings import Settings
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.bust import Bust
 from pipeline.stages.evidence import Evidence
+from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.refined_head import RefinedHead
@@ -29,12 +31,14 @@ class Reconstruction:
     settings: Settings
     digests: Mapping[str, str]  # sha256 of every input file
     views: Views
+    faces: Faces
     alignment: Alignment
     labels: PartLabels
     head: HeadFit
     refined: RefinedHead
     texturing: Texturing
     bust: Bust | None
+    pose: PoseEvidence
     evidence: Evidence
     warnings: tuple[ReportWarning, ...]
     seconds: Mapping[str, float]  # per stage, and "total"

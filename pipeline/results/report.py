@@ -1,7 +1,7 @@
 """``report.json`` of a result (format ``eigenhead-report/1``): everything that a program may want to know of it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from typing import Any, TypedDict
 
@@ -12,6 +12,9 @@ from pipeline.dense.part_votes import PART_NAMES
 from pipeline.diagnostics import ReportWarning
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import Found, Posable
+from pipeline.evidence.pose import PoseEvidence
+from pipeline.faces.detection import FaceDetection
+from pipeline.faces.subject import SubjectFaces
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import document_from_settings
@@ -59,6 +62,26 @@ class CameraReport(TypedDict):
 class WarningReport(TypedDict):
     code: str
     message: str
+
+
+class FaceReport(TypedDict):
+    """The subject's face in a camera's picture; ``found`` is false where none was."""
+
+    found: bool
+    box_px: list[float] | None
+    roll_deg: float | None
+    landmarks: int
+    score: float | None
+
+
+class PoseReport(TypedDict):
+    """What the pose came from (landmarks, features or silhouettes), how much more the best other pose costs (a share),
+    by camera how far the head's landmarks lie from the found ones (by the face's size), and whether it is in doubt."""
+
+    method: str
+    rival: float | None
+    off: dict[str, float | None]
+    doubtful: bool
 
 
 class NamedModel(TypedDict):
@@ -148,6 +171,8 @@ class Report(TypedDict):
     method: str
     detail: dict[str, str]
     front: str
+    pose: PoseReport
+    faces: dict[str, FaceReport]
     cameras: dict[str, CameraReport]
     pictures: dict[str, str]
     coefficients: list[float]
@@ -181,6 +206,8 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "method": head.fit.method,
         "detail": {"level": refined.detail.level, "reason": refined.detail.reason},
         "front": result.alignment.front,
+        "pose": _pose(result.pose),
+        "faces": {} if result.faces.subject is None else _faces(result.faces.subject, evidence.cameras),
         "cameras": {
             name: _camera(figures, head.fit.camera_shift.get(name), result.views.silhouettes.get(name))
             for name, figures in evidence.cameras.items()
@@ -224,6 +251,32 @@ def _camera(
         "xor_cost_start": _finite(figures.xor_cost_start),
         "camera_shift": _optional_numbers(shift),
         "view": None if silhouette is None else _view(silhouette.quality),
+    }
+
+
+def _pose(pose: PoseEvidence) -> PoseReport:
+    return {
+        "method": pose.method,
+        "rival": _finite(pose.rival),
+        "off": {name: _finite(share) for name, share in pose.off.items()},
+        "doubtful": pose.doubtful,
+    }
+
+
+def _faces(subject: SubjectFaces, cameras: Iterable[str]) -> dict[str, FaceReport]:
+    seen = {} if subject.matched is None else subject.matched.detections
+    return {name: _face(seen.get(name)) for name in cameras}
+
+
+def _face(face: FaceDetection | None) -> FaceReport:
+    if face is None:
+        return {"found": False, "box_px": None, "roll_deg": None, "landmarks": 0, "score": None}
+    return {
+        "found": True,
+        "box_px": _numbers(face.box_px),
+        "roll_deg": _finite(face.roll_deg),
+        "landmarks": len(face.landmarks_px),
+        "score": _finite(face.score),
     }
 
 

@@ -1,27 +1,40 @@
 """Where the head is before its shape is known (section 4.2)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
+from pipeline.alignment.face_alignment import align_to_face, frontmost_camera
 from pipeline.alignment.landmarks import feature_alignment
 from pipeline.alignment.silhouette_search import search_alignment
 from pipeline.diagnostics import ReportWarning
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.model_basis import model_basis
+from pipeline.faces.landmark_map import landmark_map
+from pipeline.fitting.problem import LandmarkObservations
 from pipeline.settings import Settings
-from pipeline.stages.context import Progress, ReconstructionContext
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.faces import Faces
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
+from rig.progress import Progress
 from rig.rig import Rig
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The pose of the mean head, and the camera that the subject faces."""
+    """The pose of the mean head, the camera that the subject faces, and what the pose came from.
+
+    ``landmarks``: of the face that was found, where the pose came from them. ``rival``: how much more the best other
+    pose costs, as a share, where silhouettes decided.
+    """
 
     world_from_head: Similarity
     front: str
+    method: Literal["features", "landmarks", "silhouettes"]
+    landmarks: LandmarkObservations | None = None
+    rival: float | None = None
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:
@@ -34,10 +47,17 @@ def front_camera(rig: Rig, settings: Settings) -> str:
 
 
 @stage("alignment")
-def align_head(context: ReconstructionContext, views: Views) -> Staged[Alignment]:
-    """Aligns the mean head to the views. Raises TooFewFeatures, NoSubject."""
-    model = model_basis(context.model, context.settings)
-    return align_to_views(model, views, context.rig, context.settings, progress=context.progress)
+def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
+    """Aligns the mean head to feature points where the capture has any, to the face that was found, or to the
+    silhouettes. Raises TooFewFeatures, NoSubject."""
+    model, rig, settings = model_basis(context.model, context.settings), context.rig, context.settings
+    face = None if faces.subject is None else faces.subject.matched
+    if views.capture.features or face is None:
+        return align_to_views(model, views, rig, settings, progress=context.progress)
+    found = align_to_face(model, face, landmark_map(context.model))
+    facing, middle = found.world_from_head.rotation[:, 2], found.world_from_head.translation
+    front = settings.front or frontmost_camera(facing, middle, rig)
+    return Staged(Alignment(found.world_from_head, front, "landmarks", found.landmarks))
 
 
 def align_to_views(
@@ -46,8 +66,12 @@ def align_to_views(
     """Aligns the mean head to feature points where the capture has any, to the silhouettes otherwise."""
     front = front_camera(rig, settings)
     if not views.capture.features:
-        pose = search_alignment(model, views.silhouettes, rig, settings, front=front, report=progress)
-        return Staged(Alignment(pose, front))
+        stated = settings.front is not None
+        found = search_alignment(model, views.silhouettes, rig, settings, front=front, stated=stated, report=progress)
+        pose = found.world_from_head
+        if not stated:
+            front = frontmost_camera(pose.rotation[:, 2], pose.translation, rig)
+        return Staged(Alignment(pose, front, "silhouettes", rival=found.rival))
     found = feature_alignment(model, views.capture.features, rig, settings.alignment)
     warnings = [ReportWarning("features", remark) for remark in found.remarks]
-    return Staged(Alignment(found.world_from_head, front), warnings)
+    return Staged(Alignment(found.world_from_head, front, "features"), warnings)

@@ -64,6 +64,7 @@ def fit_outlines(context: ReconstructionContext, views: Views, alignment: Alignm
         rig,
         settings.fitting,
         features=features,
+        landmarks=alignment.landmarks,
         report=context.progress,
     )
     if settings.method == "simplex":

@@ -9,6 +9,7 @@ from pipeline.diagnostics import Detail, ReportWarning
 from pipeline.eigenheads.model import load_model
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.measurements import Landmark, Measurement
+from pipeline.evidence.pose import PoseEvidence
 from pipeline.fitting.fit import Fit
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.reconstruction import Reconstruction
@@ -16,6 +17,7 @@ from pipeline.settings import Settings
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.bust import Bust
 from pipeline.stages.evidence import Evidence
+from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.refined_head import RefinedHead
@@ -66,12 +68,14 @@ def made_up_result(
         settings or Settings(),
         {"images/cam00.png": "cd" * 32},
         Views(capture, silhouettes or {}, {}),
-        Alignment(fit.world_from_head, front),
+        Faces(None),
+        Alignment(fit.world_from_head, front, "silhouettes"),
         PartLabels({}),
         HeadFit(fit, load_model(), detail),
         RefinedHead(mesh_world, deviation_mm, detail),
         Texturing(mesh_world.normals(), {}, capture, Texture(colours, views), atlas),
         bust,
+        PoseEvidence("silhouettes", {}, None, False),
         evidence,
         warnings,
         seconds or {},

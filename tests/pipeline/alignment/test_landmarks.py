@@ -89,7 +89,7 @@ def test_generalised_procrustes_with_equal_covariances_is_procrustes() -> None:
     plain = procrustes(SOURCE, target)
     # Without a source covariance and with a free scale the likelihood is eq. (3).
     found = generalised_procrustes(
-        SOURCE, target, np.zeros((21, 21)), np.tile(np.eye(3), (7, 1, 1)), start=Similarity.identity(), scale_spread=1e6
+        SOURCE, target, np.zeros((21, 21)), np.eye(21), start=Similarity.identity(), scale_spread=1e6
     )
     assert found.scale == pytest.approx(plain.scale, rel=1e-8)
     np.testing.assert_allclose(found.rotation, plain.rotation, atol=1e-8)
@@ -99,7 +99,7 @@ def test_generalised_procrustes_with_equal_covariances_is_procrustes() -> None:
 def test_generalised_procrustes_beats_the_plain_one_on_heads_of_the_population(model: HeadModel) -> None:
     rng = np.random.default_rng(7)
     mean, spread = landmark_statistics(model, list(SEVEN_POINTS), 0.5)
-    noise = np.tile(0.25 * np.eye(3), (7, 1, 1))
+    noise = 0.25 * np.eye(21)
     root = np.linalg.cholesky(spread)
     plain_mm, weighed_mm = [], []
     for _ in range(60):

@@ -204,8 +204,8 @@ def landmarks_of_a_head() -> Case:
     rng, faces = np.random.default_rng(7), problem.model.levels["full"].faces
     corner, blend = faces[::40], rng.dirichlet(np.ones(3), len(faces[::40]))
     found = (problem.model.vertices(np.zeros(0))[corner] * blend[:, :, None]).sum(axis=1)
-    spread = rng.standard_normal((len(corner), 3, 3))
-    covariance = spread @ spread.transpose(0, 2, 1) + np.eye(3)
+    spread = rng.standard_normal((3 * len(corner), 3 * len(corner)))
+    covariance = spread @ spread.T / len(corner) + np.eye(len(spread))
     observed = observe_landmarks(problem.model, corner, blend, found + rng.normal(0.0, 2.0, found.shape), covariance)
     term = LandmarkTerm(observed, stage, len(problem.views.names))
     return replace(

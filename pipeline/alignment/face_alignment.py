@@ -1,0 +1,79 @@
+"""Alignment to the landmarks of a face that was found in the photographs: section 4.2 without anybody's clicks.
+
+Enters: a face matched over the views, and which places of the model its points are. Leaves: ``world_from_head`` of the
+mean head, and the same landmarks as the estimator reads them. As for clicked points, the model's own covariance of the
+places says what another head's face may differ by, and what is left over must be the pose's. Places that contradict the
+others (a jaw that is open, a brow under a fringe) lose weight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.alignment.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.eigenheads.model import HeadModel
+from pipeline.faces.landmark_map import LandmarkMap
+from pipeline.faces.matching import MatchedFaces
+from pipeline.faces.points import point_table
+from pipeline.fitting.landmark_term import observe_landmarks
+from pipeline.fitting.problem import LandmarkObservations, blended_basis
+from rig.geometry import Similarity
+from rig.rig import Rig
+
+POINTS = 72  # spread over the face: neighbours err alike and tell nothing more
+ROUNDS = 3  # of reweighting
+FORGIVEN_SIGMAS = 2.5  # a residual of that many deviations has twice its variance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceAlignment:
+    """``rms_sigmas``: of what is left between the mean head's places and the found ones, by what is expected."""
+
+    world_from_head: Similarity
+    landmarks: LandmarkObservations
+    rms_sigmas: float
+
+
+def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> FaceAlignment:
+    """Aligns the mean head of ``model``, which has the modes of the fit, to the face."""
+    which = spread_points(places)
+    mean, basis = blended_basis(model, places.rows[which], places.weights[which])
+    modes = basis.reshape(len(basis), -1).T.astype(float)
+    idea, shape = places.covariance(which), modes @ modes.T  # of the network and of heads, head frame
+    by_view = face.shared_mm[:, which].reshape(len(face.shared_mm), -1)
+    target, own = face.points_world[which], face.covariances[which]
+    source = mean + places.offset_mm[which]
+    expected = np.diag(idea + shape).reshape(-1, 3).sum(axis=1) + own.trace(axis1=1, axis2=2)
+    pose, squares = procrustes(source, target, 1.0 / expected), np.zeros(len(which))
+    noise = np.zeros_like(idea)
+    for _ in range(ROUNDS):
+        squares = ((target - pose.apply(source)) ** 2).sum(axis=1) / expected
+        doubt = 1.0 + squares / FORGIVEN_SIGMAS**2
+        noise = block_diagonal((doubt - 1.0)[:, None, None] * (expected / 3.0)[:, None, None] * np.eye(3) + own)
+        noise += by_view.T @ by_view
+        pose = generalised_procrustes(source, target, idea + shape, noise, start=pose)
+    turn = pose.scale * np.kron(np.eye(len(which)), pose.rotation)
+    position = target - pose.scale * places.offset_mm[which] @ pose.rotation.T
+    covariance = noise + turn @ idea @ turn.T
+    landmarks = observe_landmarks(model, places.rows[which], places.weights[which], position, covariance)
+    return FaceAlignment(pose, landmarks, float(np.sqrt(squares.mean())))
+
+
+def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:
+    """Returns ``POINTS`` of the points that do not slide, each as far from those before it as can be."""
+    rest = np.flatnonzero(~places.slides)
+    deviation = np.sqrt((places.deviation_mm**2).sum(axis=1))
+    position = point_table().shape_mm
+    chosen = [rest[int(deviation[rest].argmin())]]
+    distance = np.full(len(rest), np.inf)
+    while len(chosen) < min(POINTS, len(rest)):
+        distance = np.minimum(distance, np.linalg.norm(position[rest] - position[chosen[-1]], axis=1))
+        chosen.append(rest[int(distance.argmax())])
+    return np.sort(np.array(chosen))
+
+
+def frontmost_camera(facing_world: Float[np.ndarray, " 3"], middle_world: Float[np.ndarray, " 3"], rig: Rig) -> str:
+    """Returns the camera towards which a face looks most."""
+    towards = {camera.name: camera.centre_world - middle_world for camera in rig}
+    return max(towards, key=lambda name: float(towards[name] @ facing_world / np.linalg.norm(towards[name])))

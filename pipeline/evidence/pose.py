@@ -1,0 +1,128 @@
+"""Is the head where the photographs show the face? The pose judged against what was found, and against its rivals.
+
+Enters: the delivered head, the faces that were found in the photographs, and what the pose came from. Leaves:
+``PoseEvidence`` and warnings. A face that lies elsewhere in most of the views that show one is never passed over;
+where nobody found a face, outlines alone decided, and say so.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.diagnostics import ReportWarning
+from pipeline.faces.detection import FaceDetection
+from pipeline.faces.landmark_map import LandmarkMap
+from pipeline.faces.subject import SubjectFaces
+from rig.geometry import Similarity
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+ELSEWHERE = 0.12  # of the face's size in the picture, RMS over its points; of a right head 0.01 to 0.04
+MIN_FACING = 0.5  # cosine: a camera that sees the head so far from the front must see the face, too
+MIN_VIEWS = 2
+RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best is not beaten
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEvidence:
+    """``off``: by camera, the RMS distance of the head's landmarks from the found ones, by the face's size.
+    ``rival``: how much more the best other pose costs, as a share of the cost; None where none was tried."""
+
+    method: str
+    off: Mapping[str, float]
+    rival: float | None
+    doubtful: bool
+
+
+def judge_pose(
+    head_world: Mesh,
+    world_from_head: Similarity,
+    rig: Rig,
+    subject: SubjectFaces | None,
+    places: LandmarkMap | None,
+    *,
+    method: str,
+    rival: float | None,
+) -> tuple[PoseEvidence, list[ReportWarning]]:
+    """Compares the delivered head with the faces that were found.
+
+    Args:
+        head_world: full level, mm.
+        world_from_head: its pose.
+        rig: the cameras as calibrated.
+        subject: the faces; None where nobody looked for any.
+        places: where on the head the landmarks are; None likewise.
+        method: what the pose came from: features, landmarks or silhouettes.
+        rival: of the search about silhouettes.
+    """
+    warnings: list[ReportWarning] = []
+    off: dict[str, float] = {}
+    if subject is not None and places is not None:
+        off = landmark_offsets(subject, places, head_world, world_from_head, rig)
+        elsewhere = [name for name, share in off.items() if share > ELSEWHERE]
+        if len(elsewhere) >= MIN_VIEWS and 2 * len(elsewhere) > len(off):
+            warnings.append(ReportWarning("face-elsewhere", _elsewhere(elsewhere, off)))
+        facing = cameras_in_front(world_from_head, rig)
+        if not off and len(facing) >= MIN_VIEWS:
+            warnings.append(ReportWarning("no-face", _no_face(len(facing))))
+    unbeaten = rival is not None and rival < RIVAL_MARGIN
+    if unbeaten:
+        text = f"another pose explains the outlines almost as well (its cost is {rival:.1%} higher)"
+        remedy = "look at the overlays; give feature points, --front or more views"
+        warnings.append(ReportWarning("pose-doubtful", f"{text}: {remedy}"))
+    doubtful = bool(warnings)
+    return PoseEvidence(method, off, rival, doubtful), warnings
+
+
+def landmark_offsets(
+    subject: SubjectFaces, places: LandmarkMap, head_world: Mesh, world_from_head: Similarity, rig: Rig
+) -> dict[str, float]:
+    """Returns by camera how far the head's landmarks lie from those that were found, by the face's size.
+
+    Of a view with several faces the nearest one counts: others may be a poster, or somebody behind.
+    """
+    turned = world_from_head.scale * places.offset_mm @ world_from_head.rotation.T
+    expected_world = (places.points(head_world.vertices) + turned)[~places.slides]
+    offsets = {}
+    for name, faces in _seen(subject).items():
+        pixels = rig[name].project(expected_world)
+        offsets[name] = min(_offset(pixels, face.landmarks_px[~places.slides], face.size_px) for face in faces)
+    return offsets
+
+
+def cameras_in_front(world_from_head: Similarity, rig: Rig) -> tuple[str, ...]:
+    """Returns the cameras that see the head from the front."""
+    facing, middle = world_from_head.rotation[:, 2], world_from_head.translation
+    towards = {camera.name: camera.centre_world - middle for camera in rig}
+    return tuple(name for name, way in towards.items() if way @ facing > MIN_FACING * np.linalg.norm(way))
+
+
+def _seen(subject: SubjectFaces) -> dict[str, tuple[FaceDetection, ...]]:
+    """The subject's face by camera; where views do not agree on one, whatever each shows."""
+    if subject.matched is None:
+        return {name: faces for name, faces in subject.found.items() if faces}
+    return {name: (face,) for name, face in subject.matched.detections.items()}
+
+
+def _offset(pixels: Float[np.ndarray, "n 2"], found: Float[np.ndarray, "n 2"], size_px: float) -> float:
+    if not np.isfinite(pixels).all():
+        return np.inf
+    return float(np.sqrt(((pixels - found) ** 2).sum(axis=1).mean()) / size_px)
+
+
+def _elsewhere(names: list[str], off: Mapping[str, float]) -> str:
+    where = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    worst = max(min(off[name], 10.0) for name in names)
+    return (
+        f"the head's face is not where the photographs show one: in {where} it lies up to {worst:.1f} face sizes away. "
+        "Do not use this head: give feature points or --front, and check calibration and masks"
+    )
+
+
+def _no_face(views: int) -> str:
+    return (
+        f"no face was found in the photographs, though {views} cameras stand before the head as it was fitted: its "
+        "pose comes from outlines alone. Look at the overlays; give feature points or --front where it is wrong"
+    )

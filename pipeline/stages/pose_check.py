@@ -1,0 +1,27 @@
+"""Whether the delivered head lies where the photographs show the face."""
+
+from pipeline.evidence.pose import PoseEvidence, judge_pose
+from pipeline.faces.landmark_map import landmark_map
+from pipeline.stages.alignment import Alignment
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.faces import Faces
+from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.refined_head import RefinedHead
+
+
+@stage("evidence")
+def check_pose(
+    context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
+) -> Staged[PoseEvidence]:
+    """Compares the delivered head with the faces that were found, and its pose with the best other one."""
+    evidence, warnings = judge_pose(
+        refined.mesh_world,
+        head.fit.world_from_head,
+        context.rig,
+        faces.subject,
+        None if faces.subject is None else landmark_map(context.model),
+        method=alignment.method,
+        rival=alignment.rival,
+    )
+    return Staged(evidence, warnings)
