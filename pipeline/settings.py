@@ -133,7 +133,8 @@ class FineSettings:
     coarse_floor_mm: float = 0.3  # the nodes' edges are 4 mm long: relief that they cannot follow
     correlation_mm: float = 4.0  # radius within which points err alike: windows of dense matching overlap
     common_mm: float = 0.1  # what points may err alike beyond that: cameras, shading
-    views_least: int = 4  # that agree on a point: with fewer, beside hair and behind ears, it lies 1 mm too deep
+    views_least: int = 4  # that agree on a point, where eight see it or more: with fewer, beside hair and behind ears,
+    # it lies 1 mm too deep. Where fewer see it, half of them; two at least
     hair_off_mm: float = 0.5  # how far beside the skin a point lies that is hair after all
     facing_least: float = 0.35  # cosine between a point's normal and its view: flatter windows smear
     least_share: float = 0.2  # of the face's vertices that the dense surface must show, or it is no use
