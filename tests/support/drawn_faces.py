@@ -85,3 +85,79 @@ def seen_face(
     points = camera.project(world_from_face.apply(shape)) + shift_px + rng.normal(0.0, noise_px, (len(shape), 2))
     box = np.concatenate([points.min(axis=0), points.max(axis=0)])
     return FaceDetection(points, np.zeros(len(points)), score, box, crop_around(points).roll_deg)
+
+
+PAINT_PX_PER_MM = 2.0  # of the drawing that is laid on a head or a poster
+PAINT_MIDDLE = (300.0, 300.0)  # px of that drawing, where the face's middle is
+DEPTH_ROUNDS = 12  # of the search for where a ray meets the relief; it halves its error each time
+EYES_MM = ((-33.0, 20.0), (33.0, 20.0))  # x to the subject's left, y up: the drawn eyes' middles, the right one first
+
+
+def photographed_face(
+    camera: Camera, world_from_face: Similarity, *, flat: bool = False, behind: ImageRgb | None = None
+) -> ImageRgb:
+    """A camera's picture of the drawn face on a head (its relief: an ellipsoid with a nose), or on a flat poster.
+
+    Face frame: origin between the ears, z out of the face. From behind there is hair.
+    """
+    k = camera.intrinsics
+    columns, rows = np.meshgrid(np.arange(k.width), np.arange(k.height))
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float)
+    face_from_world = world_from_face.inverse()
+    start = face_from_world.apply(camera.centre_world[None])[0]
+    rays = camera.rays_world(pixels) @ face_from_world.rotation.T
+    image = np.tile(np.float32(WALL), (len(pixels), 1)) if behind is None else behind.reshape(-1, 3).astype(np.float32)
+    if start[2] <= 0.0 and flat:
+        return np.rint(image).astype(np.uint8).reshape(k.height, k.width, 3)
+    if not flat:
+        along, meets = _on_ellipsoid(start, rays)
+        image[meets] = HAIR
+        points = start + along[:, None] * rays
+        for _ in range(DEPTH_ROUNDS):
+            beside = np.where(meets, relief_mm(points[:, 0], points[:, 1]) - points[:, 2], 0.0)
+            along = along + 0.5 * beside / np.where(np.abs(rays[:, 2]) > 0.2, rays[:, 2], np.inf)
+            points = start + along[:, None] * rays
+        shown = meets & (np.abs(relief_mm(points[:, 0], points[:, 1]) - points[:, 2]) < 1.0) & (points[:, 2] > 5.0)
+        shown &= rays[:, 2] < -0.1
+    else:
+        points = start - (start[2] / np.where(np.abs(rays[:, 2]) > 1e-6, rays[:, 2], np.nan))[:, None] * rays
+        shown = (np.abs(points[:, 0]) < 140.0) & (np.abs(points[:, 1]) < 140.0)
+    paint = drawn_face(600, 600, (PAINT_MIDDLE,), scale=PAINT_PX_PER_MM)
+    places = (points[:, :2] * (PAINT_PX_PER_MM, -PAINT_PX_PER_MM) + PAINT_MIDDLE).astype(np.float32)
+    across, down = np.nan_to_num(places, nan=-1.0).T.reshape(2, k.height, k.width)
+    painted = cv2.remap(paint, across, down, cv2.INTER_LINEAR).reshape(-1, 3)
+    light = np.float32(1.0) if flat else _light(points)[:, None]
+    image[shown] = (painted * light)[shown]
+    smooth = cv2.GaussianBlur(image.reshape(k.height, k.width, 3), (0, 0), 0.7)
+    return np.rint(np.clip(smooth, 0, 255)).astype(np.uint8)
+
+
+SEMI_AXES_MM = (80.0, 115.0, 95.0)
+
+
+def relief_mm(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Depth of the drawn head's front (z) by place (x, y), mm."""
+    a, b, c = SEMI_AXES_MM
+    front = c * np.sqrt(np.maximum(1.0 - (x / a) ** 2 - (y / b) ** 2, 0.0))
+    nose = 24.0 * np.exp(-((x / 11.0) ** 2) - np.where(y > -18.0, ((y + 18.0) / 22.0) ** 2, ((y + 18.0) / 7.0) ** 2))
+    sockets = sum(-7.0 * np.exp(-(((x - ex) / 15.0) ** 2) - ((y - ey) / 12.0) ** 2) for ex, ey in EYES_MM)
+    return front + nose + sockets
+
+
+def _on_ellipsoid(
+    start: Float[np.ndarray, " 3"], rays: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], np.ndarray]:
+    """How far along each ray the head's ellipsoid begins, and whether it is met."""
+    p, d = start / SEMI_AXES_MM, rays / SEMI_AXES_MM
+    square, middle = (d**2).sum(axis=1), d @ p
+    root = middle**2 - square * (p @ p - 1.0)
+    return (-middle - np.sqrt(np.maximum(root, 0.0))) / square, root > 0.0
+
+
+def _light(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Shading by a lamp above on the right of the subject."""
+    x, y = points[:, 0], points[:, 1]
+    slope_x = (relief_mm(x + 0.5, y) - relief_mm(x - 0.5, y)).astype(np.float32)
+    slope_y = (relief_mm(x, y + 0.5) - relief_mm(x, y - 0.5)).astype(np.float32)
+    cosine = (0.35 * slope_x - 0.45 * slope_y + 1.0) / np.sqrt(1.0 + slope_x**2 + slope_y**2) / 1.15
+    return np.clip(0.45 + 0.65 * np.maximum(cosine, 0.0), 0.0, 1.25).astype(np.float32)

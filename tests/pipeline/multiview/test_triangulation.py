@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from pipeline.alignment.feature_points import locate_features
-from pipeline.multiview.triangulation import NoPoint, triangulate
+from pipeline.multiview.triangulation import NoPoint, triangulate, triangulate_many
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import look_at
 from rig.rig import Rig
@@ -118,3 +118,56 @@ def test_two_views_that_contradict_each_other_lose_the_point() -> None:
     located = locate_features({"pronasale": pixels, "gnathion": {"left": pixels["left"]}}, RIG, noise_px=1.5)
     assert not located.points
     assert [remark.split()[1] for remark in located.remarks] == ["pronasale", "gnathion"]
+
+
+def many(count: int, noise_px: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points, and their pixels in every view with noise."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-120.0, 120.0, (count, 3))
+    pixels = np.stack([np.stack(list(seen(point).values())) for point in points], axis=1)
+    return points, pixels + rng.normal(0.0, noise_px, pixels.shape)
+
+
+def test_many_points_are_each_what_one_is() -> None:
+    """Found alone and together: the same points and covariances, to where the iteration stops."""
+    _, pixels = many(12, 1.5)
+    together = triangulate_many(pixels, RIG.cameras, np.full(pixels.shape[:2], 1.5))
+    for k in range(12):
+        alone = triangulate(dict(zip(RIG.names, pixels[:, k], strict=True)), RIG, noise_px=1.5)
+        np.testing.assert_allclose(together.positions_world[k], alone.position_world, atol=1e-4)
+        np.testing.assert_allclose(together.covariances[k], alone.covariance, rtol=1e-4)
+        np.testing.assert_allclose(together.residuals_px[:, k], np.stack(list(alone.residuals_px.values())), atol=1e-4)
+
+
+def test_views_count_by_their_noise() -> None:
+    """A view of infinite noise says nothing, whatever it shows; one of large noise hardly anything."""
+    points, pixels = many(30, 0.0)
+    pixels[1] += (40.0, -25.0)
+    noise = np.ones(pixels.shape[:2])
+    noise[1] = np.inf
+    left_out = triangulate_many(pixels, RIG.cameras, noise)
+    np.testing.assert_allclose(left_out.positions_world, points, atol=1e-5)
+    noise[1] = 1e3
+    hardly = triangulate_many(pixels, RIG.cameras, noise)
+    assert 0.0 < np.linalg.norm(hardly.positions_world - points, axis=1).max() < 1e-3
+
+
+def test_many_points_err_as_their_covariances_say() -> None:
+    points, pixels = many(400, 2.0, seed=4)
+    found = triangulate_many(pixels, RIG.cameras, np.full(pixels.shape[:2], 2.0))
+    miss = found.positions_world - points
+    squares = np.einsum("ni,nij,nj->n", miss, np.linalg.inv(found.covariances), miss)
+    # The sum is chi-square with 1200 degrees of freedom, whose standard deviation is 49.
+    assert abs(squares.sum() - 1200.0) < 4 * 49.0
+
+
+def test_what_determines_no_point_among_many_is_said() -> None:
+    _, pixels = many(5, 0.0)
+    noise = np.ones(pixels.shape[:2])
+    noise[1:, 3] = np.inf  # one view of the fourth point
+    with pytest.raises(NoPoint, match="parallel"):
+        triangulate_many(pixels, RIG.cameras, noise)
+    behind = pixels.copy()
+    behind[0], behind[2] = (-4000.0, 377.0), (5000.0, 377.0)  # outside the lens model, or rays that meet behind
+    with pytest.raises(NoPoint):
+        triangulate_many(behind, RIG.cameras, np.ones(pixels.shape[:2]))

@@ -1,0 +1,142 @@
+"""Which surface point of a head model each of the finder's 468 points is, and how far it errs.
+
+Both were measured on renders of heads of the model's own population (``python -m tests.support.landmark_map``) for the
+two models that are built in: MakeHuman's and ICT-FaceKit, known by their triangles. To any other model the points are
+carried from the first's mean head, by the landmarks that the models share, and what that costs is added to the noise.
+
+A point that the finder puts at x (triangulated, without its biases) is ``map.points(vertices) + e``: e has mean
+``offset_mm``, a part of each point by its own (``deviation_mm``) and a part in which all move together (``shared_mm``),
+since the finder has an idea of a face and keeps to it.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.eigenheads.correspondence.closest import SurfaceIndex
+from pipeline.eigenheads.correspondence.warp import landmark_warp
+from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.kept_arrays import kept_arrays
+from rig.errors import EigenheadError
+
+BUILT_IN = ("makehuman", "ict-facekit")
+CARRIED_MM = 1.9  # per axis; of MakeHuman's points carried to ICT-FaceKit, against those measured there, and back
+SLIDING_MM = 3.0  # per axis; a point that errs by more slides along the skin
+MIN_LANDMARKS = 6  # that models share, for one to be carried to the other
+
+
+class NoLandmarkMap(EigenheadError):
+    """A model on which nobody knows where the points of a face are."""
+
+    def __init__(self, name: str, shared: int) -> None:
+        super().__init__(
+            f"faces that are found in photographs cannot be brought onto the head model {name}: it names {shared} of "
+            f"the 26 landmarks, and {MIN_LANDMARKS} are needed (docs/models.md); import it again with its landmarks"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkMap:
+    """A model's surface points for the finder's points, and the finder's error (mm, head frame). Read-only arrays."""
+
+    rows: Int[np.ndarray, "468 3"]  # vertices of the full level
+    weights: Float[np.ndarray, "468 3"]  # of them; each row sums to 1
+    offset_mm: Float[np.ndarray, "468 3"]  # mean of found minus true
+    deviation_mm: Float[np.ndarray, "468 3"]  # along each axis, of each point by its own
+    shared_mm: Float[np.ndarray, "m 468 3"]  # modes, each times a standard normal number
+    slides: Bool[np.ndarray, " 468"]  # jaw line, forehead: better left out of what looks for single points
+
+    def points(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
+        """The surface points of a head with these vertices (full level, any frame)."""
+        return (vertices[self.rows] * self.weights[..., None]).sum(axis=1)
+
+    def expected(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
+        """Where the finder puts them in the mean, for vertices in the head frame."""
+        return self.points(vertices) + self.offset_mm
+
+    def covariance(self, which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
+        """Of the errors of some points, x y z of the first, then of the second and so on (mm^2, head frame)."""
+        modes = self.shared_mm[:, which].reshape(len(self.shared_mm), -1)
+        return modes.T @ modes + np.diag(self.deviation_mm[which].ravel() ** 2)
+
+
+def landmark_map(model: HeadModel) -> LandmarkMap:
+    """Returns a model's map: the measured one where its triangles are a built-in model's, else a carried one.
+
+    Raises NoLandmarkMap where the model names too few landmarks.
+    """
+    digest = faces_digest(model)
+    for name in BUILT_IN:
+        if str(_table()[f"{name}_faces"]) == digest:
+            return built_in_map(name)
+    carried = _carried(model)
+    offset = np.mean([_table()[f"{name}_offset_mm"] for name in BUILT_IN], axis=0)
+    return _map(carried["rows"], carried["weights"], offset, CARRIED_MM)
+
+
+def built_in_map(name: str) -> LandmarkMap:
+    """Returns the measured map of ``makehuman`` or ``ict-facekit``."""
+    table = _table()
+    return _map(table[f"{name}_rows"], table[f"{name}_weights"], table[f"{name}_offset_mm"], 0.0)
+
+
+def faces_digest(model: HeadModel) -> str:
+    """Returns the sha256 of a model's triangles: heads of one topology have their points at the same rows."""
+    faces = np.ascontiguousarray(model.levels["full"].faces, np.int32)
+    return hashlib.sha256(faces.tobytes()).hexdigest()
+
+
+def _map(rows: np.ndarray, weights: np.ndarray, offset_mm: np.ndarray, carried_mm: float) -> LandmarkMap:
+    table = _table()
+    shared = table["shared_mm"].astype(float)
+    deviation = np.sqrt(table["deviation_mm"].astype(float) ** 2 + carried_mm**2)
+    total = np.sqrt((deviation**2 + (shared**2).sum(axis=0)).mean(axis=1))
+    weights = weights.astype(float)
+    arrays = (
+        rows.astype(int), weights / weights.sum(axis=1, keepdims=True), offset_mm.astype(float), deviation, shared,
+        total > np.hypot(SLIDING_MM, carried_mm),
+    )  # fmt: skip
+    for array in arrays:
+        array.flags.writeable = False
+    return LandmarkMap(*arrays)
+
+
+def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
+    """Rows and weights of the default model's points on another model's mean head."""
+    marks = model.levels["full"].landmarks
+    default = load_model()
+    names = sorted(set(marks) & set(default.levels["full"].landmarks))
+    if len(names) < MIN_LANDMARKS:
+        raise NoLandmarkMap(model.name, len(names))
+    faces, mean = model.levels["full"].faces, model.vertices(np.zeros(0))
+    targets = mean[[marks[name] for name in names]]
+
+    def make() -> dict[str, np.ndarray]:
+        vertices = default.vertices(np.zeros(0))
+        sources = vertices[[default.levels["full"].landmarks[name] for name in names]]
+        points = landmark_map(default).points(vertices)
+        hits = SurfaceIndex(mean, faces).closest(landmark_warp(sources, targets, points))
+        return {"rows": faces[hits.triangles], "weights": hits.weights}
+
+    table = _table()
+    given = (
+        mean,
+        np.asarray(faces),
+        targets,
+        names,
+        default.sha256,
+        table["makehuman_rows"],
+        table["makehuman_weights"],
+    )
+    return kept_arrays("landmark-map", given, make, made_by=(SurfaceIndex, landmark_warp))
+
+
+@cache
+def _table() -> Mapping[str, np.ndarray]:
+    with np.load(Path(__file__).parent / "packs" / "landmark_maps.npz", allow_pickle=False) as table:
+        return {name: table[name] for name in table.files}
