@@ -43,6 +43,7 @@ from rig.studio.scene.subject import Colour, Subject, random_look
 from rig.studio.scene.visible import PARTS, VisiblePoints, sees
 from rig.studio.sensor.faults import Fault
 from rig.studio.sensor.preset import PRESET, Preset
+from rig.studio.sensor.realism import REALISM, made_real
 
 EVIDENCE = ("plates", "masks", "neither")
 FRONTAL_COUNTS, CIRCLE_COUNTS = (3, 5, 8, 11), (5, 8, 11, 12, 16)
@@ -127,12 +128,14 @@ class StudioKind:
     expression: Mapping[str, float] = field(default_factory=dict)  # weights under Apple's names
     skin: Colour | None = None
     is_before_own_colour: bool = False  # hair, clothes and backdrop alike, and dark
+    realism: tuple[str, ...] = ()  # of ``sensor.realism``
     unevenness: float = 1.0  # of the backdrop; 0.15 is the plain wall of a living room
 
 
 ROW_DEG = row_directions(3, 100.0, 500.0)
 SMILE = {"mouthSmileLeft": 0.8, "mouthSmileRight": 0.8, "jawOpen": 0.2}
 ELEVEN_DEG = DEFAULT_DIRECTIONS_DEG
+REAL = tuple(REALISM)
 STUDIO_KINDS = (
     StudioKind("bald", "front-3", ROW_DEG, 500.0, hairstyle=("bald",), unevenness=0.15),
     StudioKind("long-hair", "front-3", ROW_DEG, 500.0, hairstyle=("long",), unevenness=0.15),
@@ -149,6 +152,8 @@ STUDIO_KINDS = (
     StudioKind("pitch-up", "front-11", ELEVEN_DEG, pose_deg=(-20.0, -35.0, 10.0), hairstyle=("short",)),
     StudioKind("jaw-open", "front-11", ELEVEN_DEG, hairstyle=("bald",), expression={"jawOpen": 0.6}),
     StudioKind("dark", "front-11", ELEVEN_DEG, skin=DARK_SKIN, is_before_own_colour=True),
+    StudioKind("real-skin", "front-3", ROW_DEG, 500.0, hairstyle=("bald",), realism=REAL, unevenness=0.15),
+    StudioKind("real-skin", "front-11", ELEVEN_DEG, hairstyle=("short",), realism=REAL),
     StudioKind("cap", "front-5", FIVE_DEG, 800.0, hairstyle=("cap",)),
     StudioKind("short", "circle-8", circle_directions(8), hairstyle=("short",)),
     StudioKind("yaw", "circle-8", circle_directions(8), pose_deg=(45.0, 10.0, 0.0), hairstyle=("bald",)),
@@ -263,7 +268,8 @@ def photograph(
     subject = Subject(head, marks, face, studio.what, closed_lids(weights))
     rig = rig_from_directions(studio.directions_deg, distance_mm=studio.distance_mm, rolls_deg=studio.rolls_deg)
     look = random_look(rng)
-    preset = replace(PRESET, hairstyle=studio.hairstyle, backdrop_unevenness=studio.unevenness)
+    plain = replace(PRESET, hairstyle=studio.hairstyle, backdrop_unevenness=studio.unevenness)
+    preset = made_real(plain, studio.realism)
     shot = simulate(
         subject,
         rig,

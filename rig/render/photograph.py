@@ -50,6 +50,7 @@ class Part:
     irradiance: Float[np.ndarray, "v 3"]
     grain: Grain
     one_sided: bool = False  # nobody can look at its inside: half the triangles need not be drawn
+    oil: Float[np.ndarray, " v"] | None = None  # strength of sharp highlights; None: none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +104,8 @@ def _noise_texture(gl: moderngl.Context, gallery: Gallery) -> moderngl.Texture3D
 
 
 def _upload(gl: moderngl.Context, owned: Owned, part: Part, origin: Float[np.ndarray, " 3"]) -> list[moderngl.Buffer]:
-    columns = (part.vertices - origin, part.normals, part.places, part.paint, part.irradiance)
+    oil = np.zeros((len(part.vertices), 1)) if part.oil is None else part.oil[:, None]
+    columns = (part.vertices - origin, part.normals, part.places, part.paint, part.irradiance, oil)
     table = np.ascontiguousarray(np.concatenate(columns, axis=1), np.float32)
     indices = np.ascontiguousarray(part.faces, np.int32)
     return [owned(gl.buffer(array.tobytes())) for array in (table, indices)]
@@ -152,7 +154,7 @@ def _draw(
                 if turn == 0:
                     target.clear()
                 _set_uniforms(program, part.grain, gallery)
-                layout = (table, "3f 3f 3f 4f 3f", "position", "normal", "place", "paint", "irradiance")
+                layout = (table, "3f 3f 3f 4f 3f 1f", "position", "normal", "place", "paint", "irradiance", "oil")
                 draw = owned(gl.vertex_array(program, [layout, camera_row], index_buffer=indices))
                 draw.render(instances=1)
         gl.copy_framebuffer(resolved, target)

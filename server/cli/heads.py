@@ -4,7 +4,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
@@ -24,6 +24,9 @@ from server.cli.answers import (
     warn,
     wrong_usage,
 )
+
+if TYPE_CHECKING:
+    from rig.studio.sensor.preset import Preset
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -208,6 +211,10 @@ def simulate(
         str | None,
         typer.Option(help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, glasses."),
     ] = None,
+    realism: Annotated[
+        str | None,
+        typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
+    ] = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
     expression: Annotated[
         list[str] | None,
@@ -230,13 +237,8 @@ def simulate(
 
     --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
     given) with which the rig commands and the service work as with a real rig."""
-    from dataclasses import replace
-
-    from rig.studio.sensor.preset import PRESET
-
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
-    preset = replace(PRESET, hair=not no_hair, **{k: v for k, v in chosen.items() if v is not None})
-    preset = replace(preset, hairstyle=tuple(hair.split(",")) if hair else ())
+    preset = _studio_preset(realism, hair=not no_hair, hairstyle=tuple(hair.split(",")) if hair else (), **chosen)
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
                       faults=fault or [], expression=expression or [])  # fmt: skip
@@ -253,6 +255,20 @@ def simulate(
         truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
                                 expression=expression or [])  # fmt: skip
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
+    """The studio's preset with what was chosen. A realism that nobody knows is wrong usage."""
+    from dataclasses import replace
+
+    from rig.studio.sensor.preset import PRESET
+    from rig.studio.sensor.realism import made_real, realism_names
+
+    with wrong_usage("--realism"):
+        return made_real(
+            replace(PRESET, **{key: value for key, value in chosen.items() if value is not None}),
+            realism_names(realism),
+        )
 
 
 def _check_planted(faults: list[str], expression: list[str]) -> None:

@@ -5,11 +5,13 @@ in vec3 normal;
 in vec3 place;
 in vec4 paint;       // albedo, strength of the grain
 in vec3 irradiance;
+in float oil;
 centroid out vec3 shaded_normal;
 centroid out vec3 to_eye;
 centroid out vec3 grain_place;
 centroid out vec4 painted;
 centroid out vec3 received;
+centroid out float oily;
 
 void main() {
     vec3 camera = to_camera(position);
@@ -19,5 +21,6 @@ void main() {
     grain_place = place;
     painted = paint;
     received = irradiance;
+    oily = oil;
     gl_Position = to_clip(camera);
 }

@@ -13,6 +13,7 @@ from rig.formats.capture_folder import write_capture
 from rig.formats.images import write_image
 from rig.formats.ply import write_ply
 from rig.studio.scene.simulate import SimulatedCapture
+from rig.studio.sensor.realism import REALISM, made_real
 
 
 def simulate_to_folder(
@@ -79,6 +80,7 @@ def _meta(simulated: SimulatedCapture, face_vertices: int, seed: int | None) -> 
         "subject": scene.name,
         "seed": seed,
         "hairstyle": list(scene.preset.hairstyle),
+        "realism": [name for name in REALISM if made_real(scene.preset, (name,)) == scene.preset],
         "features": bool(simulated.capture.features),
         "vertices": len(scene.head.vertices),
         "face_vertices": face_vertices,

@@ -205,7 +205,8 @@ def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
 
 
 def _worn(look: Look, preset: Preset, faults: Sequence[Fault]) -> Look:
-    look = restyled(look, preset.hairstyle)
+    look = replace(restyled(look, preset.hairstyle), pores=preset.pores, oil=preset.oil)
+    look = replace(look, scattering_mm=preset.scattering_mm)
     if not preset.hair:
         look = replace(look, hair=None, beard=None)
     if not preset.texture:
@@ -252,7 +253,15 @@ def _views(
         blur = [fault.strength for fault in faults if fault.kind == "blurred" and fault.camera == camera.name]
         gains = np.exp(own.normal(0, preset.exposure_spread) + own.normal(0, preset.white_balance_spread, 3))
         red, green, blue = gains.tolist()
-        sensor = Sensor((red, green, blue), preset.vignetting, blur[0] if blur else preset.defocus_px, preset.noise)
+        sensor = Sensor(
+            (red, green, blue),
+            preset.vignetting,
+            blur[0] if blur else preset.defocus_px,
+            preset.noise,
+            preset.read_noise,
+            preset.mosaic,
+            preset.jpeg_quality,
+        )
         behind = backdrop(camera.intrinsics, own, preset.backdrop_unevenness, colour)
         return View(light[camera.name], behind, sensor)
 

@@ -9,6 +9,7 @@ from rig.studio.scene.anatomy import Anatomy, Landmarks
 
 BROW = np.array([0.035, 0.022, 0.015])
 LIP = np.array([0.40, 0.13, 0.12])
+DRY = 0.25  # oil of skin beside the oily zones
 
 
 def skin_paint(
@@ -31,6 +32,23 @@ def skin_paint(
             _eye(paint, vertices, body.landmarks, side, (closed or {}).get(side, 0.0))
     paint[:, :3] = np.maximum(paint[:, :3], 0.004)
     return paint
+
+
+def oily_zones(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
+    """Computes how oily skin is, 0 to 1: forehead, nose, cheeks and chin above all; everywhere alike where landmarks
+    are not known."""
+    marks = body.landmarks
+    if not marks:
+        return np.full(len(vertices), DRY)
+    forehead = marks["glabella"] + (0.0, 28.0, -4.0)
+    cheeks = [
+        (marks[f"exocanthion_{side}"] + marks[f"cheilion_{side}"]) / 2 + (-4.0 * sign, 8.0, 0.0)
+        for side, sign in (("right", -1), ("left", 1))
+    ]
+    zones = [(forehead, 28.0), (marks["pronasale"], 16.0), (marks["gnathion"] + (0.0, 12.0, 6.0), 14.0)]
+    zones += [(cheek, 16.0) for cheek in cheeks]
+    apart = np.array([np.exp(-0.5 * ((vertices - at) ** 2).sum(axis=1) / size**2) for at, size in zones])
+    return DRY + (1.0 - DRY) * apart.max(axis=0)
 
 
 def _blotches(vertices: Float[np.ndarray, "v 3"], rng: np.random.Generator) -> Float[np.ndarray, "v 1"]:

@@ -17,7 +17,8 @@ from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow
 from rig.studio.scene.headwear import cap, glasses
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.long_hair import hang, knot
-from rig.studio.scene.skin_texture import skin_paint
+from rig.studio.scene.scattering import scattered
+from rig.studio.scene.skin_texture import oily_zones, skin_paint
 from rig.studio.sensor.noise import volume
 
 Colour = tuple[float, float, float]
@@ -76,6 +77,9 @@ class Look:
     beard: HairStyle | None = None
     cap: Colour | None = None
     glasses: bool = False
+    pores: float = 1.0  # contrast, by the painted one
+    oil: float = 0.0
+    scattering_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +93,7 @@ class Piece:
     paint: Float[np.ndarray, "v 4"]
     grain: Grain
     one_sided: bool
+    oil: Float[np.ndarray, " v"] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,8 +159,10 @@ def dress(
     normals = [vertex_normals(*piece) for piece in placed]
     solid = _joined(placed)
     light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid, lamps)
+    if max(look.scattering_mm) > 0.0:
+        light[0] = scattered(*placed[0], light[0], look.scattering_mm)
     parts = [
-        Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided)
+        Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided, piece.oil)
         for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light, strict=True)
     ]
     strands = [
@@ -181,9 +188,10 @@ def _skin(subject: Subject, body: Anatomy, look: Look, one_sided: bool, rng: np.
             "head", head.vertices, head.faces, head.vertices, _even(head.vertices, look.skin), NO_GRAIN, one_sided
         )
     paint = skin_paint(head.vertices, body, look.skin, look.stubble, rng, closed=subject.closed)
-    return Piece(
-        "head", head.vertices, head.faces, head.vertices, paint, replace(SKIN, freckles=look.freckles), one_sided
-    )
+    paint[:, 3] = np.maximum(paint[:, 3] - (1.0 - look.pores), 0.0)  # brows and stubble keep what they add
+    grain = replace(SKIN, freckles=look.pores * look.freckles)
+    oil = look.oil * oily_zones(head.vertices, body) if look.oil > 0.0 else None
+    return Piece("head", head.vertices, head.faces, head.vertices, paint, grain, one_sided, oil)
 
 
 def _hairs(

@@ -29,6 +29,13 @@ class Preset:
     rolling_ms: float = 0.0  # from the first row's readout to the last's; 0: all rows at once (global shutter)
     sway_mm_s: float = 20.0  # how fast the subject moves meanwhile, in a direction of its own each time
     samples: int = 4  # coverage samples a pixel
+    # What real skin and real cameras do (``sensor.realism`` has names for it); nothing of it by default.
+    pores: float = 1.0  # contrast of pores and freckles, by the painted one
+    oil: float = 0.0  # strength of sharp highlights on forehead, nose, cheeks and chin
+    scattering_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # over which diffuse red, green and blue light spreads
+    read_noise: float = 0.0  # of the sensor without light, share of full scale in linear light
+    mosaic: bool = False  # a Bayer filter before the sensor, its gaps filled as cameras do
+    jpeg_quality: int | None = None  # of the pictures that a camera hands out; None: not compressed
 
 
 PRESET = Preset()

@@ -21,6 +21,9 @@ class Sensor:
     vignetting: float
     defocus_px: float
     noise: float
+    read_noise: float = 0.0
+    mosaic: bool = False
+    jpeg_quality: int | None = None
 
 
 def _curve() -> UInt8[np.ndarray, " n"]:
@@ -57,8 +60,32 @@ def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Gen
         # The curve's slope at mid grey is 1.07, so that the noise there is ``noise`` of full scale in the picture.
         variance = (sensor.noise / 1.07) ** 2 * (READ_SHARE + (1 - READ_SHARE) / MID_GREY * np.maximum(light, 0))
         light = light + np.sqrt(variance) * rng.standard_normal(light.shape, np.float32)
+    if sensor.read_noise > 0:
+        light = light + np.float32(sensor.read_noise) * rng.standard_normal(light.shape, np.float32)
+    if sensor.mosaic:
+        light = through_mosaic(light)
     step = np.sqrt(np.clip(light, 0.0, 1.0)) * np.float32(CURVE_STEPS - 1) + np.float32(0.5)
-    return _CURVE[step.astype(np.uint16)]
+    picture = _CURVE[step.astype(np.uint16)]
+    return picture if sensor.jpeg_quality is None else compressed(picture, sensor.jpeg_quality)
+
+
+def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Returns what a Bayer sensor (red at the first pixel) tells: one channel a pixel, the others interpolated along
+    edges (OpenCV's), float32."""
+    codes = np.rint(65535.0 * np.clip(light, 0.0, 1.0)).astype(np.uint16)
+    bayer = codes[:, :, 1].copy()
+    bayer[::2, ::2], bayer[1::2, 1::2] = codes[::2, ::2, 0], codes[1::2, 1::2, 2]
+    filled = cv2.demosaicing(bayer, cv2.COLOR_BayerRGGB2RGB_EA)
+    return filled.astype(np.float32) / np.float32(65535.0)
+
+
+def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns a picture after JPEG, colour at half of the size."""
+    flags = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+    data = cv2.imencode(".jpg", np.ascontiguousarray(picture[:, :, ::-1]), flags)[1]
+    back = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert back is not None, "OpenCV reads what it wrote"
+    return np.ascontiguousarray(back[:, :, ::-1])
 
 
 def drift(shape: tuple[int, int], amount: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 1"]:
