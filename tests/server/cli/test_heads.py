@@ -62,6 +62,13 @@ def test_what_is_no_finite_number_is_wrong_usage(option: str, value: str, tmp_pa
     assert option in done.stderr
 
 
+def test_a_realism_that_nobody_knows_is_wrong_usage_and_the_known_ones_are_named(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["simulate", str(tmp_path / "shot"), "--realism", "oily,shiny"])
+    assert done.exit_code == 2
+    told = " ".join(done.stderr.replace("│", " ").split())
+    assert "shiny is not one of smooth, oily, scattering, mosaic, jpeg" in told
+
+
 @pytest.mark.parametrize("enclosed", [False, True])
 @pytest.mark.parametrize("inside", ["", "images", "images/head", "background", "masks/x", "images/../images"])
 def test_a_result_never_lies_among_the_pictures_of_its_capture(inside: str, enclosed: bool, tmp_path: Path) -> None:
