@@ -33,7 +33,7 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
     except struct.error as error:
         raise InputError(path.name, ["ends in the middle of a record: it is truncated or no COLMAP file"]) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(path.name, [f"cannot be understood ({str(error)[:200]})"]) from error
+        raise InputError(path.name, [f"cannot be understood ({str(error)[:400]})"]) from error
 
 
 def camera_names(files: list[str]) -> list[str]:

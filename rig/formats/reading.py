@@ -87,7 +87,7 @@ def say_once(faults: Sequence[str], names: Iterable[str]) -> list[str]:
     name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
     plate = re.compile(r"\b(background/)\S+")
     groups: dict[str, list[str]] = {}
-    for fault in faults:
+    for fault in dict.fromkeys(faults):
         masked = plate.sub(r"\1", fault)
         groups.setdefault(masked if name is None else name.sub("\0", masked), []).append(fault)
     told = []
@@ -96,7 +96,7 @@ def say_once(faults: Sequence[str], names: Iterable[str]) -> list[str]:
             told += group
             continue
         others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault)))
-        told.append(f"{group[0]}; the same is true of {len(group) - 1} more files ({listed([*others])})")
+        told.append(f"{group[0]}; the same is true of {len(group) - 1} more ({listed([*others])})")
     return told
 
 

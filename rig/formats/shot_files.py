@@ -53,10 +53,11 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
     }
     used = {path for kind in owned.values() for paths in kind.values() for path in _flat(paths)}
     strays = {kind: _strays(place, used, names, kind) for kind, place in places.items()}
-    faults += _missing(folder, rig, images, masks, plates, places, strays)
+    missing, cause = _missing(folder, rig, images, masks, plates, places, strays)
     if places["images"] != folder:
         strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
     told = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
+    faults += missing + ([stray_sentence(told, rig)] if missing and told and not cause else [])
     return ShotFiles(images, masks, plates, tuple(told), tuple(faults))
 
 
@@ -154,17 +155,20 @@ def _missing(
     plates: Mapping[str, tuple[Path, ...]],
     places: Mapping[str, Path],
     strays: Mapping[str, Sequence[Path]],
-) -> list[str]:
-    """What cameras lack; where no camera has a picture of its name and there are others, that is one cause."""
+) -> tuple[list[str], bool]:
+    """What cameras lack, and whether a sentence names strays for it: where no camera has a file of its name and
+    there are others, that is one cause."""
     inside = "" if places["images"] == folder else "images/"
-    faults, alone = [], not any((folder / kind).is_dir() for kind in BESIDE_PICTURES)
+    faults, alone, named = list[str](), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES), False
     lacking = [name for name in rig.names if name not in images]
     if cause := _cause(rig, lacking, strays["images"], inside or "the folder", "picture"):
         faults.append(cause)
+        named = True
     else:
         for name in lacking:
             other = _of_other_kind(name, strays["images"])
             if other is not None:
+                named = True
                 where = other.relative_to(folder).as_posix()
                 kind = UNREAD_PICTURES[other.suffix.lower()]
                 faults.append(f"{where} is not read: of {kind} files nothing is; save it as {READ_AS}")
@@ -175,7 +179,7 @@ def _missing(
     cause = cause or _cause(rig, lacking, strays["background"], "background/", "clean plate")
     for name in () if cause else lacking:
         faults.append(f"background/{name}.png is missing: a clean plate, or masks/{name}.png, is needed")
-    return [*faults, cause] if cause else faults
+    return [*faults, *([cause] if cause else [])], named or bool(cause)
 
 
 def _of_other_kind(name: str, strays: Sequence[Path]) -> Path | None:

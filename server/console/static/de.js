@@ -891,7 +891,7 @@ export default {
   "{1} has no camera: the rig has {2}": "{1} hat keine Kamera: Das Rig hat {2}",
   "{1}/ holds {2}: which one is meant?": "{1}/ enthält {2}: Welches ist gemeint?",
   "{1}{2}.png is missing (or .jpg, .tif, .webp, .bmp, RAW, HEIC)": "{1}{2}.png fehlt (oder .jpg, .tif, .webp, .bmp, RAW, HEIC)",
-  "the same is true of {1} more files ({2})": "ebenso {1} weitere Dateien ({2})",
+  "the same is true of {1} more ({2})": "ebenso {1} weitere ({2})",
   "the same is true of {1} more members": "ebenso {1} weitere Einträge",
   "{1} have no camera: the rig has {2}": "{1} haben keine Kamera: Das Rig hat {2}",
   "{1}/ is not read: pictures lie in images/, masks/ and background/": "{1}/ wird nicht gelesen: Bilder liegen in images/, masks/ und background/",

@@ -149,6 +149,17 @@ def test_masks_that_nobody_can_file_are_one_sentence_with_the_remedy(folder: Pat
     )
 
 
+def test_what_may_be_what_is_missing_is_told_beside_it(folder: Path) -> None:
+    shutil.rmtree(folder / "background")
+    (folder / "masks" / "cam03.png").rename(folder / "masks" / "kam03.png")
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    assert caught.value.faults == (
+        "background/cam03.png is missing: a clean plate, or masks/cam03.png, is needed",
+        "masks/kam03.png has no camera: the rig has cam00, cam01, cam02, cam03, cam04",
+    )
+
+
 @pytest.mark.parametrize("kind", ["masks", "background"])
 def test_strays_beside_what_is_used_are_told(kind: str, folder: Path) -> None:
     for number, path in enumerate(sorted((folder / kind).iterdir())):
@@ -194,7 +205,7 @@ def test_pictures_that_are_not_read_are_called_what_they_are(ending: str, kind: 
         path.rename(path.with_suffix(ending))
     fault = only_fault(folder)
     assert fault.startswith(f"images/cam00{ending} is not read: of {kind} files nothing is; save it as PNG")
-    assert "the same is true of 4 more files (cam01, cam02, cam03, cam04)" in fault
+    assert "the same is true of 4 more (cam01, cam02, cam03, cam04)" in fault
 
 
 def test_a_file_of_another_kind_beside_pictures_is_told(folder: Path) -> None:
@@ -238,7 +249,7 @@ def test_one_size_that_is_wrong_everywhere_is_one_sentence(folder: Path) -> None
     with pytest.raises(InputError) as caught:
         read_capture(folder)
     assert len([fault for fault in caught.value.faults if "pixels, but its camera is" in fault]) <= 3  # one a folder
-    assert any("the same is true of 4 more files" in fault for fault in caught.value.faults)
+    assert any("the same is true of 4 more (" in fault for fault in caught.value.faults)
 
 
 def test_files_are_found_without_reading_one(folder: Path) -> None:
