@@ -64,3 +64,14 @@ def test_a_mask_of_another_size_is_a_fault(tmp_path: Path) -> None:
         find_masks(folder, find_photographs(folder / "images"), rig)
     (fault,) = refused.value.faults
     assert fault.startswith("masks/cam01.png is 12 x 12 pixels, but its camera is 24 x 24")
+
+
+def test_masks_in_colmap_s_names_are_found(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    rig = read_rig(folder / "cameras.json")
+    (folder / "masks").mkdir()
+    for path in sorted((folder / "images").iterdir()):
+        write_image(folder / "masks" / f"{path.name}.png", np.full((24, 24), 255, np.uint8))
+    masks = find_masks(folder, find_photographs(folder / "images"), rig)
+    assert set(masks) == set(rig.names)
+    assert all(mask.all() for mask in masks.values())
