@@ -92,7 +92,8 @@ def _told_by_files(root: Path) -> list[Warned]:
     if read is None:
         return []
     files = find_files(root, read.rig, read.left_out)
-    remarks = [*read.remarks, *unread_files(root, rigs), *unread_pictures(root, files, read.rig)]
+    strays = () if files.faults else unread_pictures(root, files, read.rig)  # what is missing is said with them
+    remarks = [*read.remarks, *unread_files(root, rigs), *strays]
     return [Warned(code=remark.code, message=remark.message) for remark in remarks]
 
 
