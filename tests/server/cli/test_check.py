@@ -48,9 +48,9 @@ def test_every_fault_is_told_at_once_and_is_status_2(tmp_path: Path) -> None:
         done = run("check", str(capture), "--json")
         assert (done.returncode, done.stderr) == (2, "")
         told = json.loads(done.stdout)
-        for word in ("at one place", "'third_eye'", "images/cam01.png is missing"):
-            assert [fault for fault in told["faults"] if word in fault]
-        assert [w for w in told["warnings"] if "images/foo.png has no camera" in w["message"]]
+        for word in ("at one place", "'third_eye'", "images/cam01.png is missing", "images/foo.png has no camera"):
+            assert len([fault for fault in told["faults"] if word in fault]) == 1
+        assert told["warnings"] == []  # of the picture that may be the missing one nothing is said twice
     done = run("check", str(folder))
     assert done.returncode == 2
     assert "cannot be reconstructed" in done.stdout.splitlines()[0]
