@@ -38,6 +38,9 @@ UNDECIDED_PX = 15  # side of a window ...
 UNDECIDED_FILLED = 0.6  # ... and its part that is undecided where the outline is a guess
 WEAK = "of the contour hardly differs from the background"
 NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
+SEEDED_VIEWS = (
+    8  # fewer views do not tell the subject by each other, and begin with its face; eleven do as well without
+)
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
 
@@ -85,9 +88,11 @@ def _without_plates(
     capture: Capture, rig: Rig, settings: SegmentationSettings, report: Progress
 ) -> dict[str, Silhouette]:
     from pipeline.silhouettes.without_plates.decide import decide_without_plates  # packages that few captures need
+    from pipeline.silhouettes.without_plates.head_seed import find_head_seed
 
+    head = find_head_seed(capture.images, rig) if len(rig) < SEEDED_VIEWS else None
     found = decide_without_plates(
-        capture.images, rig, settings, report=lambda share: report("segmentation", 0.8 * share)
+        capture.images, rig, settings, head=head, report=lambda share: report("segmentation", 0.8 * share)
     )
     with ThreadPoolExecutor(thread_count()) as pool:
         jobs = {n: pool.submit(_refined, capture.images[n], one, settings) for n, one in found.decisions.items()}

@@ -34,6 +34,7 @@ SUFFIX = ".silhouettes"
 PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
 ROOMS = (
     ".",
+    "faces",
     "imaging",
     "multiview",
     "silhouettes",

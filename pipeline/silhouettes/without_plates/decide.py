@@ -18,6 +18,7 @@ from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import coarse_size
 from pipeline.silhouettes.foreground import Decision
 from pipeline.silhouettes.without_plates.estimated_plate import decision_without_plate, plate_noise
+from pipeline.silhouettes.without_plates.head_seed import HeadSeed
 from pipeline.silhouettes.without_plates.local_cut import COLUMNS, cut_views
 from pipeline.silhouettes.without_plates.mask_search import search_masks
 from pipeline.silhouettes.without_plates.standing_plane import NEAR, ball_above, standing_plane
@@ -44,13 +45,15 @@ def decide_without_plates(
     rig: Rig,
     settings: SegmentationSettings,
     *,
+    head: HeadSeed | None = None,
     report: Callable[[float], None] = lambda share: None,
 ) -> WithoutPlates:
-    """What is subject in every photograph: ``pipeline.silhouettes.matting`` finds the contour from it."""
+    """Decides what is subject in every photograph: ``pipeline.silhouettes.matting`` finds the contour from it.
+    ``head``: where a face was found."""
     small = {name: _reduced(images[name], settings.coarse_columns).astype(np.float32) for name in rig.names}
     sizes = {name: image.shape[:2] for name, image in small.items()}
     points = find_scene_points(images, rig, report=partial(_between, report, 0.0, POINTS_SHARE))
-    ball = viewing_ball(rig)
+    ball = viewing_ball(rig, None if head is None else head.centre_world)
     plane = standing_plane(points.points, *ball)
     if plane is not None:
         ball = ball_above(plane, points.points, *ball)
@@ -60,7 +63,7 @@ def decide_without_plates(
         for camera in rig
     }
     told = partial(_between, report, POINTS_SHARE, MASKS_SHARE)
-    found = search_masks(small, rig, volume, background, bounded=plane is not None, report=told)
+    found = search_masks(small, rig, volume, background, bounded=plane is not None, head=head, report=told)
     decisions = {name: decision_without_plate(images[name], small[name], found[name], settings) for name in rig.names}
     cluttered = {n for n, one in decisions.items() if plane is not None or plate_noise(one) > PLATE_NOISE_MOST}
     if not cluttered:

@@ -17,6 +17,7 @@ from pipeline.imaging.masks import dilated, eroded
 from pipeline.multiview.upright import guessed_up
 from pipeline.silhouettes.mean_field_kernels import MOST_ODDS, mean_field_sweeps
 from pipeline.silhouettes.without_plates.colour_odds import Samples, colour_odds, histogram
+from pipeline.silhouettes.without_plates.head_seed import HeadSeed, beside_head, head_core
 from pipeline.silhouettes.without_plates.viewing_volume import (
     OtherViews,
     ViewingVolume,
@@ -36,6 +37,7 @@ LEVEL = 0.5  # sine of the angle between view and up below which no side of the 
 SUPPORT_WEIGHT, SUPPORT_MOST, DENIAL_MOST = 0.5, 1.0, 5.0  # of what the other views say, in log odds
 SOLID_ODDS = 3.0  # that a pixel gains where every other view has the subject
 CORE_ODDS, BORDER_ODDS = 2.0, -1.0
+FACE_ODDS = 10.0  # of a core that a found face is: highlights have the colour of a bright wall
 LINK, LINK_NOISE, SWEEPS = 0.7, 2.0, 12  # of neighbours: log odds, noise levels that hardly count as an edge
 GREY_MOST = 2.0  # levels by which the channels of a grey photograph differ
 TEXTURE_PX, TEXTURE_GAIN = 2.0, 4.0  # sigma of the window; scatter by it counts like a colour
@@ -51,6 +53,7 @@ class Seeds:
     core: Mask
     border: Mask
     reachable: Mask
+    core_odds: float = CORE_ODDS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,13 +66,19 @@ class CoarseMask:
 
 
 def find_seeds(
-    camera: Camera, volume: ViewingVolume, up_world: Float[np.ndarray, " 3"], size: tuple[int, int]
+    camera: Camera,
+    volume: ViewingVolume,
+    up_world: Float[np.ndarray, " 3"],
+    size: tuple[int, int],
+    head: HeadSeed | None = None,
 ) -> Seeds:
-    """The seeds of a view whose reduced image has ``size`` (height, width)."""
+    """Finds the seeds of a view whose reduced image has ``size`` (height, width)."""
     height, width = size
     row, column = np.mgrid[:height, :width]
     middle = (camera.project(volume.centre_world[None])[0] + 0.5) * (width / camera.intrinsics.width) - 0.5
     core = np.hypot(column - middle[0], row - middle[1]) < CORE * min(size)
+    if head is not None:
+        core = head_core(head, camera, size)
     strip = max(3, round(BORDER * min(size)))
     border = np.ones(size, bool)
     border[strip:-strip, strip:-strip] = False
@@ -77,6 +86,9 @@ def find_seeds(
     if np.linalg.norm(down) > LEVEL:
         along = (column - width / 2) * down[0] + (row - height / 2) * down[1]
         border &= along < BODY_SIDE * 0.5 * (abs(down[0]) * width + abs(down[1]) * height)
+    if head is not None:
+        border |= beside_head(head, camera, size)
+        return Seeds(core, border & ~core, reachable(volume, camera.name, size), FACE_ODDS)
     return Seeds(core, border & ~core, reachable(volume, camera.name, size))
 
 
@@ -87,13 +99,14 @@ def search_masks(
     background: Mapping[str, Bool[np.ndarray, "_ _"]],
     *,
     bounded: bool,
+    head: HeadSeed | None = None,
     report: Callable[[float], None],
 ) -> dict[str, CoarseMask]:
     """The subject in every reduced image. ``background``: pixels that are known not to show it. ``bounded``: the
     volume holds all of the subject, so that what is beyond it may be learnt as background nearby at once."""
-    up = guessed_up(rig)
+    up = guessed_up(rig) if head is None else head.up_world
     sizes = {name: image.shape[:2] for name, image in images.items()}
-    seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name]) for camera in rig}
+    seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name], head) for camera in rig}
     known = {name: seed.border | ~seed.reachable | (background[name] & ~seed.core) for name, seed in seeds.items()}
     images = {name: _with_texture(image) for name, image in images.items()}
     noise = {name: _noise(image) for name, image in images.items()}
@@ -128,7 +141,7 @@ def _with_neighbours(
     noise: Float[np.ndarray, " 3"],
 ) -> CoarseMask:
     given = odds + np.clip(SUPPORT_WEIGHT * told.support, -DENIAL_MOST, SUPPORT_MOST) + SOLID_ODDS * told.solid
-    given = np.where(seeds.reachable, given + CORE_ODDS * seeds.core, -MOST_ODDS)
+    given = np.where(seeds.reachable, given + seeds.core_odds * seeds.core, -MOST_ODDS)
     given = np.clip(given, -MOST_ODDS, MOST_ODDS).astype(np.float32)
     smooth = mean_field_sweeps(given, (image / (LINK_NOISE * noise)).astype(np.float32), LINK, SWEEPS)
     smooth = np.asarray(2 * smooth, np.float32)

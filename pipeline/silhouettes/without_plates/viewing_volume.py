@@ -43,9 +43,12 @@ class OtherViews:
     solid: Bool[np.ndarray, "h w"]
 
 
-def viewing_ball(rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Centre (world) and radius (mm) of what the cameras look at: as far as the corners of the median image reach."""
-    centre = rig.centre_world()
+def viewing_ball(
+    rig: Rig, centre_world: Float[np.ndarray, " 3"] | None = None
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Returns centre (world) and radius (mm) of what the cameras look at: as far as the corners of the median image
+    reach. ``centre_world``: where it is known better than from where the cameras look."""
+    centre = rig.centre_world() if centre_world is None else centre_world
     radius = float(
         np.median(
             [
@@ -112,11 +115,14 @@ def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray
         doubts[name] = shown & (around.ravel()[at] < SOLID_ODDS)
         total, seen, against = total + words[name], seen + shown, against + doubts[name]
     told = {}
+    witnesses = min(WITNESSES_LEAST, len(odds) - 1)  # of three cameras no voxel has three others
     for name, field in odds.items():
         places = volume.places[name]
-        asked = (places >= 0) & (seen > WITNESSES_LEAST)
+        asked = (places >= 0) & (seen > witnesses)
         support = np.full(field.size, -DENIES_MOST * len(odds), np.float32)
         np.maximum.at(support, places[asked], (total - words[name])[asked])
+        if witnesses < WITNESSES_LEAST:  # two views from nearly one side take the same wall for the subject
+            support = np.minimum(support, np.float32(0.0))
         wanted = max(WITNESSES_LEAST, WITNESSES_SHARE * (len(odds) - 1))
         held = asked & (against == doubts[name]) & (seen - 1 >= wanted)
         solid = np.zeros(field.size, np.uint8)
