@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.faces.detection import FaceDetection, crop_around
-from pipeline.faces.points import point_table
+from pipeline.faces.detection import CROP_OF_FACE, FaceDetection, crop_around
+from pipeline.faces.points import direction_from_face, point_table, view_bias
 from rig.camera import Camera
 from rig.capture import ImageRgb
 from rig.geometry import Similarity
@@ -80,9 +80,14 @@ def seen_face(
     flat: bool = False,
     score: float = 30.0,
 ) -> FaceDetection:
-    """The mean adult's points as a finder would see them; ``flat``: on a poster."""
+    """The mean adult's points as a finder would see them, the network's bias included; ``flat``: on a poster."""
     shape = point_table().shape_mm * ((1.0, 1.0, 0.0) if flat else (1.0, 1.0, 1.0))
-    points = camera.project(world_from_face.apply(shape)) + shift_px + rng.normal(0.0, noise_px, (len(shape), 2))
+    projected = camera.project(world_from_face.apply(shape)) + shift_px + rng.normal(0.0, noise_px, (len(shape), 2))
+    bias = view_bias(direction_from_face(world_from_face, camera))
+    points = projected
+    for _ in range(4):  # the bias goes by the size and roll of the points that it moves
+        crop = crop_around(points)
+        points = projected + turned_about(bias, crop.roll_deg) * crop.side_px / CROP_OF_FACE
     box = np.concatenate([points.min(axis=0), points.max(axis=0)])
     return FaceDetection(points, np.zeros(len(points)), score, box, crop_around(points).roll_deg)
 
@@ -106,7 +111,11 @@ def photographed_face(
     face_from_world = world_from_face.inverse()
     start = face_from_world.apply(camera.centre_world[None])[0]
     rays = camera.rays_world(pixels) @ face_from_world.rotation.T
-    image = np.tile(np.float32(WALL), (len(pixels), 1)) if behind is None else behind.reshape(-1, 3).astype(np.float32)
+    image = (
+        np.tile(np.array(WALL, np.float32), (len(pixels), 1))
+        if behind is None
+        else behind.reshape(-1, 3).astype(np.float32)
+    )
     if start[2] <= 0.0 and flat:
         return np.rint(image).astype(np.uint8).reshape(k.height, k.width, 3)
     if not flat:

@@ -47,9 +47,9 @@ MODELS = ("makehuman", "ict-facekit")
 MIN_SCORE, MIN_VIEWS = 2.0, 5
 NEAR = 0.25  # of a face's size: as far may the points' middle be from the true one's
 TURNS = 4
-RIDGE = 0.3  # views' worth of weight that keeps each term of the bias small
+RIDGE = 2.0  # views' worth of weight that keeps each term of the bias small
 MODES = 16
-SLIDING_MM = 3.0  # per axis: a point that errs by more is said to slide
+BEHIND_EARS_MM = 10.0
 MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
@@ -140,7 +140,8 @@ def _surface_points(
     """Where the triangulated points meet each head's surface, carried to the mean head; the median over the heads."""
     maps = {}
     for name, model in models.items():
-        faces, mean = model.levels["full"].faces, model.vertices(np.zeros(0))
+        mean = model.vertices(np.zeros(0))
+        faces = _front(model, mean)
         met = []
         for each, found in zip(measured, points, strict=True):
             if each.model == name:
@@ -151,6 +152,13 @@ def _surface_points(
         hits = SurfaceIndex(mean, faces).closest(symmetric)
         maps[name] = SurfacePoints(faces[hits.triangles], hits.weights)
     return maps
+
+
+def _front(model: HeadModel, mean: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, "f 3"]:
+    """The triangles before the ears: half of the work."""
+    faces, marks = model.levels["full"].faces, model.levels["full"].landmarks
+    ears = mean[[marks["tragion_right"], marks["tragion_left"]], 2].mean()
+    return faces[(mean[faces, 2] > ears - BEHIND_EARS_MM).all(axis=1)]
 
 
 def _fitted_bias(measured: Sequence[Measured], maps: Maps) -> Float[np.ndarray, "8 468 2"]:
