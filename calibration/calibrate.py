@@ -282,7 +282,7 @@ def _judged(
         fit.free.offsets,
         tuple(dropped),
         tuple(checks),
-        _warnings(fit, lenses, dropped),
+        (*detections.remarks, *_warnings(fit, lenses, dropped)),
     )
     bad = failed(checks)
     if bad:

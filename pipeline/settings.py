@@ -255,6 +255,7 @@ class Settings:
     detail: Literal["span", "kernel", "photo", "fine"] | None = None  # None: fine where the photographs carry it
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
+    unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them
     fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.diagnostics.WARNING_CODES) that are failures here
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
     faces: FaceSettings = field(default_factory=FaceSettings)

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from rig.image import ImageRgb
 
@@ -27,7 +27,8 @@ class Remark(NamedTuple):
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
     """Images by camera name (RGB), clean plates, ready masks (True = subject), feature points (pixels) by landmark
-    and camera, the sha256 of every file that it was read from, and what its reader noticed and did not mind."""
+    and camera, the sha256 of every file that it was read from, and what its reader noticed and did not mind.
+    ``soft_masks``: of masks with soft edges the share of the subject in every pixel, 0 to 255."""
 
     images: Mapping[str, ImageRgb]
     backgrounds: Mapping[str, tuple[ImageRgb, ...]] = field(default_factory=dict)
@@ -35,6 +36,7 @@ class Capture:
     features: Features = field(default_factory=dict)
     digests: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[Remark, ...] = ()
+    soft_masks: Mapping[str, UInt8[np.ndarray, "h w"]] = field(default_factory=dict)
 
 
 def refiled(
@@ -63,6 +65,7 @@ def refiled(
         {landmark: given(views, points) for landmark, views in capture.features.items()},
         _renamed(capture.digests, {"images": pictures, "masks": pictures, "background": plates}),
         capture.remarks,
+        given(capture.soft_masks, pictures),
     )
 
 

@@ -27,11 +27,12 @@ GRID = (9, 7)
 CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
 
 
-def rig_faults(rig: Rig) -> list[str]:
-    """Faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base line."""
+def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[str]:
+    """Faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base line.
+    ``any_unit``: a known length beside them will tell the unit."""
     faults = [fault for camera in rig if (fault := _lens_fault(camera))]
     convention = _convention_fault(rig)
-    return faults + ([convention] if convention else _spread_faults(rig))
+    return faults + ([convention] if convention else [] if any_unit else _spread_faults(rig))
 
 
 def _lens_fault(camera: Camera) -> str | None:

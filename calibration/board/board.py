@@ -2,8 +2,9 @@
 
 Board frame: origin at the outer corner of the first square, x along a row of squares, y down its columns, z *into* the
 board (away from who looks at it), so that a camera before the board sees x to the right when y points down: the frame
-is right-handed and matches OpenCV's. The first square is black (white if ``inverted``). Corners are the inner ones,
-numbered row by row.
+is right-handed and matches OpenCV's. The first square is black (white if ``inverted``, or if a ChArUco board of an
+even number of rows is ``legacy``: as OpenCV before 4.6 and calib.io draw it). Corners are the inner ones, numbered row
+by row.
 """
 
 import tomllib
@@ -47,6 +48,8 @@ class Board:
     marker_ratio: float = 0.75
     dictionary: str = "DICT_4X4_1000"
     inverted: bool = False
+    legacy: bool = False
+    first_marker: int = 0
     measured_width_mm: float | None = None
     measured_height_mm: float | None = None
 
@@ -58,6 +61,11 @@ class Board:
     @property
     def corner_count(self) -> int:
         return self.grid[0] * self.grid[1]
+
+    @property
+    def marker_count(self) -> int:
+        """Markers of a ChArUco board: one in every white square."""
+        return self.columns * self.rows // 2
 
     def corners(self) -> Float[np.ndarray, "n 3"]:
         """The inner corners in the board frame, mm, row by row."""
@@ -93,13 +101,17 @@ class Board:
     def squares(self) -> Bool[np.ndarray, "rows columns"]:
         """True where a square is black."""
         row, column = np.indices((self.rows, self.columns))
-        return ((row + column) % 2 == 0) ^ self.inverted
+        white_first = self.kind == "charuco" and self.legacy and self.rows % 2 == 0
+        return ((row + column) % 2 == 0) ^ self.inverted ^ white_first
 
     def opencv(self) -> cv2.aruco.CharucoBoard:
         """OpenCV's own board; ChArUco only."""
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         size = (self.columns, self.rows)
-        return cv2.aruco.CharucoBoard(size, self.square_mm, self.square_mm * self.marker_ratio, dictionary)
+        numbers = np.arange(self.marker_count) + self.first_marker
+        board = cv2.aruco.CharucoBoard(size, self.square_mm, self.square_mm * self.marker_ratio, dictionary, numbers)
+        board.setLegacyPattern(self.legacy)
+        return board
 
 
 def read_board(path: Path) -> Board:
@@ -131,8 +143,12 @@ def board_from_document(document: Mapping[str, Any], subject: str = "board.toml"
         value = document.get(key, least)
         if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
             faults.append(f"{key} is {value!r}, wanted a number from {least:g} to {most:g}")
-    if not isinstance(document.get("inverted", False), bool):
-        faults.append(f"inverted is {document['inverted']!r}, wanted true or false")
+    for key in ("inverted", "legacy"):
+        if not isinstance(document.get(key, False), bool):
+            faults.append(f"{key} is {document[key]!r}, wanted true or false")
+    first = document.get("first_marker", 0)
+    if isinstance(first, bool) or not isinstance(first, int) or not 0 <= first < 10_000:
+        faults.append(f"first_marker is {first!r}, wanted the number of the first marker, 0 or more")
     faults += _dictionary_faults(document) if not faults and kind == "charuco" else []
     if faults:
         raise InputError(subject, faults)
@@ -145,7 +161,7 @@ def _dictionary_faults(document: Mapping[str, Any]) -> list[str]:
     if not isinstance(name, str) or not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
         return [f"dictionary is {name!r:.60}, wanted one of OpenCV's, such as 'DICT_4X4_1000'"]
     held = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
-    wanted = document["columns"] * document["rows"] // 2
+    wanted = document.get("first_marker", 0) + document["columns"] * document["rows"] // 2
     return [f"{name} holds {held} markers; the board needs {wanted}"] if held < wanted else []
 
 
@@ -158,6 +174,8 @@ def write_board(board: Board, path: Path) -> None:
             f"marker_ratio = {board.marker_ratio!r}  # marker side / square side",
             f'dictionary = "{board.dictionary}"',
         ]
+        lines += ["legacy = true  # the first square is white"] if board.legacy else []
+        lines += [f"first_marker = {board.first_marker}"] if board.first_marker else []
     lines.append(f"inverted = {str(board.inverted).lower()}")
     for key in ("measured_width_mm", "measured_height_mm"):
         value = getattr(board, key)
@@ -209,7 +227,7 @@ def _rectangles(board: Board) -> list[tuple[float, float, float, float, bool]]:
     if board.kind == "charuco":
         for number, corners in enumerate(board.opencv().getObjPoints()):
             x, y = np.asarray(corners)[:, :2].min(axis=0)
-            found += _marker(board, number, float(x), float(y))
+            found += _marker(board, board.first_marker + number, float(x), float(y))
     return found
 
 

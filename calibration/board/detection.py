@@ -6,7 +6,7 @@ import io
 import zipfile
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -15,18 +15,21 @@ from jaxtyping import UInt8
 
 from calibration.board.board import Board
 from calibration.board.corners import Found, detect
-from calibration.board.missing import explain
+from calibration.board.markers import RATIO_OFF, board_of, find_layout, find_markers
+from calibration.board.missing import explain, explain_markers
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras_json import name_fault
 from rig.formats.picture_names import PLAIN_SUFFIXES
 from rig.progress import Progress
 
-VERSION = 1  # of the detector: part of the cache's key
+VERSION = 2  # of the detector: part of the cache's key
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES)
 
 
 EXPLAINED = 4  # pictures of a blind camera that are looked at twice
+MEASURED = 24  # pictures whose markers are measured where the board is not found as it was described ...
+FEW_FOUND = 0.2  # ... that is in less than this share of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +44,8 @@ class View:
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
     """All finds. ``sizes``: (width, height) per camera, in the order of the cameras; ``missed``: (camera, shot) without
-    a find; ``notes`` say, per camera, what was wrong with pictures that hold another pattern."""
+    a find; ``notes`` say, per camera, what was wrong with pictures that hold another pattern; ``remarks`` what of the
+    board is otherwise than it was described."""
 
     board: Board
     sizes: dict[str, tuple[int, int]]
@@ -49,6 +53,7 @@ class Detections:
     views: tuple[View, ...]
     missed: tuple[tuple[str, str], ...]
     notes: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def corner_count(self) -> int:
@@ -59,7 +64,20 @@ class WrongBoard(EigenheadError):
     """The pictures do not show the board that was described."""
 
     def __init__(self, notes: Iterable[str]) -> None:
-        super().__init__("the pictures do not show the board of board.toml: " + "; ".join(notes))
+        pictures: dict[str, list[str]] = {}
+        for note in notes:
+            picture, colon, reason = note.partition(": ")
+            pictures.setdefault(reason if colon else note, []).append(picture if colon else "")
+        texts = [_of_pictures(names, reason) for reason, names in pictures.items()]
+        super().__init__("the pictures do not show the board of board.toml: " + "; ".join(texts))
+
+
+def _of_pictures(names: list[str], reason: str) -> str:
+    """A reason, said once for all cameras that have it."""
+    if not names[0]:
+        return reason
+    more = f" and {len(names) - 1} other cameras" if len(names) > 2 else f" and {names[1]}" if len(names) == 2 else ""
+    return f"{names[0]}{more}: {reason}"
 
 
 def ignore_progress(stage: str, fraction: float) -> None:
@@ -90,9 +108,62 @@ def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
 def detect_folder(
     folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Progress = ignore_progress
 ) -> Detections:
-    """Finds the board in every picture of ``folder``. Raises InputError on damaged input, WrongBoard where no picture
-    shows the board and some show another. ``cache`` is a folder in which finds are kept by the pictures' content."""
+    """Finds the board in every picture of ``folder``; a ChArUco board also with the first square white, or with markers
+    that begin at another number. Raises InputError on damaged input, WrongBoard where no picture shows the board and
+    some show another. ``cache`` is a folder in which finds are kept by the pictures' content."""
     pictures = list_pictures(folder)
+    detections = _detect_pictures(folder, pictures, board, cache, workers, report)
+    if board.kind == "charuco":
+        detections = _with_measured_pattern(folder, pictures, detections, cache, workers, report)
+    if detections.notes and not detections.views:
+        raise WrongBoard(detections.notes)
+    return detections
+
+
+def _with_measured_pattern(
+    folder: Path,
+    pictures: dict[str, dict[str, Path]],
+    detections: Detections,
+    cache: Path | None,
+    workers: int,
+    report: Progress,
+) -> Detections:
+    """The board again with the pattern that its markers have, where it is not found as it was described. Raises
+    WrongBoard where its markers are not as wide as described: their edges then pass for blur."""
+    board = detections.board
+    paths = [path for shots in pictures.values() for path in shots.values()]
+    found_share = len(detections.views) / len(paths)
+    sample = paths[:: max(1, len(paths) // MEASURED)]
+    greys = [grey for path in sample if (grey := _decode(path.read_bytes())) is not None]
+    greys = [255 - grey for grey in greys] if board.inverted else greys
+    markers = [find_markers(grey, board.dictionary) for grey in greys[: MEASURED if found_share < FEW_FOUND else 4]]
+    if found_share >= FEW_FOUND:
+        layout = find_layout(markers, board)
+        if layout is not None and abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
+            raise WrongBoard([explain_markers(markers, board) or ""])
+        return detections
+    layout = find_layout(markers, board)
+    measured = None if layout is None else board_of(layout, board)
+    if measured is None or measured == board:
+        return detections
+    again = _detect_pictures(folder, pictures, measured, cache, workers, report)
+    if len(again.views) <= len(detections.views):
+        return detections
+    keys = ["legacy = true"] if measured.legacy != board.legacy else []
+    keys += [f"first_marker = {measured.first_marker}"] if measured.first_marker != board.first_marker else []
+    remark = f"the board was found with {' and '.join(keys)}: say so in board.toml"
+    return replace(again, remarks=(remark,))
+
+
+def _detect_pictures(
+    folder: Path,
+    pictures: dict[str, dict[str, Path]],
+    board: Board,
+    cache: Path | None,
+    workers: int,
+    report: Progress,
+) -> Detections:
+    """One pass over all pictures for one board. Raises InputError on damaged input."""
     tasks = [(camera, shot, path) for camera, shots in pictures.items() for shot, path in shots.items()]
     results: list[tuple[tuple[int, int], Found | None] | str] = []
     with ThreadPoolExecutor(workers) as pool:
@@ -125,8 +196,6 @@ def detect_folder(
         raise InputError(folder.name, faults)
     shots = tuple(sorted({shot for _, shot, _ in tasks}))
     notes = _explain_missing(pictures, sizes, views, board)
-    if notes and not views:
-        raise WrongBoard(notes)
     return Detections(board, sizes, shots, tuple(views), tuple(missed), tuple(notes))
 
 

@@ -1,5 +1,6 @@
 """Why no board was found in a picture, as an operator would say it."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -8,6 +9,15 @@ from jaxtyping import UInt8
 
 from calibration.board.board import SQUARES_LEAST, Board
 from calibration.board.corners import classic_corners, detect, in_board_order, pattern_continues
+from calibration.board.markers import (
+    MARKERS_LEAST,
+    RATIO_OFF,
+    Markers,
+    find_layout,
+    find_markers,
+    is_april_grid,
+    other_dictionary,
+)
 
 
 def explain(grey: UInt8[np.ndarray, "h w"], board: Board) -> str | None:
@@ -46,12 +56,41 @@ def _explain_checkerboard(grey: np.ndarray, board: Board) -> str | None:
 
 
 def _explain_charuco(grey: np.ndarray, board: Board) -> str | None:
-    detector = cv2.aruco.ArucoDetector(board.opencv().getDictionary(), cv2.aruco.DetectorParameters())
-    _, ids, _ = detector.detectMarkers(grey)
-    if ids is None or len(ids) < 3:
-        return None
-    held = board.columns * board.rows // 2
-    if int(ids.max()) >= held:
-        squares = f"{board.columns} x {board.rows} squares"
-        return f"it shows marker {int(ids.max())}, but {squares} hold only {held}: correct columns and rows"
-    return "it shows markers of the dictionary in another order: correct columns and rows in board.toml"
+    """What the markers in a picture say of the board, once it was not found by them."""
+    markers = find_markers(grey, board.dictionary)
+    mirrored = find_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)
+    if len(mirrored) > len(markers) + 2:
+        return "the board or the picture is mirrored: turn off mirroring in the camera or its software, or print again"
+    inverse = find_markers(255 - grey, board.dictionary)
+    if len(inverse) > len(markers) + 2:
+        return f"the colours are inverted: set {_toml(replace(board, inverted=not board.inverted))} in board.toml"
+    if len(markers) < MARKERS_LEAST:
+        other = other_dictionary([grey], board.dictionary)
+        if other is None:
+            return None
+        return f"its markers are of {other}, board.toml says {board.dictionary}: correct dictionary"
+    return explain_markers([markers], board)
+
+
+def explain_markers(pictures: Sequence[Markers], board: Board) -> str | None:
+    """What is wrong with the described board by the markers that pictures show; None where nothing is."""
+    layout = find_layout(pictures, board)
+    if layout is None:
+        if any(map(is_april_grid, pictures)):
+            return "its markers stand in every cell, as on an AprilGrid, which is not read: print a board of ours"
+        return "it shows markers of the dictionary in an order that no ChArUco board has: is board.toml of this board?"
+    if layout.columns != board.columns:
+        last = max(max(markers) for markers in pictures if markers) - layout.first_marker + 1
+        rows = -(-2 * last // layout.columns)
+        said = f"board.toml says {board.columns} x {board.rows}"
+        return f"it shows {layout.columns} squares in a row and {rows} rows or more, {said}: correct columns and rows"
+    if abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
+        return (
+            f"its markers are {layout.ratio:.2f} times as wide as its squares, board.toml says "
+            f"{board.marker_ratio:g}: correct marker_ratio"
+        )
+    beyond = max(max(markers) for markers in pictures if markers) - layout.first_marker
+    if beyond >= board.marker_count:
+        said = f"{board.columns} x {board.rows} squares"
+        return f"it shows marker {beyond}, but {said} hold only {board.marker_count}: correct rows"
+    return None

@@ -14,6 +14,7 @@ from jaxtyping import Bool
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
 from rig.formats.capture_folder import capture_root, size_fault
+from rig.formats.capture_masks import mask_subjects
 from rig.formats.images import decode_image_file, is_picture
 from rig.formats.shot_files import BESIDE_PICTURES, find_files
 from rig.rig import Rig
@@ -71,7 +72,7 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
     root = capture_root(folder)
     if photographs.shots != (ONE_SHOT,) or not (root / "masks").is_dir():
         return {}
-    masks, faults = {}, []
+    planes, faults = {}, list[str]()
     for name, path in find_files(root, rig, [name for name in photographs.names if name not in rig]).masks.items():
         pixels, _, fault = decode_image_file(path, f"masks/{path.name}", "mask")
         k = rig[name].intrinsics
@@ -80,10 +81,11 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
         elif pixels.shape != (k.height, k.width):
             faults.append(size_fault(f"masks/{path.name}", (pixels.shape[1], pixels.shape[0]), k))
         else:
-            masks[name] = pixels > 0
+            planes[name] = f"masks/{path.name}", pixels
+    masks = mask_subjects(planes, rig, faults).masks
     if faults:
         raise InputError(folder.name, faults)
-    return masks
+    return dict(masks)
 
 
 def _pictures(folder: Path) -> list[Path]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from calibration.scene.photographs import Photographs
 from calibration.scene.structure import Structure
@@ -102,21 +102,43 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
     """Corners (px) of the tags of a dictionary, by shot and number, then by camera."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-    dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[known.dictionary])
-    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+    detector = _tag_detector(known)
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
     for camera, own in photographs.files.items():
         for shot, path in own.items():
             pixels, _, _ = decode_image_file(path, path.name, "grey")
             assert pixels is not None  # matching has read it
-            corners, ids, _ = detector.detectMarkers(pixels)
-            numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
-            for number, corner in zip(numbers, corners, strict=True):
-                if numbers.count(number) == 1:  # a number that is there twice cannot be told apart
-                    tags.setdefault((shot, number), {})[camera] = corner.reshape(4, 2) - HALF_PIXEL
+            for number, corners in _tags_in(pixels, detector).items():
+                tags.setdefault((shot, number), {})[camera] = corners
     return tags
+
+
+def find_tags_of_shot(images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], known: TagSize) -> Tags:
+    """Finds the corners (px) of the tags in one shot's pictures, by number, then by camera."""
+    detector = _tag_detector(known)
+    tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
+    for camera, image in images.items():
+        for number, corners in _tags_in(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), detector).items():
+            tags.setdefault(("", number), {})[camera] = corners
+    return tags
+
+
+def _tag_detector(known: TagSize) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+    dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[known.dictionary])
+    return cv2.aruco.ArucoDetector(dictionary, parameters)
+
+
+def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) -> dict[int, Float[np.ndarray, "4 2"]]:
+    """Corners by number; a number that is there twice cannot be told apart."""
+    corners, ids, _ = detector.detectMarkers(grey)
+    numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
+    return {
+        number: corner.reshape(4, 2) - HALF_PIXEL
+        for number, corner in zip(numbers, corners, strict=True)
+        if numbers.count(number) == 1
+    }
 
 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:

@@ -146,7 +146,9 @@ def make_cells(
 
 def _cell_px(camera: Camera, at_world: Float[np.ndarray, " 3"], cell_mm: float) -> int:
     depth = float(camera_depths(camera, at_world[None])[0])
-    return max(1, round(cell_mm * camera.intrinsics.fx / depth))
+    # A head that lies on the camera, or before it, has cells as large as the picture.
+    largest = min(camera.intrinsics.width, camera.intrinsics.height)
+    return int(np.clip(round(cell_mm * camera.intrinsics.fx / max(depth, 1e-3)), 1, largest))
 
 
 def _linear(image: UInt8[np.ndarray, "h w 3"], size: int) -> Float32[np.ndarray, "r c 3"]:

@@ -28,6 +28,15 @@ OUTSIDE_MOST_PX_PER_WIDTH = 0.003  # 3 px of 1024; at most 0.6 in 66 cameras of 
 OUTSIDE_TIMES_MEDIAN = 6.0  # and this many times what the other cameras have
 
 
+UNEXPLAINED_SHARE = 0.9  # median over the views of the rim that the fit did not believe: 0.15 to 0.45 of nine captures
+# with hair and beards, and of one whose face is turned by 90 degrees; 1.0 of a head three times too small
+UNEXPLAINED_MM = 5.0  # and median over the views of the rim's RMS distance from its outline: 1 to 4 there, 40 here
+
+
+class UnexplainedOutlines(EigenheadError):
+    """A head that explains hardly any outline is none of this subject."""
+
+
 class ImplausibleResult(EigenheadError):
     """A result with warnings that the settings do not let pass."""
 
@@ -51,6 +60,28 @@ def plausibility_warnings(
         *(_scale(fit.world_from_head.scale) or _size(*size_of(fit, model))),
         *_contours(cameras, widths_px),
     ]
+
+
+def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mapping[str, float]) -> str | None:
+    """Says that a head explains hardly any outline, whichever view is asked; None where it does.
+
+    Args:
+        cameras: contour residuals of every camera.
+        pixels_mm: what a pixel shows at the head, by camera.
+    """
+    spoke = {name: of for name, of in cameras.items() if of.used and of.excluded_share is not None}
+    misses_mm = [of.contour_rms_px * pixels_mm[name] for name, of in spoke.items() if of.contour_rms_px is not None]
+    if not spoke or not misses_mm:
+        return None
+    shares = [of.excluded_share for of in spoke.values() if of.excluded_share is not None]
+    if np.median(shares) < UNEXPLAINED_SHARE or np.median(misses_mm) < UNEXPLAINED_MM:
+        return None
+    poor = sum(share >= UNEXPLAINED_SHARE for share in shares)
+    return (
+        f"the fitted head explains hardly any outline: in {poor} of {len(shares)} views its contour lies "
+        f"{np.median(misses_mm):.0f} mm (median) from the subject's. Check that cameras and masks are of these "
+        "pictures and to scale, name the camera that the subject faces (--front), or give feature points"
+    )
 
 
 def refuse(warnings: Iterable[ReportWarning], fail_on: Sequence[str]) -> None:

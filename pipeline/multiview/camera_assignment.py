@@ -17,7 +17,15 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.tangency import BORDER_PX, LONGEST_SPAN, angle_slopes, outer_hull, pencil, rays_about
+from pipeline.multiview.tangency import (
+    BORDER_PX,
+    LEAST_SLOPE,
+    LONGEST_SPAN,
+    angle_slopes,
+    outer_hull,
+    pencil,
+    rays_about,
+)
 from rig.camera import Camera
 from rig.rig import Rig
 
@@ -130,7 +138,12 @@ def own_misses(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.
     cameras = list(rig)
     touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
     angle, step = (np.stack([touch[k][0] for touch in touches]) for k in range(2))
-    return (angle - angle.swapaxes(0, 1)) / np.hypot(step, step.swapaxes(0, 1))
+    return _miss_px(angle - angle.swapaxes(0, 1), np.hypot(step, step.swapaxes(0, 1)))
+
+
+def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Angles by angles a pixel; NaN where a plane has no direction, as in two cameras at one place."""
+    return np.divide(gap, step, out=np.full(gap.shape, np.nan), where=step > LEAST_SLOPE)
 
 
 def mean_misfit(misses: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
@@ -182,7 +195,7 @@ def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float
     misfit = np.zeros((count,) * 4, np.float32)
     for i, j in permutations(range(count), 2):
         gap = angle[i, :, j, None, :] - angle[j, None, :, i, :]
-        miss = gap / np.hypot(step[i, :, j, None, :], step[j, None, :, i, :])
+        miss = _miss_px(gap, np.hypot(step[i, :, j, None, :], step[j, None, :, i, :]))
         misfit[i, :, j] = np.where(np.isfinite(miss), _robust(miss, scale), CUT_OFF_MISFIT).sum(axis=-1)
     return misfit
 

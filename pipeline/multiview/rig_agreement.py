@@ -4,7 +4,9 @@ Where most cameras contradict the others, other readings are tried: all pictures
 as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 where they are
 square; and poses that were written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
 sphere about the world's origin does not show by itself. The reading under which tangent planes touch both outlines of
-each pair is named. Where there is none, the calibration is another rig's, or of this one before it was rearranged.
+each pair is named. Where there is none, the calibration is another rig's, or of this one before it was rearranged;
+unless a good part of all planes meet closely nevertheless: then the masks are loose, with a shadow on the wall or hair
+that some of them miss.
 Where one camera alone contradicts the others, it is named.
 
 Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
@@ -26,6 +28,10 @@ CAMERAS_LEAST = 4  # three have six planes at most: too few to refuse a capture 
 PLANES_LEAST = 4  # of a camera whose word counts
 WRONG_LEAST = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
 RIGHT_MOST = 0.25  # of a reading that is believed
+LOOSE_QUARTER = 22e-4  # of the picture's width, that the better quarter of all planes misses at most in a right rig
+# whose masks are loose: 20e-4 with long hair in 8 to 24 views; 24e-4 and more in rigs of another arrangement
+LOOSE_BIMODAL, LOOSE_QUARTER_MOST = 0.28, 35e-4  # of the median miss: shadows spoil some planes and leave others whole,
+# 0.03 to 0.25 with shadows in all of 11 views; a wrong rig's misses have one spread, 0.34 and more
 MISPLACED_LEAST = 0.6  # of one camera among good ones: 0.95 with its rotation transposed; good ones reach 0.25
 MISPLACED_AMONG = 5  # cameras; of four, one that is wrong leaves three, who have six planes at most
 
@@ -52,7 +58,17 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
     for other, read, remedy in other_conventions(seen):
         found.append((_median_misfit(hulls, read), _CONVENTION.format(other, remedy)))
     believed = [(misfit, told) for misfit, told in found if misfit <= RIGHT_MOST]
-    return min(believed)[1] if believed else OTHER_RIG
+    if believed:
+        return min(believed)[1]
+    return None if _are_loose(hulls, seen) else OTHER_RIG
+
+
+def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
+    """Whether most outlines contradict the others, though these cameras took the pictures (``wrong_rig`` is None)."""
+    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    if len(seen) < CAMERAS_LEAST:
+        return False
+    return _median_misfit([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen) >= WRONG_LEAST
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
@@ -76,6 +92,15 @@ def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
     misses = own_misses(hulls, rig)
     speaking = np.isfinite(misses).sum(axis=(1, 2)) >= PLANES_LEAST
     return float(np.median(mean_misfit(misses)[speaking])) if speaking.sum() >= CAMERAS_LEAST else np.nan
+
+
+def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
+    """Whether so many planes meet closely as they do in the rig that took the pictures alone, whatever the masks."""
+    misses = own_misses(hulls, rig)
+    widths = np.array([camera.intrinsics.width for camera in rig], float)
+    shares = np.abs(misses) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
+    quarter, half = np.nanquantile(shares, (0.25, 0.5))
+    return bool(quarter <= LOOSE_QUARTER or quarter <= min(LOOSE_BIMODAL * half, LOOSE_QUARTER_MOST))
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:

@@ -17,7 +17,7 @@ from jaxtyping import Float32, UInt8
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_assignment import FITTING_MISFIT, Assignment, find_assignment, own_misfit, ring_texts
-from pipeline.multiview.rig_agreement import wrong_rig
+from pipeline.multiview.rig_agreement import loose_outlines, wrong_rig
 from pipeline.multiview.triangulation import NoPoint, triangulate
 from rig.capture import Capture, Features, refiled
 from rig.errors import EigenheadError
@@ -30,6 +30,11 @@ PLATE_GAIN = 1.3  # how many times as much of each picture the other plates must
 PLATE_COLUMNS = 64
 PLATE_TOLERANCE = 0.06  # of log level: 2 % of light drift, vignetting, and noise averaged over 16 x 16 pixels
 CLICK_PX, CLICK_MISFIT_MOST = 1.5, 50.0
+
+OUTLINES_LOOSE = (
+    "most outlines contradict each other by more than these cameras explain: look at the overlays for a shadow on the "
+    "wall, or hair that some masks miss; where the masks are tight, calibrate again"
+)
 
 Segmentation = Callable[[Capture], dict[str, Silhouette]]
 
@@ -91,6 +96,8 @@ def own_pictures(
         silhouettes = segmented(capture)
         plates = _composed(plates, assignment.pictures)
     warnings = _warnings(assignment, plates, duplicates)
+    if not assignment.pictures and loose_outlines(distinct, rig):
+        warnings = (*warnings, ReportWarning("outlines-loose", OUTLINES_LOOSE))
     return OwnPictures(capture, _left_out(silhouettes, duplicates), assignment.pictures, plates, warnings)
 
 

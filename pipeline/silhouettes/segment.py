@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.imaging.contour_distance import distance_to_level
 from pipeline.imaging.masks import dilated, eroded
@@ -38,9 +38,8 @@ UNDECIDED_PX = 15  # side of a window ...
 UNDECIDED_FILLED = 0.6  # ... and its part that is undecided where the outline is a guess
 WEAK = "of the contour hardly differs from the background"
 NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
-SEEDED_VIEWS = (
-    8  # fewer views do not tell the subject by each other, and begin with its face; eleven do as well without
-)
+SEEDED_VIEWS = 8  # fewer do not tell the subject by each other, and begin with its face
+BODY_FILLS = 0.75  # of the subject's width is on the border where shoulders leave; a cut above the brow leaves less
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
 
@@ -57,7 +56,8 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
     silhouettes: dict[str, Silhouette] = {}
     with ThreadPoolExecutor(thread_count()) as pool:  # cv2 and the compiled kernels release the interpreter lock
         given = {
-            name: pool.submit(_operators, capture.masks[name], settings) for name in rig.names & capture.masks.keys()
+            name: pool.submit(_operators, capture.masks[name], capture.soft_masks.get(name), settings)
+            for name in rig.names & capture.masks.keys()
         }
         jobs = {
             name: pool.submit(decide, capture.images[name], capture.backgrounds[name], settings)
@@ -79,7 +79,7 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
         for count, name in enumerate(rig.names, 1):
             silhouettes[name] = (given | finished)[name].result()
             report("segmentation", 0.4 + 0.5 * count / len(rig))
-    agreed = judge_agreement(silhouettes, rig, settings)
+    agreed = judge_agreement(silhouettes, rig, settings, ready=capture.masks.keys())
     report("segmentation", 1.0)
     return agreed
 
@@ -127,8 +127,14 @@ def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -
     return Silhouette(mask, distance_to_level(alpha), _quality(mask, (1, holes), float("inf"), weak, figures, settings))
 
 
-def _operators(mask: Bool[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
-    return replace(silhouette_from_mask(mask), quality=_mask_quality(mask, settings))
+def _operators(
+    mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | None, settings: SegmentationSettings
+) -> Silhouette:
+    """The silhouette of a ready mask; where its edges are soft the outline is where the subject's share is half."""
+    if share is None:
+        return replace(silhouette_from_mask(mask), quality=_mask_quality(mask, settings))
+    smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), settings.alpha_blur_px)
+    return Silhouette(mask, distance_to_level(smooth), _mask_quality(mask, settings))
 
 
 def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Silhouette:
@@ -215,8 +221,10 @@ def _quality(
     borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
     cut_off = tuple(name for name, line in borders.items() if line.sum() > 2)
     warnings, fatal = [], []
-    if "top" in cut_off:
-        warnings.append("the head is cut off at the top of the image: move the camera back or tilt it up")
+    crown = _crown_side(mask)
+    if crown in cut_off:
+        remedy = "tilt it up" if crown == "top" else "turn it"
+        warnings.append(f"the head is cut off at the {crown} of the image: move the camera back or {remedy}")
     apart = figures.get("other_pieces", 0.0)
     if apart > settings.other_pieces_warned:
         text = f"pieces of {apart:.1%} of the subject's area stand apart from it and are left out: did something move"
@@ -234,6 +242,19 @@ def _quality(
     warnings += [f"{text}; the view is left out" for text in fatal]
     components, holes = components_holes
     return ViewQuality(not fatal, contrast, cut_off, components, holes, tuple(warnings), figures)
+
+
+def _crown_side(mask: Bool[np.ndarray, "h w"]) -> str:
+    """The border beyond which the crown would be: opposite to the one through which the body leaves the picture, for
+    cameras may hang on their side or upside down. A body fills as much of a border as it is wide; a cut crown less."""
+    across, down = mask.sum(axis=0), mask.sum(axis=1)
+    widest = {"top": down.max(), "bottom": down.max(), "left": across.max(), "right": across.max()}
+    touched = {"top": mask[0].sum(), "bottom": mask[-1].sum(), "left": mask[:, 0].sum(), "right": mask[:, -1].sum()}
+    body = max(touched, key=lambda side: touched[side])
+    return _OPPOSITE[body] if touched[body] >= BODY_FILLS * max(widest[body], 1) else "top"
+
+
+_OPPOSITE = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 
 
 def _nothing(shape: tuple[int, ...], background: Background) -> Silhouette:

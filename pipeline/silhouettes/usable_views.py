@@ -12,6 +12,7 @@ from typing import Literal
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_drift import find_drift
+from pipeline.multiview.head_size import judge_head_size
 from pipeline.multiview.rig_agreement import misplaced_camera
 from pipeline.silhouettes.own_pictures import own_pictures
 from rig.capture import Capture
@@ -24,12 +25,18 @@ VIEWS_LEAST = 3
 class TooFewViews(EigenheadError):
     """Not enough usable silhouettes."""
 
-    def __init__(self, silhouettes: Mapping[str, Silhouette]) -> None:
+    def __init__(self, silhouettes: Mapping[str, Silhouette], capture: Capture) -> None:
         poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
-        told = "; ".join(f"{name}: {', '.join(reasons) or 'unusable'}" for name, reasons in poor.items())
+        reasons = "; ".join(f"{name}: {', '.join(texts) or 'unusable'}" for name, texts in poor.items())
+        if capture.masks:
+            remedy = "Correct these masks, or take them away and supply clean plates"
+        elif capture.backgrounds:
+            remedy = "Take new clean plates with the same light, or supply masks/"
+        else:
+            remedy = "Supply clean plates (background/), or masks/"
         super().__init__(
             f"only {len(silhouettes) - len(poor)} of {len(silhouettes)} views have a usable silhouette, "
-            f"{VIEWS_LEAST} are needed ({told}). Take new clean plates with the same light, or supply masks/"
+            f"{VIEWS_LEAST} are needed ({reasons}). {remedy}"
         )
 
 
@@ -61,14 +68,16 @@ def usable_views(
 
     Raises:
         ExchangedPictures, WrongRig: of ``own_pictures``.
+        WrongScale: of ``judge_head_size``.
         TooFewViews: fewer than ``VIEWS_LEAST`` silhouettes are of use.
     """
     own = own_pictures(capture, rig, segmented, exchanged=exchanged)
     if sum(silhouette.quality.usable for silhouette in own.silhouettes.values()) < VIEWS_LEAST:
-        raise TooFewViews(own.silhouettes)
+        raise TooFewViews(own.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(own.silhouettes, rig)
     remarks = [ReportWarning(remark.code, remark.message) for remark in capture.remarks]
-    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *remarks)
+    size = judge_head_size(silhouettes, rig)
+    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *size, *remarks)
     return UsableViews(own.capture, silhouettes, own.pictures, warnings)
 
 

@@ -18,12 +18,13 @@ from pipeline.evidence.expression import (
     shut_eyes,
 )
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
-from pipeline.evidence.plausibility import plausibility_warnings
+from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines
 from pipeline.fitting.expression_evidence import makes_face
 from pipeline.fitting.fine.blink import blinks_of, with_lids
 from pipeline.fitting.fine.expression_reading import with_read_expression
 from pipeline.fitting.fine.refine import Displaced
 from pipeline.fitting.fit import Fit
+from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
@@ -57,7 +58,9 @@ def judge_head(
     refined: RefinedHead,
     texturing: Texturing,
 ) -> Staged[Evidence]:
-    """Measures the delivered head, and warns of what heads, rigs and masks cannot be."""
+    """Measures the delivered head, and warns of what heads, rigs and masks cannot be.
+
+    Raises UnexplainedOutlines where it explains hardly any outline, unless the settings let that pass."""
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)
     fitted = {name: np.isfinite(depth) for name, depth in texturing.depths.items()}
@@ -79,6 +82,11 @@ def judge_head(
         posable_head(model, fit.world_from_head, refined.mesh_world, expression) if posed else None,
     )
     warnings = plausibility_warnings(fit, model, cameras, widths_px)
+    pixels_mm = {camera.name: pixel_mm(camera, fit.world_from_head.translation) for camera in rig}
+    unexplained = unexplained_outlines(cameras, pixels_mm)
+    if unexplained is not None and context.settings.unexplained_outlines == "refuse":
+        raise UnexplainedOutlines(unexplained)
+    warnings += [] if unexplained is None else [ReportWarning("outlines-unexplained", unexplained)]
     return Staged(evidence, [*warnings, *eye_warnings(shut_eyes(model, made) | closed_eyes)])
 
 

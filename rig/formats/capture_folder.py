@@ -12,7 +12,7 @@ beside cameras.json. Which file is whose, where names differ, is found in ``rig.
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +25,11 @@ from rig.capture import Capture, Features, Remark
 from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
+from rig.formats.capture_masks import mask_subjects
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import decode_image_file, picture_size, write_image
 from rig.formats.picture_names import is_junk
+from rig.formats.picture_samples import WHOLE_BITS, measure_samples
 from rig.formats.reading import CamerasRead, say_once
 from rig.formats.shot_files import (
     BESIDE_PICTURES,
@@ -36,11 +38,12 @@ from rig.formats.shot_files import (
     listed_pictures,
     stray_sentence,
 )
-from rig.formats.work_size import at_share, work_features, work_rig, work_share
+from rig.formats.work_size import work_features, work_rig, work_share
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.text import suggest
 
+SCALE = "scale.json"
 ENCLOSING_MOST = 3  # folders around a capture: of the archive, and of who packed a folder twice
 ALIKE_LEAST = 0.75  # of the names of two folders: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 
@@ -58,7 +61,7 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     read = read_rig_of(rig_file)
     rig = read.rig
     check_folders(folder, rig)
-    faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
+    faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig, any_unit=has_known_length(folder))]
     files = find_files(folder, rig, read.left_out)
     faults += files.faults
     capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most)
@@ -68,7 +71,10 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
-    remarks = [*read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
+    if has_known_length(folder):
+        digests[SCALE] = hashlib.sha256((folder / SCALE).read_bytes()).hexdigest()
+        ordered = dict(sorted(digests.items()))
+    remarks = [*capture.remarks, *read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
     return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
 
 
@@ -93,15 +99,10 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Remark]:
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Remark]:
-    """Cameras of another program, and a length for cameras that are known: files that do nothing here."""
+    """Cameras of another program: files that do nothing here."""
     read, *others = (path.relative_to(folder).as_posix() for path in rigs)
     others += _other_models(folder, rigs[0])
     told = [f"{other} is not read: the cameras come from {read}" for other in others]
-    if (folder / "scale.json").is_file() and not (folder / "calibration.json").is_file():  # whose cameras it scaled
-        told.append(
-            f"scale.json is not read: the cameras of {read} are taken as millimetres; without that file the cameras "
-            "are found from the photographs, and scaled"
-        )
     return [Remark("file-unread", message) for message in told]
 
 
@@ -114,6 +115,11 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
     found = [twin] if twin.is_file() else []
     found += [path for path in sparse if path.suffix in (".bin", ".txt") and path.parent != rig_file.parent]
     return [path.relative_to(folder).as_posix() for path in found]
+
+
+def has_known_length(folder: Path) -> bool:
+    """Whether a length beside cameras tells their unit: scale.json, unless it told that when the cameras were found."""
+    return (folder / SCALE).is_file() and not (folder / "calibration.json").is_file()
 
 
 def capture_root(folder: Path) -> Path:
@@ -154,10 +160,13 @@ def read_shot(
         files = find_files(folder, rig)
         faults += files.faults
     jobs = [(kind, camera.name, path) for camera in rig for kind, path in files.of_camera(camera.name)]
+    bits, levels = _sample_bits(jobs, faults)
     with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
-        decoded = list(pool.map(lambda job: _decode(folder, *job, rig=rig, pixels_most=pixels_most), jobs))
+        decoded = list(
+            pool.map(lambda job: _decode(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]]), jobs)
+        )
     images: dict[str, np.ndarray] = {}
-    masks: dict[str, np.ndarray] = {}
+    masks: dict[str, tuple[str, np.ndarray]] = {}
     backgrounds: dict[str, list[np.ndarray]] = {}
     digests: dict[str, str] = {}
     for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
@@ -168,7 +177,7 @@ def read_shot(
         if kind == "images":
             images[name] = pixels
         elif kind == "masks":
-            masks[name] = pixels
+            masks[name] = path.relative_to(folder).as_posix(), pixels
         else:
             backgrounds.setdefault(name, []).append(pixels)
     features: Features = {}
@@ -177,7 +186,35 @@ def read_shot(
         digests["features.json"] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
         features = work_features(features, rig, work_rig(rig, pixels_most))
-    return Capture(images, {name: tuple(plates) for name, plates in backgrounds.items()}, masks, features, digests)
+    subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)
+    return Capture(
+        images,
+        {name: tuple(plates) for name, plates in backgrounds.items()},
+        subjects.masks,
+        features,
+        digests,
+        (*levels, *subjects.remarks),
+        subjects.soft,
+    )
+
+
+def _sample_bits(jobs: Sequence[tuple[str, str, Path]], faults: list[str]) -> tuple[Mapping[str, int], list[Remark]]:
+    """Bits that the files of each kind use of 16, and what is said of fewer; undeveloped mosaics are a fault."""
+    kinds = ("images", "background")
+    samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
+    mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
+    if mosaics:
+        faults.append(
+            f"the pictures in {' and '.join(mosaics)} are the mosaic of a colour sensor, undeveloped: have the "
+            "camera's software write colours"
+        )
+    bits = {kind: samples[kind].bits or WHOLE_BITS for kind in kinds} | {"masks": WHOLE_BITS}
+    remarks = []
+    for used in sorted({bits[kind] for kind in kinds} - {WHOLE_BITS}):
+        folders = " and ".join(f"{kind}/" for kind in kinds if bits[kind] == used)
+        text = f"no pixel of {folders} is above {2**used - 1} of 65535: read as {used} bits"
+        remarks.append(Remark("picture-levels", f"{text}; shift them by {WHOLE_BITS - used} when writing"))
+    return bits, remarks
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
@@ -192,7 +229,8 @@ def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
         for i, plate in enumerate(plates):
             files.append((folder / "background" / (f"{name}/{i:03}.png" if several else f"{name}.png"), plate))
     for name, mask in capture.masks.items():
-        files.append((folder / "masks" / f"{name}.png", mask.astype(np.uint8) * 255))
+        share = capture.soft_masks.get(name, mask.astype(np.uint8) * np.uint8(255))
+        files.append((folder / "masks" / f"{name}.png", share))
     with ThreadPoolExecutor(max_workers=4) as pool:
         list(pool.map(lambda file: write_image(*file), files))
     if capture.features:
@@ -211,26 +249,24 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
 
 
 def _decode(
-    folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None
+    folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
 ) -> tuple[np.ndarray | None, str, str]:
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"
-    pixels, digest, fault = decode_image_file(path, where, "mask" if whole else "colour", share=1.0 if whole else share)
+    pixels, digest, fault = decode_image_file(
+        path, where, "mask" if whole else "colour", share=1.0 if whole else share, bits=bits
+    )
     if pixels is None:
         return None, digest, fault
     size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
     if size != wanted:
         return None, "", size_fault(where, size, camera.intrinsics)
-    if whole:  # whatever is not zero is the subject, so that it is told before pixels are averaged
-        pixels = at_share(pixels, size, share)
+    if whole:  # what its numbers mean is asked of all masks together, and before pixels are averaged
+        return pixels, digest, fault
     if camera.recorded is not None:
         matrix = work_rig(rig.subset([name]), pixels_most)[name].intrinsics.matrix()
-        pixels = camera.recorded.undistort(pixels, matrix, smooth=not whole)
-    if whole:
-        pixels = pixels > 127
-        if not pixels.any():
-            return None, "", f"{where} is empty: no pixel belongs to the subject"
+        pixels = camera.recorded.undistort(pixels, matrix)
     pixels.setflags(write=False)
     return pixels, digest, fault
 

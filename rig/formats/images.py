@@ -20,7 +20,9 @@ from PIL import Image, UnidentifiedImageError
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError, how_to_install
+from rig.formats.mask_values import Plane, mask_plane
 from rig.formats.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
+from rig.formats.picture_samples import WHOLE_BITS
 from rig.formats.work_size import at_share, halvings
 from rig.image import ImageRgb
 
@@ -101,11 +103,13 @@ def open_picture(path: Path) -> Image.Image:
 
 
 def decode_image_file(
-    path: Path, where: str, kind: PictureKind, *, share: float = 1.0
+    path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
 ) -> tuple[np.ndarray | None, str, str]:
-    """Pixels at ``share`` of their number across, the sha256 of the file, and the fault (then no pixels) as a sentence.
+    """Pixels at ``share`` of their number across (a mask's are all there), the sha256 of the file, and the fault (then
+    no pixels) as a sentence.
 
-    Pixels are RGB (``colour``), one channel (``grey``), or of a ``mask`` 255 where the subject is and else 0."""
+    Pixels are RGB (``colour``), one channel (``grey``), or of a ``mask`` the one channel that holds it, in the file's
+    own numbers (``rig.formats.mask_values``). ``bits``: that samples of 16 use (``rig.formats.picture_samples``)."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     try:
         with _faults_of(where):
@@ -113,8 +117,8 @@ def decode_image_file(
         if width * height > PIXELS_MOST:
             raise InputError(where, [f"is {width} x {height} pixels; at most {PIXELS_MOST:,} are read"])
         with _faults_of(where, "its pixels cannot be decoded"):
-            pixels = _decoded(data, suffix, kind, halved=halvings(share, (width, height)))
-            pixels = at_share(pixels, (width, height), share)
+            pixels = _decoded(data, suffix, kind, halved=halvings(share, (width, height)), bits=bits)
+        pixels = _plane(pixels, where) if kind == "mask" else at_share(pixels, (width, height), share)
     except InputError as error:
         return None, "", f"{where} {error.faults[0]}"
     if data.startswith(PNG) and PNG_END not in data:  # OpenCV fills up what is cut off
@@ -148,7 +152,7 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
         return header.size, header.info.get("icc_profile") or b""
 
 
-def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int) -> np.ndarray:
+def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: int) -> np.ndarray:
     """``halved``: how often a JPEG is, which costs its decoder less than none at all; others come as they are."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
@@ -162,14 +166,17 @@ def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int) -> np.
             return _of_white(data, int(white[1]), kind)
         halved = halved if data.startswith(JPEG) and kind != "mask" else 0
         flags = cv2.IMREAD_UNCHANGED if kind == "mask" else (GREY_FLAGS if kind == "grey" else COLOUR_FLAGS)[halved]
+        flags |= cv2.IMREAD_ANYDEPTH if bits < WHOLE_BITS and kind != "mask" else 0
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if pixels is None:
             raise ValueError("not decoded")
         if kind == "mask":
-            return _subject(pixels)
+            return pixels
+        if pixels.dtype == np.uint16:
+            pixels = np.minimum(np.right_shift(pixels, bits - 8), 255).astype(np.uint8)
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if halved and kind == "colour" else pixels
     if kind == "mask":
-        return _subject(pixels)
+        return pixels
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if kind == "grey" else np.ascontiguousarray(pixels)
 
 
@@ -179,7 +186,7 @@ def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
     if pixels is None or not 0 < white < 65536:
         raise ValueError("not decoded")
     if kind == "mask":
-        return _subject(pixels)
+        return pixels
     bytes_of = np.clip(np.round(np.arange(65536) * (255.0 / white)), 0, 255).astype(np.uint8)
     pixels = bytes_of[np.asarray(pixels, np.uint16)]
     if kind == "grey":
@@ -187,15 +194,11 @@ def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
     return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB)
 
 
-def _subject(pixels: np.ndarray) -> UInt8[np.ndarray, "h w"]:
-    """255 where a mask shows the subject: where it is opaque by half, in a cut-out, else where any channel is not 0."""
-    channels = pixels[:, :, None] if pixels.ndim == 2 else pixels
-    alpha = channels[:, :, 3] if channels.shape[2] == 4 else None
-    if alpha is not None and alpha.min() < alpha.max():
-        inside = alpha > np.iinfo(alpha.dtype).max // 2
-    else:
-        inside = (channels[:, :, :3] != 0).any(axis=2)
-    return inside.astype(np.uint8) * np.uint8(255)
+def _plane(pixels: np.ndarray, where: str) -> Plane:
+    plane = mask_plane(pixels)
+    if isinstance(plane, str):
+        raise InputError(where, [plane])
+    return plane
 
 
 @contextmanager

@@ -89,11 +89,14 @@ def calibrate(
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Of a board: write cameras.json even where checks refuse it.")
+    ] = False,
     json_out: Json = False,
 ) -> None:
     """Calibrate a rig from pictures of a board, or of a scene."""
     if source == "scene":
-        for option, value in (("--board", board), ("--previous", previous)):
+        for option, value in (("--board", board), ("--previous", previous), ("--anyway", anyway or None)):
             if value is not None:
                 raise typer.BadParameter("is for a board; a scene takes none", param_hint=option)
         prepare_file(out)
@@ -105,11 +108,11 @@ def calibrate(
     if board is None:
         raise typer.BadParameter("say which board, or --from scene", param_hint="--board")
     prepare_file(out)
-    _calibrate_board(images, board, out, front, previous, json_out)
+    _calibrate_board(images, board, out, front, previous, json_out, anyway=anyway)
 
 
 def _calibrate_board(
-    images: Path, board: Path, out: Path, front: str | None, previous: Path | None, json_out: bool
+    images: Path, board: Path, out: Path, front: str | None, previous: Path | None, json_out: bool, *, anyway: bool
 ) -> None:
     from calibration.board.board import read_board
     from calibration.calibrate import calibrate as run
@@ -123,9 +126,14 @@ def _calibrate_board(
         with progress_bar() as report:
             found = run(images, read_board(board), front=front, previous=known, report=report)
     except CalibrationRefused as refusal:
-        if refusal.calibration is not None:
-            write_report(refusal.calibration, page)
-        raise
+        if refusal.calibration is None:
+            raise
+        write_report(refusal.calibration, page)
+        if not anyway:
+            reasons = (*refusal.reasons, "its report is written, and --anyway writes cameras.json, too, for a look")
+            raise CalibrationRefused(reasons, refusal.calibration) from refusal
+        warn(str(refusal))
+        found = refusal.calibration
     write_calibration(found, out)
     write_report(found, page)
     figures = found.figures()

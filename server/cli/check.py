@@ -12,16 +12,15 @@ from typing import TYPE_CHECKING, TypedDict
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError, WrongVariable
 from rig.formats.cameras_file import read_cameras, rig_files
-from rig.formats.capture_folder import capture_root, read_capture, unread_files, unread_pictures
+from rig.formats.capture_folder import SCALE, capture_root, unread_files, unread_pictures
 from rig.formats.images import decode_image_file
 from rig.formats.shot_files import BESIDE_PICTURES, find_files, listed_pictures
-from rig.formats.work_size import WORK_PIXELS
 from rig.progress import Progress
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
 from server.tasks.child import WorkFailed
 from server.tasks.ingest import check_capture
-from server.tasks.photographs import SCALE, photographs_alone
+from server.tasks.photographs import photographs_alone, read_scaled_capture
 from server.tasks.prepare import prepare_kernels
 
 if TYPE_CHECKING:
@@ -138,7 +137,7 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> lis
     from pipeline.silhouettes.usable_views import usable_views
     from pipeline.texture.chart_colours import chart_colours
 
-    shot, rig = read_capture(folder, pixels_most=WORK_PIXELS)
+    shot, rig = read_scaled_capture(folder)
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
 
     def segmented(capture: Capture) -> dict[str, "Silhouette"]:

@@ -17,11 +17,11 @@ from pipeline.stages.alignment import align_to_views
 from pipeline.stages.views import Views
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
-from rig.formats.capture_folder import read_capture
 from rig.geometry import RigidTransform, Similarity
 from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 from server.cli.reconstruct_local import folder_of
+from server.tasks.photographs import read_scaled_capture
 
 
 def refine_locally(
@@ -44,7 +44,7 @@ def refine_locally(
     for number, path in enumerate(captures):
         report("silhouettes", 0.5 * number / len(captures))
         with folder_of(path) as folder:
-            capture, own = read_capture(folder)
+            capture, own = read_scaled_capture(folder, pixels_most=None)
         rig = rig or own
         faults = _differences(own, rig, same_poses=calibration is None)
         if faults:

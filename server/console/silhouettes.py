@@ -18,11 +18,10 @@ LINE_PX = 3
 def draw(bench: Bench, report: Progress, *, capture: str, cache: str, target: str) -> None:
     """Writes ``target``/<camera>.png, the outline with a tint of the subject on nothing. Raises InputError."""
     from pipeline.settings import SegmentationSettings
-    from rig.formats.capture_folder import read_capture
-    from rig.formats.work_size import WORK_PIXELS
     from server.storage.silhouette_cache import segment_once
+    from server.tasks.photographs import read_scaled_capture
 
-    shot, rig = read_capture(Path(capture), pixels_most=WORK_PIXELS)
+    shot, rig = read_scaled_capture(Path(capture))
     found = segment_once(Path(cache), shot, rig, SegmentationSettings(), report=report)
     for name, silhouette in found.items():
         done, data = cv2.imencode(".png", outline(silhouette.mask)[:, :, [2, 1, 0, 3]])

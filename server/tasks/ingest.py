@@ -20,11 +20,20 @@ from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
 from rig.formats.cameras_json import read_rig
-from rig.formats.capture_folder import capture_root, check_folders, read_rig_of, read_shot, size_fault
+from rig.formats.capture_folder import (
+    SCALE,
+    capture_root,
+    check_folders,
+    has_known_length,
+    read_rig_of,
+    read_shot,
+    size_fault,
+)
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.reading import say_once
 from rig.formats.rig_toml import ShotConfig
+from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
 from rig.plausibility import rig_faults
 from rig.progress import Progress
@@ -169,7 +178,7 @@ def check_capture(
     read = read_rig_of(rig_file)
     rig = read.rig
     check_folders(root, rig)
-    faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig)]
+    faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig, any_unit=has_known_length(root))]
     files = find_files(root, rig, read.left_out)
     faults += files.faults
     faults += [stray_sentence(files.strays, rig)] if files.strays and not strays_pass else []
@@ -194,6 +203,9 @@ def check_capture(
         raise InputError("capture", say_once(faults, rig.names))
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(root).as_posix()] = _sha256(path)
+    if has_known_length(root):
+        read_scale(root / SCALE, rig.names)
+        digests[SCALE] = _sha256(root / SCALE)
     return CaptureContent(
         cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
         front=rig.front_camera(),

@@ -23,17 +23,26 @@ from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.cameras_file import find_rig_file
+from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
-from rig.formats.capture_folder import capture_root, read_capture, read_shot, unread_pictures
+from rig.formats.capture_folder import (
+    SCALE,
+    capture_root,
+    has_known_length,
+    read_capture,
+    read_shot,
+    unread_pictures,
+)
 from rig.formats.images import is_picture, picture_size, write_image
 from rig.formats.reading import say_once
+from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import find_files, picture_folder
 from rig.formats.work_size import WORK_PIXELS, work_rig
+from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
 
-CAMERAS, FIGURES, PAGE, SCALE = "cameras.json", "calibration.json", "calibration.html", "scale.json"
+CAMERAS, FIGURES, PAGE = "cameras.json", "calibration.json", "calibration.html"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +69,7 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
 
     Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
     if not photographs_alone(folder):
-        return Prepared(*read_capture(folder, pixels_most=WORK_PIXELS), ())
+        return Prepared(*read_scaled_capture(folder), ())
     from calibration.scene.photographs import find_photographs
 
     root = capture_root(folder)
@@ -75,6 +84,23 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
     warnings += tuple(ReportWarning(remark.code, remark.message) for remark in unread_pictures(root, files, rig))
     digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
     return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
+
+
+def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) -> tuple[Capture, Rig]:
+    """Reads a capture folder with its cameras; where scale.json lies beside them, in its millimetres.
+
+    Raises InputError naming every fault, also of cameras that are in no plausible unit once they are scaled."""
+    capture, rig = read_capture(folder, pixels_most=pixels_most)
+    root = capture_root(folder)
+    rig_file = find_rig_file(root)
+    if rig_file is None or not has_known_length(root):
+        return capture, rig
+    from calibration.scene.rig_scale import scaled_by_length
+
+    scaled, remarks = scaled_by_length(capture, rig, read_rig_file(rig_file), read_scale(root / SCALE, rig.names))
+    if faults := rig_faults(scaled):
+        raise InputError("capture", [f"{rig_file.name}, scaled by {SCALE}: {fault}" for fault in faults])
+    return replace(capture, remarks=(*capture.remarks, *remarks)), scaled
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Progress) -> tuple[ReportWarning, ...]:

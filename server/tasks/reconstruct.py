@@ -53,11 +53,9 @@ def reconstruct_capture(
     from pipeline.settings import settings_from_document
     from pipeline.stages.context import ReconstructionContext
     from pipeline.templates.load import load_template
-    from rig.formats.capture_folder import read_capture
-    from rig.formats.work_size import WORK_PIXELS
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
-    from server.tasks.photographs import calibration_warnings
+    from server.tasks.photographs import calibration_warnings, read_scaled_capture
     from server.tasks.prepare import prepare_kernels
 
     chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
@@ -67,7 +65,7 @@ def reconstruct_capture(
     head_model = bench.keep(f"model {name}", lambda: load_model(name))
     template = load_template(chosen.outputs.template, head_model)
     renderer = bench.keep("renderer", Renderer.create)
-    shot, rig = read_capture(Path(capture), pixels_most=WORK_PIXELS)
+    shot, rig = read_scaled_capture(Path(capture))
 
     def tell(stage: str, fraction: float) -> None:
         if stage != DONE:  # the files are still to be written

@@ -72,7 +72,7 @@ def test_a_mirrored_picture_is_refused_and_named(board: Board) -> None:
     [
         pytest.param(CHECKERBOARD, 7, "it shows 9 x 6", marks=pytest.mark.slow),
         pytest.param(CHECKERBOARD, 10, "it shows 9 x 6", marks=pytest.mark.slow),
-        (CHARUCO, 7, "hold only 21"),
+        (CHARUCO, 7, "it shows 9 squares in a row"),
     ],
 )
 def test_a_wrong_square_count_is_refused_and_named(board: Board, columns: int, said: str) -> None:
@@ -114,7 +114,7 @@ def test_a_folder_is_detected_and_remembered(tmp_path: Path) -> None:
 
 def test_a_wrong_board_in_every_picture_is_refused(tmp_path: Path) -> None:
     write_pictures(tmp_path, CHARUCO, shots=1)
-    with pytest.raises(WrongBoard, match="hold only 21"):
+    with pytest.raises(WrongBoard, match="9 squares in a row and 6 rows or more"):
         detect_folder(tmp_path, replace(CHARUCO, columns=7))
 
 

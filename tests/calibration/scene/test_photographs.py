@@ -58,7 +58,9 @@ def test_what_is_no_folder_is_named(tmp_path: Path) -> None:
 def test_a_mask_of_another_size_is_a_fault(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "shot")  # 24 x 24 pixels
     for name, size in (("cam00", 24), ("cam01", 12)):
-        write_image(folder / "masks" / f"{name}.png", np.full((size, size), 255, np.uint8))
+        mask = np.zeros((size, size), np.uint8)
+        mask[size // 4 : size * 3 // 4, size // 4 : size * 3 // 4] = 255
+        write_image(folder / "masks" / f"{name}.png", mask)
     rig = read_rig(folder / "cameras.json")
     with pytest.raises(InputError) as refused:
         find_masks(folder, find_photographs(folder / "images"), rig)

@@ -8,7 +8,13 @@ import pytest
 from pipeline.diagnostics import ReportWarning
 from pipeline.eigenheads.model import load_model
 from pipeline.evidence.camera_metrics import CameraFigures
-from pipeline.evidence.plausibility import ImplausibleResult, plausibility_warnings, refuse, size_of
+from pipeline.evidence.plausibility import (
+    ImplausibleResult,
+    plausibility_warnings,
+    refuse,
+    size_of,
+    unexplained_outlines,
+)
 from pipeline.fitting.fit import Fit
 from pipeline.settings import Settings, settings_from_document
 from rig.errors import InputError
@@ -94,3 +100,33 @@ def test_settings_take_codes_that_there_are():
     for wrong in (["scale"], "scale-implausible", [3]):
         with pytest.raises(InputError, match="fail_on"):
             settings_from_document({"fail_on": wrong})
+
+
+def explained(shares, rms_px, used=True):
+    return {
+        f"cam{k:02}": CameraFigures(used, 0.98, rms, 100.0, excluded_share=share)
+        for k, (share, rms) in enumerate(zip(shares, rms_px, strict=True))
+    }
+
+
+@pytest.mark.parametrize(
+    ("shares", "rms_px", "pixel_mm", "refused"),
+    [
+        pytest.param([1.0] * 7 + [0.3] * 4, [120.0] * 7 + [20.0] * 4, 0.5, True, id="a doll in the face"),
+        pytest.param([0.16, 0.96, 1.0, 0.17, 0.66, 0.58, 0.59, 0.0, 0.08, 0.0, 0.0],
+                     [3, 115, 30, 13, 38, 7, 11, 0.4, 6, 0.3, 0.4], 0.5, False, id="hair over the ears"),
+        pytest.param([1.0] * 9 + [0.2] * 2, [9.0] * 11, 0.24, False, id="large pictures: 2 mm off"),
+        pytest.param([1.0] * 3, [100.0] * 3, 0.5, True, id="three views"),
+    ],
+)  # fmt: skip
+def test_a_head_that_explains_no_outline_is_refused(shares, rms_px, pixel_mm, refused):
+    cameras = explained(shares, rms_px)
+    text = unexplained_outlines(cameras, dict.fromkeys(cameras, pixel_mm))
+    assert (text is not None) == refused
+    assert not refused or f"{sum(s >= 0.9 for s in shares)} of {len(shares)} views" in text
+
+
+def test_views_without_a_rim_and_views_left_out_have_no_say():
+    bad = explained([1.0] * 3, [100.0] * 3, used=False)
+    none = {"cam09": CameraFigures(True, None, None, None)}
+    assert unexplained_outlines(bad | none, dict.fromkeys(bad | none, 0.5)) is None

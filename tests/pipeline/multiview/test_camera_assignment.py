@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.experiments.robustness import knocked
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.multiview.camera_assignment import find_assignment, own_misfit, rings
+from pipeline.multiview.camera_assignment import _miss_px, find_assignment, own_misfit, rings
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.support.silhouette_subjects import captures_of, disturbed
@@ -101,3 +101,10 @@ def test_pictures_are_exchanged_only_among_cameras_of_one_size(subjects):
     half = {"cam04": silhouette_from_mask(captures[0]["cam04"].mask[::2, ::2])}
     filed = {"cam06": "cam08", "cam08": "cam06"}
     assert find_assignment(exchanged(captures[0], filed) | half, mixed).pictures == filed
+
+
+def test_planes_without_a_direction_say_nothing_and_warn_of_nothing() -> None:
+    """Warnings are errors in the tests: two angles by a step of 0, or one that is no number, are left out."""
+    gap = np.array([1e-3, 0.0, np.nan, 2e-3])
+    step = np.array([0.0, 0.0, 1e-3, 1e-3])
+    np.testing.assert_array_equal(np.isfinite(_miss_px(gap, step)), [False, False, False, True])

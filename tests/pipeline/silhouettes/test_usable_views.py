@@ -5,8 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibration.scene.rig_scale import times
 from pipeline.eigenheads.model import load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.multiview.head_size import WrongScale
+from pipeline.settings import SegmentationSettings
+from pipeline.silhouettes.segment import _mask_quality
 from pipeline.silhouettes.usable_views import TooFewViews, UsableViews, usable_views
 from rig.capture import Capture, Remark
 from rig.geometry import RigidTransform, rotation_from_vector
@@ -58,3 +62,42 @@ def test_two_views_are_too_few_and_each_lost_one_is_named(seen: Seen) -> None:
     }
     with pytest.raises(TooFewViews, match=r"only 2 of 11 .* cam10"):
         judged(rig, lost)
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [("masks", "Correct these masks"), ("backgrounds", "Take new clean plates"), ("nothing", "Supply clean plates")],
+)
+def test_the_remedy_is_for_what_was_given(seen: Seen, kind: str, remedy: str) -> None:
+    rig, silhouettes = seen
+    lost = {name: replace(s, quality=replace(s.quality, usable=False)) for name, s in silhouettes.items()}
+    captures = {
+        "masks": Capture({}, masks={name: s.mask for name, s in silhouettes.items()}),
+        "backgrounds": Capture({}, backgrounds={name: (np.zeros((4, 4, 3), np.uint8),) for name in silhouettes}),
+        "nothing": Capture({}),
+    }
+    with pytest.raises(TooFewViews) as refused:
+        judged(rig, lost, captures[kind])
+    assert remedy in str(refused.value)
+    assert kind != "masks" or "or supply masks/" not in str(refused.value)
+
+
+def test_a_rig_in_another_unit_is_refused_before_a_fit(seen: Seen) -> None:
+    rig, silhouettes = seen
+    with pytest.raises(WrongScale, match=r"about 3\.\d times as large as a head"):
+        judged(times(rig, 3.3), silhouettes)
+
+
+def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
+    rows, columns = np.indices((120, 160))
+    bust = (np.hypot(columns - 80, rows - 55) < 25) | ((rows > 85) & (np.abs(columns - 80) < 55))
+    settings = SegmentationSettings()
+    for turns, side in ((0, "top"), (1, "left"), (2, "bottom"), (3, "right")):
+        for cut in (False, True):
+            mask = np.roll(bust, -40, axis=0) if cut else bust
+            mask[-40:] |= cut & bust[-1]
+            quality = _mask_quality(np.ascontiguousarray(np.rot90(mask, turns)), settings)
+            assert [text for text in quality.warnings if "cut off" in text] == (
+                [f"the head is cut off at the {side} of the image: move the camera back or "
+                 f"{'tilt it up' if side == 'top' else 'turn it'}"] if cut else []
+            )  # fmt: skip

@@ -92,19 +92,20 @@ def test_a_key_that_nobody_reads_is_a_warning(masked: tuple[Capture, Rig], tmp_p
 
 
 @pytest.mark.gl
-def test_cameras_and_a_scale_that_nobody_reads_are_warnings(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
+def test_unread_cameras_are_warnings_and_a_scale_is_read(masked: tuple[Capture, Rig], tmp_path: Path) -> None:
     capture, rig = masked
     folder = tmp_path / "shot"
     write_capture(folder, capture, rig)
     write_rig_file(rig, folder / "transforms.json", "nerfstudio")
     write_rig_file(rig, folder / "sparse" / "0", "colmap")
-    (folder / "scale.json").write_text('{"cameras": ["cam00", "cam01"], "distance_mm": 400.0}')
+    (folder / "scale.json").write_text('{"cameras": ["cam00", "cam01"], "distance_mm": 714.557}')
     (folder / "images" / "cam00.xmp").write_text(
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"></x:xmpmeta>'
     )  # a raw developer's
     told = [(w["code"], w["message"].split(":")[0]) for w in found_in(folder)["warnings"]]
-    names = ("sparse/0/cameras.bin", "transforms.json", "scale.json")
-    assert told == [("file-unread", f"{name} is not read") for name in names]
+    names = ("sparse/0/cameras.bin", "transforms.json")
+    unread = [("file-unread", f"{name} is not read") for name in names]
+    assert sorted(told) == sorted([*unread, ("cameras-scaled", "the cameras were scaled by 0.94")])
     (folder / "calibration.json").write_text("{}")  # which says that the scale was read, and found these cameras
     assert len(found_in(folder)["warnings"]) == 2
 

@@ -28,12 +28,12 @@ def outlines(path: Path, *names: str) -> Path:
 
 def test_outlines_and_masks_of_a_folder_judge_it(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "anna")
-    write_image(folder / "masks" / "cam00.png", np.full((24, 24), 255, np.uint8))
+    write_image(folder / "masks" / "cam00.png", np.pad(np.full((12, 12), 255, np.uint8), 6))
     outlines(folder / "outlines.json", "cam01", "cam07")
     given = read_real_capture(folder, tmp_path / "kept", "cam02", None, quiet)
     assert (given.name, given.front, given.rig.names) == ("anna", "cam02", read_rig(folder / "cameras.json").names)
     assert set(given.drawn) == {"cam00", "cam01"}
-    assert given.drawn["cam00"].all()
+    assert given.drawn["cam00"].sum() == 144
     assert given.drawn["cam01"].sum() == pytest.approx(81, abs=2)
     other = read_real_capture(folder, tmp_path / "kept", None, outlines(tmp_path / "other.json", "cam02"), quiet)
     assert set(other.drawn) == {"cam00", "cam02"}

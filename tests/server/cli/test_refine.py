@@ -55,7 +55,9 @@ def test_cameras_come_back_and_the_page_says_so(renderer, tmp_path: Path) -> Non
 
 def test_captures_of_two_rigs_are_refused(tmp_path: Path) -> None:
     small = TRUE.subset(TRUE.names[:3]).scaled(0.05)
-    masks = {camera.name: np.ones((camera.intrinsics.height, camera.intrinsics.width), bool) for camera in small}
+    masks = {camera.name: np.zeros((camera.intrinsics.height, camera.intrinsics.width), bool) for camera in small}
+    for mask in masks.values():
+        mask[10:30, 15:35] = True
     blank = {name: np.zeros((*mask.shape, 3), np.uint8) for name, mask in masks.items()}
     other = disturbed(small, 0.5, np.random.default_rng(0))
     write_capture(tmp_path / "one", Capture(blank, masks=masks), small)

@@ -1,0 +1,154 @@
+"""What board the markers in pictures belong to: measured, where the described one is not found.
+
+A ChArUco board's markers are numbered row by row over its white squares. OpenCV before 4.6, and calib.io, begin an even
+number of rows with a white square; the second board of a pair begins with another number; squares are counted wrongly,
+the marker's side is measured wrongly, the dictionary is another. Each leaves centres of markers that a homography takes
+onto another layout, which tells the cause; the side of a marker by the squares is then its own measure.
+
+Enters: grey pictures. Leaves: the board that explains most of them, or the reason why none does.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from calibration.board.board import SQUARES_LEAST, Board
+
+Markers = Mapping[int, Float[np.ndarray, "4 2"]]  # corners (px) by number
+
+COLUMNS_MOST = 30
+MARKERS_LEAST = 5  # of a picture that is measured: a homography is free to meet four
+LAYOUT_MISS = 0.12  # of a square, RMS: a right layout has 0.02 and a lens's bend, one shifted by a square 0.3 and more
+RATIO_OFF = 0.05  # of the square, between the told and the measured side of markers; 0.01 in sharp pictures
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How markers are laid out: squares in a row, the number of the first marker, and whether the first square is white
+    (``legacy``). ``ratio``: a marker's side by a square's, as measured."""
+
+    columns: int
+    first_marker: int
+    legacy: bool
+    ratio: float
+
+
+def find_markers(grey: UInt8[np.ndarray, "h w"], dictionary: str) -> dict[int, Float[np.ndarray, "4 2"]]:
+    """The markers of one of OpenCV's dictionaries in a picture; a number that is there twice cannot be told apart."""
+    return _detected(grey, cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)))
+
+
+def _detected(grey: np.ndarray, dictionary: cv2.aruco.Dictionary) -> dict[int, Float[np.ndarray, "4 2"]]:
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, cv2.aruco.DetectorParameters()).detectMarkers(grey)
+    numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
+    pairs = zip(numbers, corners, strict=True)
+    return {number: np.asarray(c, float).reshape(4, 2) for number, c in pairs if numbers.count(number) == 1}
+
+
+def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
+    """The layout that explains the markers of most pictures, one of as many columns as ``board`` where there is one;
+    None where none does."""
+    shown = [markers for markers in pictures if len(markers) >= MARKERS_LEAST]
+    if not shown:
+        return None
+    others = [n for n in range(SQUARES_LEAST, COLUMNS_MOST + 1) if n != board.columns]
+    for columns in (board.columns, *sorted(others, key=lambda n: abs(n - board.columns))):
+        for first in _first_markers(shown, board if columns == board.columns else None):
+            for legacy in (board.legacy, not board.legacy):
+                layout = _explaining(shown, columns, first, legacy=legacy)
+                if layout is not None:
+                    return layout
+    return None
+
+
+def _first_markers(shown: Sequence[Markers], board: Board | None) -> list[int]:
+    """Numbers that the first marker may have: 0 or the board's own where that is possible, else the least that was
+    seen, or a lower one where the board has more markers than were seen."""
+    least, most = min(min(markers) for markers in shown), max(max(markers) for markers in shown)
+    if board is None:
+        return [0] if least == 0 else [0, least]
+    held = board.columns * board.rows // 2
+    possible = [first for first in range(least, -1, -1) if first + held > most]
+    likely = [first for first in (board.first_marker, 0) if first in possible]
+    return [*dict.fromkeys([*likely, *possible])]
+
+
+def _explaining(shown: Sequence[Markers], columns: int, first: int, *, legacy: bool) -> Layout | None:
+    corners = _layout_corners(columns, legacy=legacy)
+    ratios = []
+    for markers in shown:
+        numbers = np.array([number for number in markers if 0 <= number - first < len(corners)])
+        if len(numbers) < max(MARKERS_LEAST, 0.8 * len(markers)):
+            continue
+        flat, seen = corners[numbers - first], np.array([markers[number] for number in numbers.tolist()])
+        miss, ratio = _fit(flat, seen)
+        if miss < LAYOUT_MISS:
+            ratios.append(ratio)
+    if len(ratios) <= 0.5 * len(shown):
+        return None
+    return Layout(columns, first, legacy, float(np.median(ratios)))
+
+
+def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]:
+    """Corners of the markers in squares, as if their sides were a square's, for as many rows as any board has."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    rows = min(60, 2 * (len(dictionary.bytesList) // columns))
+    board = cv2.aruco.CharucoBoard((columns, rows), 1.0, 0.999, dictionary)
+    board.setLegacyPattern(legacy)
+    return np.array([np.asarray(points)[:, :2] for points in board.getObjPoints()], float)
+
+
+def _fit(flat: Float[np.ndarray, "m 4 2"], seen: Float[np.ndarray, "m 4 2"]) -> tuple[float, float]:
+    """How far (squares, RMS) the centres of markers miss their layout, and the measured side of a marker (squares)."""
+    homography, _ = cv2.findHomography(seen.mean(axis=1), flat.mean(axis=1), 0)
+    if homography is None or np.linalg.det(homography) <= 0:
+        return np.inf, 0.0
+    back = cv2.perspectiveTransform(seen.reshape(-1, 1, 2), homography).reshape(seen.shape)
+    miss = float(np.sqrt(((back.mean(axis=1) - flat.mean(axis=1)) ** 2).sum(axis=1).mean()))
+    sides = np.linalg.norm(np.roll(back, -1, axis=1) - back, axis=2)
+    turned = ((back[:, 1] - back[:, 0]) * (flat[:, 1] - flat[:, 0])).sum(axis=1) > 0  # markers lie as the layout's do
+    return (miss if turned.mean() > 0.5 else np.inf), float(np.median(sides))
+
+
+def other_dictionary(greys: Iterable[UInt8[np.ndarray, "h w"]], dictionary: str) -> str | None:
+    """Another of OpenCV's dictionaries, whose markers a picture shows; the smallest that holds them."""
+    names = sorted((name for name in dir(cv2.aruco) if name.startswith("DICT_") and name != dictionary), key=_size)
+    for grey in greys:
+        counts = {name: len(find_markers(grey, name)) for name in names}
+        best = max(names, key=lambda name: counts[name])
+        if counts[best] >= MARKERS_LEAST:
+            return best
+    return None
+
+
+def _size(name: str) -> int:
+    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
+
+
+def is_april_grid(markers: Markers) -> bool:
+    """Whether markers stand in every cell of a grid, numbered from row to row, as on Kalibr's AprilGrid."""
+    if len(markers) < MARKERS_LEAST:
+        return False
+    numbers = np.array(sorted(markers))
+    seen = np.array([markers[number].mean(axis=0) for number in numbers.tolist()])
+    for columns in range(2, COLUMNS_MOST):
+        for turn in (1.0, -1.0):  # Kalibr counts rows upwards
+            flat = np.stack([numbers % columns, turn * (numbers // columns)], axis=1).astype(float)
+            if np.linalg.matrix_rank(flat - flat.mean(axis=0)) < 2:
+                continue
+            homography, _ = cv2.findHomography(seen, flat, 0)
+            if homography is not None:
+                back = cv2.perspectiveTransform(seen[:, None], homography)[:, 0]
+                if float(np.sqrt(((back - flat) ** 2).sum(axis=1).mean())) < LAYOUT_MISS:
+                    return True
+    return False
+
+
+def board_of(layout: Layout, board: Board) -> Board | None:
+    """The described board with the pattern and the first number of ``layout``; None where its squares are others."""
+    if layout.columns != board.columns or abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
+        return None
+    return replace(board, legacy=layout.legacy, first_marker=layout.first_marker)

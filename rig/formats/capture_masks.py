@@ -1,0 +1,105 @@
+"""The masks of a capture, read together: what their numbers mean, which of two levels is the subject, and its outline
+in the pictures that cameras are taken to have made.
+
+Enters: a plane a camera, as ``rig.formats.images`` decodes it. Leaves: masks (True = subject), the greys of those whose
+edges are soft, and what was noticed. Faults are appended, one sentence for files that share one.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from rig.capture import Remark
+from rig.formats.mask_values import MaskReading, Plane, Share, read_masks
+from rig.formats.work_size import at_share, work_rig, work_share
+from rig.mask_polarity import inverted_masks
+from rig.rig import Rig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskSubjects:
+    """``masks``: True where the subject is; ``soft``: its share of a pixel, 0 to 255, where edges are soft."""
+
+    masks: Mapping[str, Bool[np.ndarray, "_ _"]]
+    soft: Mapping[str, UInt8[np.ndarray, "_ _"]]
+    remarks: tuple[Remark, ...]
+
+
+def mask_subjects(
+    planes: Mapping[str, tuple[str, Plane]], rig: Rig, faults: list[str], *, pixels_most: int | None = None
+) -> MaskSubjects:
+    """Reads the masks of one capture as ``work_rig`` sees them.
+
+    Args:
+        planes: by camera the file's name, for faults, and its pixels, of the camera's size.
+        rig: the cameras as calibrated.
+        faults: what cannot be used is appended.
+        pixels_most: as of ``rig.formats.work_size``.
+    """
+    readings = read_masks({name: plane for name, (_, plane) in planes.items()})
+    files = {name: file for name, (file, _) in planes.items()}
+    faults += _by_text({files[name]: reading.fault for name, reading in readings.items() if reading.fault})
+    usable = {name: reading for name, reading in readings.items() if not reading.fault}
+    inverted = inverted_masks({name: reading.share > 127 for name, reading in usable.items()}, _middles(rig))
+    masks, soft = {}, {}
+    for name, reading in usable.items():
+        share = _in_picture(255 - reading.share if name in inverted else reading.share, reading, name, rig, pixels_most)
+        masks[name] = share > 127
+        masks[name].setflags(write=False)
+        if not masks[name].any():
+            faults.append(f"{files[name]} is empty: no pixel belongs to the subject")
+        elif reading.soft:
+            soft[name] = share
+            soft[name].setflags(write=False)
+    remarks = [Remark("mask-undecided", text) for text in _by_text({files[n]: r.remark for n, r in usable.items()})]
+    if inverted:
+        remarks.append(Remark("mask-inverted", _inverted_text([files[name] for name in inverted], len(planes))))
+    return MaskSubjects(masks, soft, tuple(remarks))
+
+
+def _in_picture(
+    share: Share, reading: MaskReading, name: str, rig: Rig, pixels_most: int | None
+) -> UInt8[np.ndarray, "_ _"]:
+    """A mask of a file as large as the picture that is worked on, and undistorted like it."""
+    camera = rig[name]
+    scale = work_share(camera.intrinsics, pixels_most)
+    pixels = at_share(share, (share.shape[1], share.shape[0]), scale)
+    if camera.recorded is None:
+        return pixels
+    matrix = work_rig(rig.subset([name]), pixels_most)[name].intrinsics.matrix()
+    return camera.recorded.undistort(pixels, matrix, smooth=reading.soft)
+
+
+def _middles(rig: Rig) -> dict[str, np.ndarray]:
+    """Where each camera sees the point that all look at; nothing where they are too few to have one."""
+    if len(rig) < 2:
+        return {}
+    point = rig.centre_world()[None]
+    with np.errstate(all="ignore"):
+        pixels = {camera.name: camera.project(point)[0] for camera in rig}
+    return {name: pixel for name, pixel in pixels.items() if np.isfinite(pixel).all()}
+
+
+def _by_text(texts: Mapping[str, str]) -> list[str]:
+    """One sentence for all files of which the same is true."""
+    files: dict[str, list[str]] = {}
+    for file, text in texts.items():
+        if text:
+            files.setdefault(text, []).append(file)
+    return [f"{_listed(names)} {text}" for text, names in files.items()]
+
+
+def _listed(files: list[str]) -> str:
+    if len(files) == 1:
+        return files[0]
+    return f"each of the {len(files)} masks {files[0]} to {files[-1]}"
+
+
+def _inverted_text(files: list[str], count: int) -> str:
+    which = "all masks are" if len(files) == count > 1 else f"{', '.join(files)} {'is' if len(files) == 1 else 'are'}"
+    return (
+        f"{which} black where the subject is (white holds the borders of the pictures): turned for this result. "
+        "Write the subject white and all else black"
+    )

@@ -1,0 +1,208 @@
+"""What a mask's file says, as the share of the subject in every pixel.
+
+Programs write masks as 0 and 1, 0 and 255, 16 bits, two colours, the alpha of a cut-out, soft greys, and through JPEG,
+whose ringing leaves values of 1 to 40 ten pixels outside an outline. All of these have two levels that fill areas; what
+lies half way between them is the outline. Levels are measured over all masks of a capture, so that one in which nothing
+is seen is not stretched to hold a subject. Files that hold something else (labels, depth, a photograph, one value) are
+named.
+
+Which of the two levels is the subject is another question: ``rig.mask_polarity``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Num, UInt8
+
+Pixels = Num[np.ndarray, "h w *channels"]
+Plane = Num[np.ndarray, "h w"]
+Share = UInt8[np.ndarray, "h w"]
+
+BINS = 256  # of the range that masks use
+PLATEAU_SHARE = 0.005  # of a picture: a value that fills an area; one of a soft edge 40 px wide has 0.0006
+AREA_WITHIN = 0.2  # of an area's pixels whose eight neighbours are of it, too: 0 on soft edges, 0.4 in a band 5 px wide
+PLATEAU_APART = 0.1  # of the range: nearer values are one plateau; ringing of JPEG 50 to 98 scatters by 0.08
+NEAR_LEVEL = 0.03  # of the range, to both sides of a level
+AREAS_LEAST = 0.7  # of a picture that its levels must hold: 0.85 with soft edges of 40 px, 0.2 of a smooth ramp
+BETWEEN = (0.15, 0.85)  # of the range: neither subject nor background
+BETWEEN_MOST = 0.35  # of the smaller of both areas that is neither: a soft edge of 20 px has 0.15, a depth map 0.9
+SOFT_PER_PX = 0.35  # pixels between by the outline's length: 0.9 where edges were averaged, 0.0 to 0.2 in JPEG 50 to 98
+BAND_MOST_PX = 24.0  # half width of a band that a trimap leaves undecided
+FAINT = 0.25  # of the capture's range: a file with less of it, and more than two values, shows noise
+LABELS_MOST = 32  # values that are counted one by one: finer than JPEG leaves them
+COLOURS_TWO = 0.95  # share of a picture that its two most frequent colours hold
+COLOURS_FEW = 64  # a picture of labels has no more, a photograph thousands
+CUT_OUT_LEAST = 0.1  # share of a picture that a cut-out leaves in exactly one colour
+VALUES_NAMED = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskReading:
+    """A mask as it was read: ``share`` of the subject, 0 to 255, and whether its edges are ``soft``, so that the greys
+    tell where the outline lies. ``fault``: why it is none (then the share is empty). ``remark``: what was noticed."""
+
+    share: Share
+    soft: bool = False
+    fault: str = ""
+    remark: str = ""
+
+
+def mask_plane(pixels: Pixels) -> Plane | str:
+    """The one channel of decoded pixels (BGR order) that holds the mask, or why there is none.
+
+    That is the alpha of a cut-out; of two colours the channel in which they differ most; of a picture that was cut out
+    on one colour 1 where it has another."""
+    channels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    if channels.shape[2] in (2, 4):
+        alpha = channels[:, :, -1]
+        if alpha.min() < alpha.max():
+            return np.ascontiguousarray(alpha)
+        channels = channels[:, :, :-1]
+    if channels.shape[2] == 1 or all(np.array_equal(channels[:, :, 0], channels[:, :, k]) for k in (1, 2)):
+        return np.ascontiguousarray(channels[:, :, 0])
+    return _plane_of_colours(channels)
+
+
+def _plane_of_colours(channels: Num[np.ndarray, "h w c"]) -> Plane | str:
+    span = max(float(channels.max()), 1.0)
+    coarse = (channels.astype(np.float32) * (15.0 / span) + 0.5).astype(np.int32)
+    codes, counts = np.unique(coarse @ (1, 16, 256), return_counts=True)
+    order = np.argsort(counts)[::-1]
+    if len(order) == 1 or counts[order[:2]].sum() >= COLOURS_TWO * counts.sum():
+        pair = np.array([[code % 16, code // 16 % 16, code // 256] for code in codes[order[:2]].tolist()])
+        return np.ascontiguousarray(channels[:, :, int(np.argmax(np.ptp(pair, axis=0)))])
+    packed = channels.reshape(-1, channels.shape[2]).astype(np.float64) @ (1.0, 2.0**16, 2.0**32)
+    exact, numbers = np.unique(packed, return_counts=True)
+    if len(exact) <= COLOURS_FEW:
+        return (
+            f"holds {len(exact)} colours, as a picture of labels does; wanted: white where the subject is, else black"
+        )
+    if numbers.max() >= CUT_OUT_LEAST * packed.size:
+        return (packed != exact[np.argmax(numbers)]).reshape(channels.shape[:2]).astype(np.uint8)
+    return "is a photograph and no mask; wanted: white where the subject is, else black, or a cut-out with alpha"
+
+
+def read_masks(planes: Mapping[str, Plane]) -> dict[str, MaskReading]:
+    """Reads the masks of one capture. Files of one type of numbers show what a capture's black and white are."""
+    ranges: dict[str, tuple[float, float]] = {}
+    for plane in planes.values():
+        low, high = _range(plane)
+        before = ranges.get(str(plane.dtype), (low, high))
+        ranges[str(plane.dtype)] = (min(before[0], low), max(before[1], high))
+    return {name: _read(plane, ranges[str(plane.dtype)]) for name, plane in planes.items()}
+
+
+def _range(plane: Plane) -> tuple[float, float]:
+    finite = plane[np.isfinite(plane)] if plane.dtype.kind == "f" else plane
+    return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+
+
+def _read(plane: Plane, common: tuple[float, float]) -> MaskReading:
+    low, high = _range(plane)
+    faint = high - low < FAINT * (common[1] - common[0]) and len(np.unique(plane)) > 2
+    if low == high or faint:
+        return MaskReading(_nothing(plane), fault=_constant_fault(low, common))
+    levels = _levels(plane, (low, high))
+    if not _fills_areas(plane, levels, high - low):
+        return MaskReading(_nothing(plane), fault=_SPREAD)
+    if len(levels) > 2:
+        return _read_trimap(plane, levels)
+    share = _share_between(plane, levels[0], levels[1])
+    between = np.count_nonzero((share > 255 * BETWEEN[0]) & (share < 255 * BETWEEN[1]))
+    white = share > 127
+    smaller = min(np.count_nonzero(white), np.count_nonzero(~white))
+    if between > BETWEEN_MOST * max(smaller, 1):
+        return MaskReading(_nothing(plane), fault=_SPREAD)
+    return MaskReading(share, soft=bool(between > SOFT_PER_PX * max(_outline_px(white), 1)))
+
+
+def _nothing(plane: Plane) -> Share:
+    return np.zeros(plane.shape, np.uint8)
+
+
+_SPREAD = (
+    "holds values all over its range, as a depth map or a photograph does; wanted: white where the subject is, else "
+    "black"
+)
+
+
+def _constant_fault(value: float, common: tuple[float, float]) -> str:
+    if value == 0 or value < 0.5 * (common[0] + common[1]):
+        return "is empty: no pixel belongs to the subject"
+    return f"is {value:g} all over: it has no outline; wanted: white where the subject is, else black"
+
+
+def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
+    """The values that fill areas, rising; near ones count as the most frequent of them."""
+    low, high = span
+    exact = plane.dtype.kind in "ui" and high - low < BINS
+    count = int(high - low) + 1 if exact else BINS
+    step = (high - low) / (count - 1)
+    finite = np.nan_to_num(plane.astype(np.float64), nan=low, posinf=high, neginf=low)
+    at = np.rint((finite - low) / step).astype(int)
+    numbers = np.bincount(at.ravel(), minlength=count)
+    apart = 0 if exact and count <= LABELS_MOST else PLATEAU_APART * count
+    plateaus: list[int] = []
+    for number in np.argsort(numbers)[::-1].tolist():
+        if numbers[number] < PLATEAU_SHARE * plane.size:
+            break
+        if all(abs(number - other) > apart for other in plateaus) and _is_area(
+            np.abs(at - number) <= NEAR_LEVEL * count
+        ):
+            plateaus.append(number)
+    return sorted(low + step * number for number in plateaus)
+
+
+def _is_area(pixels: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether most pixels lie among their like; those of one level of a soft edge are a line."""
+    within = cv2.erode(pixels.astype(np.uint8), np.ones((3, 3), np.uint8))
+    return bool(np.count_nonzero(within) > AREA_WITHIN * np.count_nonzero(pixels))
+
+
+def _fills_areas(plane: Plane, levels: list[float], span: float) -> bool:
+    """Whether two levels or more hold most of a picture."""
+    near = sum(np.count_nonzero(np.abs(plane.astype(np.float64) - level) <= NEAR_LEVEL * span) for level in levels)
+    return len(levels) > 1 and bool(near >= AREAS_LEAST * plane.size)
+
+
+def _share_between(plane: Plane, black: float, white: float) -> Share:
+    share = np.nan_to_num((plane.astype(np.float32) - np.float32(black)) / np.float32(white - black))
+    return (255.0 * np.clip(share, 0.0, 1.0) + 0.5).astype(np.uint8)
+
+
+def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
+    """A trimap's undecided band is narrow and lies between black and white: the outline is in its middle."""
+    listed = ", ".join(f"{level:g}" for level in levels[:VALUES_NAMED]) + (
+        ", ..." if len(levels) > VALUES_NAMED else ""
+    )
+    labels = (
+        f"holds areas of {len(levels)} values ({listed}), as a picture of labels does; wanted: white where the subject "
+        "is, else black"
+    )
+    if len(levels) > 3:
+        return MaskReading(_nothing(plane), fault=labels)
+    share = _share_between(plane, levels[0], levels[2])
+    black, white = share < 64, share > 191
+    away_black, away_white = (_distance_to(area) for area in (black, white))
+    width = float(np.minimum(away_black, away_white)[~black & ~white].max(initial=0.0))
+    if width > BAND_MOST_PX or not _separates(black, white):
+        return MaskReading(_nothing(plane), fault=labels)
+    middle = away_black / np.maximum(away_black + away_white, np.float32(1e-3))
+    remark = f"leaves a band of {2 * width:.0f} px undecided: the outline was taken in its middle"
+    return MaskReading((255.0 * middle + 0.5).astype(np.uint8), soft=True, remark=remark)
+
+
+def _distance_to(area: np.ndarray) -> Float32[np.ndarray, "h w"]:
+    return np.asarray(cv2.distanceTransform((~area).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+
+
+def _separates(black: np.ndarray, white: np.ndarray) -> bool:
+    """Whether white touches no black."""
+    return not (cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & black).mean() > 1e-4
+
+
+def _outline_px(inside: np.ndarray) -> int:
+    """Pixels of the subject beside one that is not."""
+    return int(np.count_nonzero(inside & (cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)))

@@ -1,0 +1,59 @@
+"""Which level of a mask is the subject: white by our convention, black where programs mark what is to be ignored.
+
+Backgrounds hold the borders of a picture but one (a person's shoulders fill the bottom, or another side of a camera
+that hangs on its side), subjects its middle. Where both say that a mask is inverted it is; a close-up that fills the
+frame, and a subject beside the middle, contradict themselves and follow the other views. All views that decide nothing
+follow those that do.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+Convention = Literal["white", "black"]
+
+BORDER_MARGIN = 0.15  # of the borders' share, by which one reading must be the better: shoulders leave 0.25 and more
+MIDDLE_RADIUS = 0.06  # of the picture's longer side: half a face
+MIDDLE_MARGIN = 0.3  # from one half
+
+
+def subject_convention(
+    mask: Bool[np.ndarray, "h w"], middle_px: Float[np.ndarray, " 2"] | None = None
+) -> Convention | None:
+    """What a mask alone says: whether white or black is its subject; None where it contradicts itself.
+
+    Args:
+        mask: True where it is white.
+        middle_px: where the cameras look; None: the middle of the picture.
+    """
+    sides = np.sort([mask[0].mean(), mask[-1].mean(), mask[:, 0].mean(), mask[:, -1].mean()])
+    white_at_borders, black_at_borders = float(sides[:3].mean()), float(1.0 - sides[1:].mean())
+    height, width = mask.shape
+    x, y = ((width - 1) / 2, (height - 1) / 2) if middle_px is None else middle_px
+    reach = max(1, round(MIDDLE_RADIUS * max(width, height)))
+    column, row = int(np.clip(x, 0, width - 1)), int(np.clip(y, 0, height - 1))
+    about = mask[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
+    inside = float(about.mean()) - 0.5
+    if white_at_borders + BORDER_MARGIN < black_at_borders and inside > MIDDLE_MARGIN:
+        return "white"
+    if black_at_borders + BORDER_MARGIN < white_at_borders and inside < -MIDDLE_MARGIN:
+        return "black"
+    return None
+
+
+def inverted_masks(
+    masks: Mapping[str, Bool[np.ndarray, "_ _"]], middles_px: Mapping[str, Float[np.ndarray, " 2"]]
+) -> list[str]:
+    """The masks of a capture whose subject is black; undecided ones are taken as most of the others.
+
+    Args:
+        masks: by camera, True where they are white.
+        middles_px: where each camera sees the place that all look at.
+    """
+    said = {name: subject_convention(mask, middles_px.get(name)) for name, mask in masks.items()}
+    black = [name for name, convention in said.items() if convention == "black"]
+    white = [name for name, convention in said.items() if convention == "white"]
+    follow = len(black) > len(white)
+    return [name for name, convention in said.items() if convention == "black" or (convention is None and follow)]

@@ -1,0 +1,58 @@
+"""Masks of a capture, as its reader takes them: inverted ones turned and told, soft ones kept, faults said once."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rig.capture import Capture
+from rig.errors import InputError
+from rig.formats.capture_folder import read_capture, write_capture
+from tests.rig.formats.test_capture_folder import HEIGHT, WIDTH, picture, small_rig
+
+ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
+BUST = (np.hypot(COLUMNS - 32, ROWS - 22) < 10) | ((ROWS > 32) & (np.abs(COLUMNS - 32) < 22))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    images = {name: picture() for name in "abc"}
+    write_capture(tmp_path, Capture(images, masks=dict.fromkeys("abc", BUST)), small_rig())
+    return tmp_path
+
+
+def write(folder: Path, name: str, pixels: np.ndarray) -> None:
+    cv2.imwrite(str(folder / "masks" / f"{name}.png"), pixels)
+
+
+@pytest.mark.parametrize(("names", "words"), [("abc", "all masks are black"), ("b", "masks/b.png is black")])
+def test_inverted_masks_are_turned_and_told(folder: Path, names: str, words: str) -> None:
+    for name in names:
+        write(folder, name, np.where(BUST, 0, 255).astype(np.uint8))
+    capture, _ = read_capture(folder)
+    for name in "abc":
+        np.testing.assert_array_equal(capture.masks[name], BUST)
+    (remark,) = capture.remarks
+    assert remark.code == "mask-inverted"
+    assert words in remark.message
+
+
+def test_soft_masks_keep_their_greys_and_are_written_with_them(folder: Path, tmp_path: Path) -> None:
+    soft = cv2.GaussianBlur(BUST.astype(np.uint8) * np.uint8(255), (0, 0), 0.8)
+    write(folder, "a", 255 - soft)
+    capture, rig = read_capture(folder)
+    assert set(capture.soft_masks) == {"a"}
+    np.testing.assert_allclose(capture.soft_masks["a"].astype(float), soft, atol=2)
+    write_capture(tmp_path / "again", capture, rig)
+    again, _ = read_capture(tmp_path / "again")
+    np.testing.assert_array_equal(again.masks["a"], capture.masks["a"])
+
+
+def test_what_is_true_of_all_masks_is_said_once(folder: Path) -> None:
+    for name in "abc":
+        write(folder, name, np.where(BUST, 1 + ROWS // 12, 0).astype(np.uint8))
+    with pytest.raises(InputError) as refused:
+        read_capture(folder)
+    (fault,) = refused.value.faults
+    assert fault.startswith("each of the 3 masks masks/a.png to masks/c.png holds areas of")
