@@ -1,9 +1,14 @@
 """Depth in every view from the photographs, and what of it is the fitted head's surface."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
 
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.estimate import estimate_depth
+from pipeline.dense.highlights import without_highlights
 from pipeline.dense.part_votes import PartVotes, vote_parts
 from pipeline.dense.window_bias import WindowBias
 from pipeline.fitting.fine.dense_points import dense_points
@@ -22,6 +27,7 @@ class Depth:
     """Depth maps with what their pixels show, and the same as oriented points beside the fitted face."""
 
     maps: tuple[DepthMap, ...]  # none where no stage needs them
+    images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]  # as they were matched, without highlights
     votes: PartVotes | None
     points: SurfacePoints  # world frame, mm
     on_face: OnFace
@@ -38,11 +44,11 @@ def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, l
     """Measures depth in every view, bounded by the fitted head, where a later stage needs it."""
     settings, mesh = context.settings, head.mesh_world
     maps: tuple[DepthMap, ...] = ()
+    images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]] = views.capture.images
     if is_refined(head, settings) or settings.outputs.surface != "head":
-        maps = estimate_depth(
-            views.capture.images, views.silhouettes, context.rig, mesh, settings.dense, report=context.progress
-        )
+        images = without_highlights(images, views.silhouettes, context.rig, mesh)
+        maps = estimate_depth(images, views.silhouettes, context.rig, mesh, settings.dense, report=context.progress)
     votes = vote_parts(maps, labels.maps, context.rig)
     points = dense_points(maps, votes, mesh, settings.fine)
     on_face = points_on_face(points, mesh, head.model.levels["full"].face_region)
-    return Staged(Depth(maps, votes, points, on_face, measure_bias(on_face)))
+    return Staged(Depth(maps, images, votes, points, on_face, measure_bias(on_face)))

@@ -43,8 +43,8 @@ def refine_head(
     deviation_mm = vertex_deviation_mm(model, fit)
     if not is_refined(head, settings):
         return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), head.detail))
-    images = views.capture.images
     distances = {name: views.silhouettes[name].distance for name, used in fit.used.items() if used}
+    hair = labels.hair_probability()
     displaced = refine_to_surface(
         fit,
         model,
@@ -52,8 +52,8 @@ def refine_head(
         settings.fine,
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,
-        eyes=look_at_eyes(model, mesh.vertices, images, context.rig),
-        patches=patch_search(model, fit, images, distances, labels.hair_probability(), context.rig, settings.photo),
+        eyes=look_at_eyes(model, mesh.vertices, views.capture.images, context.rig),
+        patches=patch_search(model, fit, depth.images, distances, hair, context.rig, settings.photo),
         report=context.progress,
     )
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), settings.fine.least_share

@@ -31,6 +31,19 @@ def test_what_lies_farther_apart_stays() -> None:
         assert np.abs(drawn.vertices - surface.vertices).max() < 0.01
 
 
+def test_a_crater_and_a_speck_go_to_the_head_that_their_surroundings_agree_with() -> None:
+    head = ellipsoid(5)
+    surface = off_by(head, 0.1)
+    spots = surface.vertices.copy()
+    for middle, height_mm in ((head.vertices[0], -2.5), (head.vertices[40], 2.5)):
+        near = np.linalg.norm(head.vertices - middle, axis=1) < 4.0  # a vertex and its neighbours
+        assert 4 < near.sum() < 10
+        spots[near] += height_mm * head.normals()[near]
+    drawn = drawn_to_skin(Mesh(spots, head.faces), np.ones(len(spots)), head)
+    left = np.abs(((drawn.vertices - head.vertices) * head.normals()).sum(axis=1))
+    assert left.max() < 0.6
+
+
 def test_only_seen_skin_moves_and_only_to_what_was_measured_of_the_head() -> None:
     head = ellipsoid(5)
     surface, front = off_by(head, 0.3), head.vertices[:, 2] > 0.0
