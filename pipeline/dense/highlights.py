@@ -46,17 +46,20 @@ MIN_SHARE = 0.04  # of that light, that a highlight adds at least; it counts who
 # photographed by one kind of camera differs by less
 COLOURED = (0.02, 0.05)  # squared sine between the skin's colour and white, from which on they can be told apart, and
 # are well; skin has 0.1, dark hair 0.04
-NEAR_RINGS = 3  # of triangles, 2 to 3 mm in the face: what a fitted head is off by
+DARK_SHARE = 0.4  # of the head's usual light: darker places are hair, brows or nostrils, and what is brighter in some
+# views is skin beside them
 MIN_GAIN_PLACES = 300  # that a camera shares with others, for its gain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """The head as one camera sees it: where, and its colours (linear; NaN where it sees none)."""
+    """The head as one camera sees it: the part of the image that holds it, and there its vertices' pixels and depths
+    (mm), the triangle of each pixel, and the vertices' colours (linear; NaN where it sees none)."""
 
-    pixels: np.ndarray
-    depths: np.ndarray
-    faces_seen: Int32[np.ndarray, "h w"]
+    box: tuple[slice, slice]
+    pixels: Float[np.ndarray, "v 2"]
+    depths: Float[np.ndarray, " v"]
+    faces_seen: Int32[np.ndarray, "r c"]
     colours: Float32[np.ndarray, "v 3"]
 
 
@@ -131,6 +134,8 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
     added, floor = white * WHITE[0], MIN_SHARE * own_light
     share = np.clip((added - floor) / floor, 0.0, 1.0)
     share *= np.clip((apart - COLOURED[0]) / (COLOURED[1] - COLOURED[0]), 0.0, 1.0)
+    usual = float(np.median(own_light[known.any(axis=0)])) if known.any() else 0.0
+    share *= (own_light > DARK_SHARE * usual) & (own_light < usual / DARK_SHARE)
     # A head that is off by a few mm shows other skin, brows or hair in each view: what differs no more than the skin's
     # own light does nearby may be that.
     sure = known & (share > 0.5) & (added > floor + local_range(own_light, faces))
@@ -140,13 +145,12 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
 
 
 def local_range(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " v"]:
-    """Returns by how much values differ within ``NEAR_RINGS`` rings of triangles about each vertex."""
+    """Returns by how much values differ among each vertex and those beside it, 1 mm away in the face."""
     high, low = values.copy(), values.copy()
-    for _ in range(NEAR_RINGS):
-        highest, lowest = high[faces].max(axis=1), low[faces].min(axis=1)
-        for corner in faces.T:
-            np.maximum.at(high, corner, highest)
-            np.minimum.at(low, corner, lowest)
+    highest, lowest = values[faces].max(axis=1), values[faces].min(axis=1)
+    for corner in faces.T:
+        np.maximum.at(high, corner, highest)
+        np.minimum.at(low, corner, lowest)
     return high - low
 
 
@@ -159,22 +163,34 @@ def _seen(
 ) -> _Sight:
     vertices, k = head_world.vertices, camera.intrinsics
     pixels, depths = project_points(camera, vertices), camera_depths(camera, vertices)
-    nearest, faces_seen = rasterise(pixels, depths, head_world.faces, k.height, k.width)
+    pixel_mm = float(np.median(depths)) / k.fx
+    box = _box(pixels, 3.0 * SPREAD_MM / pixel_mm, k.height, k.width)
+    pixels = pixels - (box[1].start, box[0].start)
+    height, width = (side.stop - side.start for side in box)
+    nearest, faces_seen = rasterise(pixels, depths, head_world.faces, height, width)
     towards = camera.centre_world - vertices
     facing = np.einsum("vk,vk->v", towards, normals) / np.linalg.norm(towards, axis=1)
-    pixel_mm = float(np.median(depths)) / k.fx
     with np.errstate(invalid="ignore"):  # NaN is outside
-        inside = (pixels >= 1.0).all(axis=1) & (pixels <= (k.width - 2.0, k.height - 2.0)).all(axis=1)
+        inside = (pixels >= 0.0).all(axis=1) & (pixels <= (width - 1.0, height - 1.0)).all(axis=1)
     rows = np.flatnonzero(inside & (facing > MIN_FACING) & (depths > 0.0))
     column, row = np.rint(pixels[rows]).astype(int).T
-    slack = HIDDEN_MM + 3.0 * pixel_mm / facing[rows]
-    clear = depths[rows] < nearest[row, column] + slack
-    clear &= silhouette.distance[row, column] * pixel_mm < -OUTLINE_MM
-    linear = np.power(np.arange(256, dtype=np.float32) / 255.0, GAMMA)[image]
+    clear = depths[rows] < nearest[row, column] + HIDDEN_MM + 3.0 * pixel_mm / facing[rows]
+    clear &= silhouette.distance[box][row, column] * pixel_mm < -OUTLINE_MM
+    linear = np.power(np.arange(256, dtype=np.float32) / 255.0, GAMMA)[image[box]]
     smooth = cv2.GaussianBlur(linear, (0, 0), max(BLUR_MM / pixel_mm, 0.5))
     colours = np.full((len(vertices), 3), np.nan, np.float32)
     colours[rows[clear]] = smooth[row[clear], column[clear]]
-    return _Sight(pixels, depths, faces_seen, colours)
+    return _Sight(box, pixels, depths, faces_seen, colours)
+
+
+def _box(pixels: Float[np.ndarray, "v 2"], margin: float, height: int, width: int) -> tuple[slice, slice]:
+    """Rows and columns of the image that hold the pixels; two of each at least."""
+    with np.errstate(invalid="ignore"):
+        seen = pixels[((pixels > -margin) & (pixels < (width + margin, height + margin))).all(axis=1)]
+    low, high = (seen.min(axis=0), seen.max(axis=0)) if len(seen) else (np.zeros(2), np.zeros(2))
+    column, row = np.clip(np.floor(low - margin), 0, (width - 2, height - 2)).astype(int)
+    last = np.ceil(high + margin).astype(int) + 1
+    return slice(row, int(np.clip(last[1], row + 2, height))), slice(column, int(np.clip(last[0], column + 2, width)))
 
 
 def _lowered(
@@ -192,4 +208,6 @@ def _lowered(
     about = cv2.GaussianBlur(shown[:, :, 1:], (0, 0), LOBE_MM / pixel_mm)
     levels = smooth[:, :, 0] / np.maximum(smooth[:, :, 2], MIN_COVERAGE)
     levels *= np.minimum(LOBE_FACTOR * about[:, :, 0] / np.maximum(about[:, :, 1], MIN_COVERAGE), 1.0)
-    return np.clip(np.rint(image - levels[:, :, None]), 0.0, 255.0).astype(np.uint8)
+    out = image.copy()
+    out[sight.box] = np.clip(np.rint(image[sight.box] - levels[:, :, None]), 0.0, 255.0)
+    return out
