@@ -41,12 +41,10 @@ def test_people_pass(heads, name, scale):
     assert judge_head_size({camera: of[name][camera] for camera in few.names}, times(few, scale)) == []
 
 
-@pytest.mark.parametrize("factor", [0.25, 0.5, 2.2, 3.3, 5.0])
+@pytest.mark.parametrize("factor", [0.25, 0.45, 2.2, 3.3, 5.0])  # hair 40 mm thick at half its size is a child's head
 @pytest.mark.parametrize("name", STYLES)
 def test_another_unit_is_refused(heads, name, factor):
     rig, of = heads
-    if name == "thick" and factor == 0.5:
-        pytest.skip("hair 40 mm thick at half its size is a child's head")
     with pytest.raises(WrongScale) as refused:
         judge_head_size(of[name], times(rig, factor))
     ratio = float(str(refused.value).split("about ")[1].split(" times")[0])
