@@ -1,0 +1,97 @@
+"""A head is held against the faces that photographs show: in place, back to front, and where nobody found one."""
+
+import numpy as np
+import pytest
+
+from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.evidence.pose import cameras_in_front, judge_pose
+from pipeline.faces.detection import FaceDetection
+from pipeline.faces.landmark_map import landmark_map
+from pipeline.faces.subject import SubjectFaces
+from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import Mesh
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout, rig_from_directions
+
+FACING = ("cam00", "cam01", "cam02")
+
+
+@pytest.fixture(scope="module")
+def model() -> HeadModel:
+    return load_model()
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return default_layout()
+
+
+def posed(turn_deg: float, rig: Rig, shift_mm: float = 0.0) -> Similarity:
+    rotation = rotation_from_vector(np.radians([0.0, turn_deg, 0.0]))
+    return Similarity(1.0, rotation, rig.centre_world() + np.array([shift_mm, 0.0, 0.0]))
+
+
+def head_at(model: HeadModel, pose: Similarity) -> Mesh:
+    return Mesh(pose.apply(model.vertices(np.zeros(0))), model.levels["full"].faces)
+
+
+def faces_of(model: HeadModel, pose: Similarity, rig: Rig, names: tuple[str, ...]) -> SubjectFaces:
+    """What the networks find of a mean head at ``pose``, without noise."""
+    expected = pose.apply(landmark_map(model).expected(model.vertices(np.zeros(0))))
+    found = {}
+    for name in names:
+        pixels = rig[name].project(expected)
+        box = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+        found[name] = (FaceDetection(pixels, np.zeros(468), 40.0, box, 0.0),)
+    return SubjectFaces(found, None, names)
+
+
+def codes(model: HeadModel, pose: Similarity, rig: Rig, subject: SubjectFaces, rival: float | None = None) -> list[str]:
+    places = landmark_map(model)
+    _, warnings = judge_pose(head_at(model, pose), pose, rig, subject, places, method="silhouettes", rival=rival)
+    return [warning.code for warning in warnings]
+
+
+def test_a_head_where_the_face_is_has_nothing_against_it(model: HeadModel, rig: Rig) -> None:
+    pose = posed(0.0, rig)
+    evidence, warnings = judge_pose(
+        head_at(model, pose), pose, rig, faces_of(model, pose, rig, FACING), landmark_map(model), method="x", rival=0.5
+    )
+    assert warnings == []
+    assert not evidence.doubtful
+    assert max(evidence.off.values()) < 1e-6
+
+
+@pytest.mark.parametrize(("turn_deg", "shift_mm"), [(180.0, 0.0), (45.0, 0.0), (0.0, 60.0)])
+def test_a_face_that_lies_elsewhere_is_said(model: HeadModel, rig: Rig, turn_deg: float, shift_mm: float) -> None:
+    subject = faces_of(model, posed(0.0, rig), rig, FACING)
+    assert codes(model, posed(turn_deg, rig, shift_mm), rig, subject) == ["face-elsewhere"]
+
+
+def test_one_wrong_view_of_three_says_nothing_of_the_pose(model: HeadModel, rig: Rig) -> None:
+    pose = posed(0.0, rig)
+    subject = faces_of(model, pose, rig, FACING)
+    (wrong,) = faces_of(model, posed(0.0, rig, 80.0), rig, ("cam02",)).found["cam02"]
+    mixed = SubjectFaces({**subject.found, "cam02": (wrong,)}, None, FACING)
+    assert codes(model, pose, rig, mixed) == []
+
+
+def test_no_face_before_cameras_that_must_see_one(model: HeadModel, rig: Rig) -> None:
+    pose = posed(0.0, rig)
+    assert len(cameras_in_front(pose, rig)) >= 3
+    nobody = SubjectFaces({name: () for name in rig.names}, None, ())
+    assert codes(model, pose, rig, nobody) == ["no-face"]
+    away = posed(180.0, rig)
+    assert codes(model, away, rig, nobody) == ([] if len(cameras_in_front(away, rig)) < 2 else ["no-face"])
+
+
+def test_outlines_of_one_side_alone_are_in_doubt(model: HeadModel) -> None:
+    narrow = rig_from_directions([(-12.0, 0.0), (0.0, 0.0), (12.0, 0.0)])
+    pose = posed(0.0, narrow)
+    nobody = SubjectFaces({name: () for name in narrow.names}, None, ())
+    assert codes(model, pose, narrow, nobody) == ["no-face", "pose-doubtful"]
+
+
+def test_a_rival_that_is_not_beaten_is_said(model: HeadModel, rig: Rig) -> None:
+    pose = posed(0.0, rig)
+    assert codes(model, pose, rig, faces_of(model, pose, rig, FACING), rival=0.01) == ["pose-doubtful"]
