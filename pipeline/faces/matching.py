@@ -86,12 +86,24 @@ def match_faces(
         rig: holds the views' cameras.
         eye_distance_mm: limits of a face's size; None where the rig's scale is not known.
     """
-    faces = list(_consistent(candidates, rig, eye_distance_mm))
-    if not faces:
-        return None
-    best = max(faces, key=lambda face: _prominence(face, rig))
-    whole = triangulate_face(best.detections, rig)
-    return whole and _matched(whole, rig, _outliers(best, candidates, rig))
+    best = find_subject_face(candidates, rig, eye_distance_mm)
+    return best and complete_match(best, candidates, rig)
+
+
+def find_subject_face(
+    candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
+) -> TriangulatedFace | None:
+    """Finds the face that ``match_faces`` finds, and triangulates a few of its points."""
+    faces = _consistent(candidates, rig, eye_distance_mm)
+    return max(faces, key=lambda face: _prominence(face, rig), default=None)
+
+
+def complete_match(
+    face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
+) -> MatchedFaces | None:
+    """Triangulates all points of a face. None where its views do not determine every one."""
+    whole = triangulate_face(face.detections, rig)
+    return whole and _matched(whole, rig, _outliers(face, candidates, rig))
 
 
 def _consistent(

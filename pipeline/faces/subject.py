@@ -19,15 +19,19 @@ from pipeline.faces.detection import (
     find_small_faces,
 )
 from pipeline.faces.eyes import find_eyes
-from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, match_faces
+from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, complete_match, find_subject_face
 from pipeline.faces.networks import FaceNetworks
+from pipeline.faces.points import direction_from_face, point_table
+from pipeline.faces.triangulated_face import TriangulatedFace
 from pipeline.multiview.spread_views import spread_views
 from rig.capture import ImageRgb
+from rig.geometry import Similarity
 from rig.rig import Rig
 
 SMALL_FACE_VIEWS = 3  # in which small faces are searched where no view has a large one
+APART_DEG = 35.0  # between views: a face that one sees well is seen by the other, and their rays meet steeply
+LOOKING_ROUNDS = 1  # of a crop at least, from a projected face
 CONFIRMING_VIEWS = 3  # that must show one face before no more are searched
-PREDICTED_ROUNDS = 2  # of the crop, from a projected face
 MIN_FACING = -0.1  # cosine between where a face looks and a camera in which it is looked for: to a profile
 MIN_EYES_FACING = 0.5  # the same for a camera that sees both eyes
 MIN_INSIDE = 0.6  # share of a face's points within a picture
@@ -62,18 +66,21 @@ def find_subject(
     views = rig.subset(name for name in rig.names if name in images)
     scene = _Scene(views, {name: make_pyramid(images[name]) for name in views.names}, networks, eye_distance_mm)
     in_order = spread_views(views, len(views))
-    found, matched = _search(scene, in_order, find_large_faces, report)
+    found, face = _search(scene, in_order, find_large_faces, report)
     if not any(found.values()):
-        found, matched = _search(scene, in_order[:SMALL_FACE_VIEWS], find_small_faces, report)
+        found, face = _search(scene, in_order[:SMALL_FACE_VIEWS], find_small_faces, report)
     report(1.0)
+    matched = face and complete_match(face, found, views)
     if matched is None:
         return SubjectFaces(found, None, ())
-    looking = _towards(matched, views)
+    placed = matched.world_from_face
     with_eyes = {
-        name: find_eyes(scene.pyramids[name], face, networks) if looking[name] > MIN_EYES_FACING else face
-        for name, face in matched.detections.items()
+        name: find_eyes(scene.pyramids[name], seen, networks)
+        if direction_from_face(placed, rig[name])[2] > MIN_EYES_FACING
+        else seen
+        for name, seen in matched.detections.items()
     }
-    return SubjectFaces(found, replace(matched, detections=with_eyes), tuple(_expected(matched, views)))
+    return SubjectFaces(found, replace(matched, detections=with_eyes), tuple(_expected(placed, views)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,9 +92,9 @@ class _Scene:
     networks: FaceNetworks
     eye_distance_mm: tuple[float, float] | None
 
-    def match(self, found: Mapping[str, tuple[FaceDetection, ...]]) -> MatchedFaces | None:
+    def match(self, found: Mapping[str, tuple[FaceDetection, ...]]) -> TriangulatedFace | None:
         """The subject among the faces of all views."""
-        return match_faces(found, self.rig, eye_distance_mm=self.eye_distance_mm)
+        return find_subject_face(found, self.rig, self.eye_distance_mm)
 
 
 def _search(
@@ -95,51 +102,63 @@ def _search(
     in_order: Sequence[str],
     find: Callable[[Pyramid, FaceNetworks], tuple[FaceDetection, ...]],
     report: Callable[[float], None],
-) -> tuple[dict[str, tuple[FaceDetection, ...]], MatchedFaces | None]:
+) -> tuple[dict[str, tuple[FaceDetection, ...]], TriangulatedFace | None]:
     """Searches view after view until one face is confirmed: the faces of each that was searched or looked at, and the
     subject's."""
     found: dict[str, tuple[FaceDetection, ...]] = {}
-    matched = None
-    for count, name in enumerate(in_order):
-        report(count / len(in_order))
-        if name in found:  # looked at where a face must be that was not confirmed
-            continue
+    face = None
+    while left := [name for name in in_order if name not in found]:
+        report(len(found) / len(in_order))
+        name = _next_view(left, found, scene.rig)
         found[name] = find(scene.pyramids[name], scene.networks)
-        if found[name] and (matched := scene.match(found)) is not None:
-            found |= _look(scene, matched, found)
-            matched = scene.match(found)
-            if matched is not None and len(matched.detections) >= CONFIRMING_VIEWS:
+        if found[name] and (face := scene.match(found)) is not None:
+            looked = _look(scene, face, found)
+            found |= looked
+            face = scene.match(found) if looked else face
+            if face is not None and len(face.detections) >= CONFIRMING_VIEWS:
                 break
-    return found, matched
+    return found, face
+
+
+def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> str:
+    """The view to search next: the first that is left until a face is found, then the one that looks from about
+    ``APART_DEG`` beside the view that shows the best one."""
+    seen = [name for name in found if found[name]]
+    if not seen:
+        return left[0]
+    best = max(seen, key=lambda name: found[name][0].score)
+    middle = rig.centre_world()
+
+    def apart_deg(name: str) -> float:
+        towards, other = rig[name].centre_world - middle, rig[best].centre_world - middle
+        return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(towards, other)), towards @ other)))
+
+    return min(left, key=lambda name: abs(apart_deg(name) - APART_DEG))
 
 
 def _look(
-    scene: _Scene, matched: MatchedFaces, found: Mapping[str, tuple[FaceDetection, ...]]
+    scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
     """Looks for a face in the views in which it must be and was not found; what was found there comes after it."""
     looked = {}
-    for name in _expected(matched, scene.rig):
-        if name in matched.detections:
+    points = face.world_from_face.apply(point_table().shape_mm)
+    for name in _expected(face.world_from_face, scene.rig):
+        if name in face.detections:
             continue
-        crop = crop_around(scene.rig[name].project(matched.points_world))
-        face = find_face_at(scene.pyramids[name], crop, scene.networks, rounds=PREDICTED_ROUNDS)
-        if face.score >= MIN_SCORE:
-            looked[name] = (face, *found.get(name, ()))
+        crop = crop_around(scene.rig[name].project(points))
+        seen = find_face_at(scene.pyramids[name], crop, scene.networks, min_rounds=LOOKING_ROUNDS)
+        if seen.score >= MIN_SCORE:
+            looked[name] = (seen, *found.get(name, ()))
     return looked
 
 
-def _expected(matched: MatchedFaces, rig: Rig) -> Iterator[str]:
+def _expected(world_from_face: Similarity, rig: Rig) -> Iterator[str]:
     """The views towards which a face looks and whose pictures hold it."""
-    looking = _towards(matched, rig)
+    points = world_from_face.apply(point_table().shape_mm)
     for camera in rig:
-        pixels = camera.project(matched.points_world)
+        pixels = camera.project(points)
         size = (camera.intrinsics.width, camera.intrinsics.height)
         inside = ((pixels > -0.5) & (pixels < np.array(size) - 0.5)).all(axis=1)  # False where a pixel is NaN
-        if looking[camera.name] >= MIN_FACING and inside.mean() > MIN_INSIDE and np.isfinite(pixels).all():
+        facing = direction_from_face(world_from_face, camera)[2]
+        if facing >= MIN_FACING and inside.mean() > MIN_INSIDE and np.isfinite(pixels).all():
             yield camera.name
-
-
-def _towards(matched: MatchedFaces, rig: Rig) -> dict[str, float]:
-    """For each camera the cosine of the angle between where a face looks and the way to the camera."""
-    towards = {camera.name: camera.centre_world - matched.points_world.mean(axis=0) for camera in rig}
-    return {name: float(way @ matched.facing_world / np.linalg.norm(way)) for name, way in towards.items()}

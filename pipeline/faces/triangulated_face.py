@@ -21,7 +21,7 @@ from rig.rig import Rig
 ALL_POINTS = slice(None)
 SOME_POINTS = slice(0, None, 13)  # of the 468: enough to tell whose they are
 MAX_POINT_MISFIT = 3.0  # a residual by its noise, beyond which it counts as this much
-ROUNDS = 3  # of how the face lies, and what follows from it
+ROUNDS = 2  # of how the face lies, and what follows from it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ def triangulate_face(
             noise = _noise_px(sizes, found.positions_world, world_from_face, cameras, which)
             beyond = np.linalg.norm(found.residuals_px, axis=2) / (np.sqrt(2.0) * MAX_POINT_MISFIT * noise)
             noise = noise * np.maximum(beyond, 1.0)
-            found = triangulate_many(pixels, cameras, noise)
+            found = triangulate_many(pixels, cameras, noise, start=found.positions_world)
     except NoPoint:
         return None
     world_from_face, relief = place_face(found.positions_world, which)

@@ -101,7 +101,11 @@ class TriangulatedPoints:
 
 
 def triangulate_many(
-    pixels: Float[np.ndarray, "v n 2"], cameras: Sequence[Camera], noise_px: Float[np.ndarray, "v n"]
+    pixels: Float[np.ndarray, "v n 2"],
+    cameras: Sequence[Camera],
+    noise_px: Float[np.ndarray, "v n"],
+    *,
+    start: Float[np.ndarray, "n 3"] | None = None,
 ) -> TriangulatedPoints:
     """Triangulates many points, each seen by every camera, as ``triangulate`` does one.
 
@@ -109,12 +113,11 @@ def triangulate_many(
         pixels: of each point in each view.
         cameras: of the views.
         noise_px: standard deviation of a coordinate of each pixel; infinite where a view says nothing of a point.
+        start: points near to those that are wanted, where they are known; nothing is then said of parallel rays.
 
     Raises NoPoint where a point's rays are parallel, where it lies behind a camera, or a pixel outside its lens.
     """
-    rays = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
-    centres = np.stack([camera.centre_world for camera in cameras])
-    points = _nearest_to_rays(rays, centres, noise_px)
+    points = _nearest_to_rays(pixels, cameras, noise_px) if start is None else start
     weights = 1.0 / noise_px[..., None]
     at_points = _whitened(points, pixels, cameras, weights)
     if not np.isfinite(at_points[0]).all():
@@ -141,9 +144,11 @@ def triangulate_many(
 
 
 def _nearest_to_rays(
-    rays_world: Float[np.ndarray, "v n 3"], centres_world: Float[np.ndarray, "v 3"], noise: Float[np.ndarray, "v n"]
+    pixels: Float[np.ndarray, "v n 2"], cameras: Sequence[Camera], noise: Float[np.ndarray, "v n"]
 ) -> Float[np.ndarray, "n 3"]:
     """For each point the one with the least weighted sum of squared distances to its rays."""
+    rays_world = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
+    centres_world = np.stack([camera.centre_world for camera in cameras])
     if not np.isfinite(rays_world).all():
         raise NoPoint("a pixel lies where the lens model of its camera sees nothing")
     weights = 1.0 / noise**2

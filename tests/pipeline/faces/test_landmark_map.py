@@ -124,7 +124,7 @@ def test_a_model_without_landmarks_is_refused(model: HeadModel) -> None:
 
 @pytest.mark.slow
 def test_ict_facekit_has_a_measured_map_and_carrying_errs_as_stated() -> None:
-    ict = assemble(import_model(shared("ict-facekit/ict_facekit_light.npz")), "")
+    ict = assemble(import_model(shared("data/ict-facekit/ict_facekit_light.npz")), "")
     measured = landmark_map(ict)
     assert (measured.rows == built_in_map("ict-facekit").rows).all()
     full = ict.levels["full"]

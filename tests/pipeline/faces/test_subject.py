@@ -158,7 +158,7 @@ def test_progress_is_told_and_may_end_the_search(networks: FaceNetworks, picture
 def test_a_living_person_before_four_cameras() -> None:
     """A man who holds a board before four cameras: found in every moment in which two of them see his face, and as
     large each time. Eyes' middles are 62 to 70 mm apart in most men."""
-    folder = shared("multicam-board")
+    folder = shared("data/multicam-board")
     rig = read_rig_file(folder / "camera_array.toml")
     networks, distances, missed = load_networks(), [], []
     for shot in range(0, 26, 2):
@@ -183,7 +183,7 @@ def test_a_statue_on_its_side_is_found_without_a_scale(turned: bool) -> None:
     """The plaster Buddha, grey pictures, most of them on their side; all of them turned once more."""
     from tests.support.published_poses import read_projections
 
-    folder = shared("buddha")
+    folder = shared("data/buddha")
     images, cameras = {}, []
     for name, matrix in list(read_projections(folder / "projections.json").items())[8:24]:
         image = read_image(folder / "images" / f"{name}.jpg")
