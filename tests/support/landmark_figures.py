@@ -5,11 +5,13 @@
 Of each capture: views in which the subject's face was found, of those it is turned to (less than 90 degrees away); CPU
 seconds; how far the triangulated points are from the true surface (median, mm). Where the truth has ICT-FaceKit's
 vertices, how far they are from their own points on it (median and RMS, mm): with the network's biases left in, and
-taken off as the pipeline does; and by how many degrees and millimetres a head would be turned and shifted that lies as
-the points say.
+taken off as the pipeline does; by how many degrees and millimetres a head would be turned and shifted that lies as the
+points say; and chi-square a degree of freedom of their errors, by all that is said of them (1 where that is right, less
+where it is cautious).
 """
 
 import argparse
+import json
 import time
 from pathlib import Path
 
@@ -31,8 +33,10 @@ from rig.rig import Rig
 
 ICT_VERTICES = 11248  # come first in the truths that are drawn from ICT-FaceKit
 NOSE_TIP = 1
+EVERY = 9
 HEADER = (
-    "| capture | views | seconds | surface mm | biased mm median, RMS | unbiased mm median, RMS | turn deg | shift mm |"
+    "| capture | views | seconds | surface mm | biased mm median, RMS | unbiased mm median, RMS | turn deg | shift mm "
+    "| chi-square |"
 )
 
 
@@ -54,18 +58,39 @@ def _row(path: Path, truth: Path) -> str:
     found = find_subject(capture.images, rig, load_networks()).matched
     seconds = time.process_time() - start
     if found is None:
-        return f"| {path.name} | none | {seconds:.2f} | | | | | |"
+        return f"| {path.name} | none | {seconds:.2f} | | | | | | |"
     surface = np.median(SurfaceIndex(head.vertices, head.faces).closest(found.points_world).distances)
     turned_to = [c for c in rig if (c.centre_world - found.points_world[NOSE_TIP]) @ found.facing_world > 0.0]
     row = f"| {path.name} | {len(found.detections)} of {len(turned_to)} | {seconds:.2f} | {surface:.2f} |"
     if not _is_ict(path.name):
-        return row + " | | | |"
+        return row + " | | | | |"
     of_model = built_in_map("ict-facekit")
     true = of_model.points(head.vertices[:ICT_VERTICES])
     apart, biased = (np.linalg.norm(points - true, axis=1) for points in (found.points_world, _biased(found, rig)))
     turn, shift = _posed(found, of_model, true)
     figures = [f" {np.median(each):.2f}, {np.sqrt((each**2).mean()):.2f} |" for each in (biased, apart)]
-    return row + "".join(figures) + f" {turn:.1f} | {shift:.1f} |"
+    squares = chi_square(found, of_model, true, head_axes(truth))
+    return row + "".join(figures) + f" {turn:.1f} | {shift:.1f} | {squares:.2f} |"
+
+
+def head_axes(truth: Path) -> Float[np.ndarray, "3 3"]:
+    """world_from_head's rotation of a capture's truth."""
+    meta = json.loads((truth / "meta.json").read_text(encoding="utf-8"))
+    return np.array(meta["world_from_head"]["rotation"])
+
+
+def chi_square(
+    found: MatchedFaces, of_model: LandmarkMap, true: Float[np.ndarray, "468 3"], axes: Float[np.ndarray, "3 3"]
+) -> float:
+    """Squares of errors by their covariance, a degree of freedom: of each point's own noise, each view's, and the
+    map's. Of every ``EVERY``-th point that does not slide: with all, a covariance of few modes would be rounding."""
+    which = np.flatnonzero(~of_model.slides)[::EVERY]
+    errors = (found.points_world - true)[which] @ axes - of_model.offset_mm[which]
+    views = (found.shared_mm[:, which] @ axes).reshape(len(found.shared_mm), -1)
+    own = np.zeros((len(which), 3, len(which), 3))
+    own[np.arange(len(which)), :, np.arange(len(which)), :] = axes.T @ found.covariances[which] @ axes
+    covariance = of_model.covariance(which) + views.T @ views + own.reshape(errors.size, -1)
+    return float(errors.ravel() @ np.linalg.solve(covariance, errors.ravel()) / errors.size)
 
 
 def _is_ict(name: str) -> bool:

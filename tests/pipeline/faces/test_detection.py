@@ -5,7 +5,6 @@ import pytest
 
 from pipeline.faces.crops import make_pyramid
 from pipeline.faces.detection import crop_around, find_face_at, find_faces
-from pipeline.faces.eyes import find_eyes
 from pipeline.faces.networks import FaceNetworks, load_networks
 from tests.support.drawn_faces import OUTER_EYE_CORNERS, drawn_face, turned_about
 
@@ -47,7 +46,8 @@ def test_small_and_large_faces_are_found(networks: FaceNetworks, scale: float) -
 
 def test_a_face_of_a_twentieth_of_a_picture_is_found(networks: FaceNetworks) -> None:
     middle = (300.0, 600.0)
-    (face,) = find_faces(drawn_face(1000, 800, (middle,), scale=0.24), networks)
+    image = drawn_face(1000, 800, (middle,), scale=0.24)
+    (face,) = find_faces(image, networks)
     assert np.abs(face.landmarks_px.mean(axis=0) - middle).max() < 0.3 * face.size_px
 
 
@@ -84,22 +84,3 @@ def test_a_place_without_a_face_has_a_low_score(networks: FaceNetworks) -> None:
     assert find_face_at(pyramid, crop, networks).score > 20.0
     crop.centre_px[0] += 420.0
     assert find_face_at(pyramid, crop, networks).score < 0.0
-
-
-def test_irises_and_lids_are_where_they_are_drawn(networks: FaceNetworks) -> None:
-    image = drawn_face(scale=1.6)
-    (face,) = find_faces(image, networks)
-    face = find_eyes(make_pyramid(image), face, networks)
-    assert face.irises_px is not None
-    assert face.lids_px is not None
-    middles = np.array([[-33.0, -20.0], [33.0, -20.0]]) * 1.6 + (319.5, 239.5)
-    assert np.abs(face.irises_px[[0, 5]] - middles).max() < 3.0
-    radii = np.linalg.norm(face.irises_px[[1, 2, 3, 4]] - face.irises_px[0], axis=1)
-    assert np.abs(radii - 7.5 * 1.6).max() < 0.3 * 7.5 * 1.6
-    # The subject's right eye comes first; its second iris point lies towards the nose, its third above.
-    assert face.irises_px[1, 0] > face.irises_px[0, 0] > face.irises_px[3, 0]
-    assert face.irises_px[6, 0] < face.irises_px[5, 0] < face.irises_px[8, 0]
-    assert face.irises_px[2, 1] < face.irises_px[0, 1] < face.irises_px[4, 1]
-    lids = face.lids_px[:16]
-    assert lids[12, 1] < middles[0, 1] < lids[4, 1]
-    assert np.abs(lids[[12, 4], 1] - middles[0, 1]).max() < 1.5 * 8.0 * 1.6
