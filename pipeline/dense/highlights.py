@@ -135,7 +135,7 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
     share = np.clip((added - floor) / floor, 0.0, 1.0)
     share *= np.clip((apart - COLOURED[0]) / (COLOURED[1] - COLOURED[0]), 0.0, 1.0)
     usual = float(np.median(own_light[known.any(axis=0)])) if known.any() else 0.0
-    share *= (own_light > DARK_SHARE * usual) & (own_light < usual / DARK_SHARE)
+    share *= own_light > DARK_SHARE * usual
     # A head that is off by a few mm shows other skin, brows or hair in each view: what differs no more than the skin's
     # own light does nearby may be that.
     sure = known & (share > 0.5) & (added > floor + local_range(own_light, faces))
