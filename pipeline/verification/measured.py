@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.eigenheads.subdivision import vertex_areas
-from pipeline.results.report import Report as ReportDocument
+from pipeline.results.report_types import Report as ReportDocument
 from rig.errors import InputError
 from rig.formats.ply import read_head_ply
 from rig.geometry import RigidTransform

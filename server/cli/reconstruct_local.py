@@ -22,7 +22,7 @@ from server.tasks.prepare import prepare_kernels
 from server.tasks.progress import JobProgress
 
 if TYPE_CHECKING:
-    from pipeline.results.report import Report as ReportDocument
+    from pipeline.results.report_types import Report as ReportDocument
     from pipeline.settings import Settings
 
 

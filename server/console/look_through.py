@@ -7,7 +7,7 @@ from typing import TypedDict
 import cv2
 import numpy as np
 
-from pipeline.results.report import Report
+from pipeline.results.report_types import Report
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file, read_rig_file

@@ -6,7 +6,7 @@ import typing
 from pathlib import Path
 from typing import Any
 
-from pipeline.results.report import FORMAT, Report
+from pipeline.results.report_types import FORMAT, Report
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "schemas" / "report.schema.json"
 PLAIN = {str: "string", bool: "boolean", int: "integer", float: "number", type(None): "null", object: None}

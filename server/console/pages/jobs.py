@@ -9,7 +9,7 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model_names import list_models
-from pipeline.results.report import CameraReport, WarningReport
+from pipeline.results.report_types import CameraReport, WarningReport
 from rig.errors import InputError
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.pages.rig import read_report

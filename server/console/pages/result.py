@@ -9,7 +9,7 @@ from nicegui import ui
 from nicegui.elements import scene
 from starlette.responses import RedirectResponse
 
-from pipeline.results.report import Measured, Report, WarningReport
+from pipeline.results.report_types import Measured, Report, WarningReport
 from server.console.page import Page, shared, show
 from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report

@@ -8,7 +8,7 @@ from typing import TypedDict, cast
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from pipeline.results.report import Report
+from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import CameraSyncDocument
 from server.console.media import live_view

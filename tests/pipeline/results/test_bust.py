@@ -54,7 +54,7 @@ def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     context = ReconstructionContext(capture, made.rig, load_model(), SETTINGS, renderer)
     nothing = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
     bias = WindowBias()
-    depth = Depth(made.maps, None, nothing, points_on_face(nothing, head, np.zeros(0, bool)), bias)
+    depth = Depth(made.maps, images, None, nothing, points_on_face(nothing, head, np.zeros(0, bool)), bias)
     refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", "planted"))
     bust = fuse_bust(context, Views(capture, made.silhouettes, {}), depth, refined, capture).product
     assert bust is not None

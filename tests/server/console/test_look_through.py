@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.results.report import Report
+from pipeline.results.report_types import Report
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
