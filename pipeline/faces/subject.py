@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.faces.crops import Pyramid, make_pyramid
 from pipeline.faces.detection import (
+    CERTAIN_SCORE,
     MIN_SCORE,
     FaceDetection,
     crop_around,
@@ -22,6 +23,7 @@ from pipeline.faces.eyes import find_eyes
 from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, complete_match, find_subject_face
 from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import direction_from_face, point_table
+from pipeline.faces.single_view import place_from_one_view
 from pipeline.faces.triangulated_face import TriangulatedFace
 from pipeline.multiview.spread_views import spread_views
 from rig.capture import ImageRgb
@@ -39,11 +41,16 @@ MIN_INSIDE = 0.6  # share of a face's points within a picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectFaces:
-    """What was found in each view that was searched or looked at, best first, and the subject among it."""
+    """What was found in each view that was searched or looked at, best first, and the subject among it.
+
+    ``world_from_face`` says how the subject's face lies (``points.PointTable``): by its points in the world, or, where
+    one view alone shows a face, by the mean adult's (``single_view``).
+    """
 
     found: Mapping[str, tuple[FaceDetection, ...]]
     matched: MatchedFaces | None  # None where no two views agree
-    expected: tuple[str, ...]  # views towards which the face looks, and whose picture holds it
+    expected: tuple[str, ...]  # views towards which the matched face looks, and whose pictures hold it
+    world_from_face: Similarity | None = None
 
 
 def find_subject(
@@ -64,6 +71,8 @@ def find_subject(
         report: is told the share that is done.
     """
     views = rig.subset(name for name in rig.names if name in images)
+    if not len(views):
+        return SubjectFaces({}, None, ())
     scene = _Scene(views, {name: make_pyramid(images[name]) for name in views.names}, networks, eye_distance_mm)
     in_order = spread_views(views, len(views))
     found, face = _search(scene, in_order, find_large_faces, report)
@@ -72,7 +81,7 @@ def find_subject(
     report(1.0)
     matched = face and complete_match(face, found, views)
     if matched is None:
-        return SubjectFaces(found, None, ())
+        return SubjectFaces(found, None, (), _placed_alone(found, views))
     placed = matched.world_from_face
     with_eyes = {
         name: find_eyes(scene.pyramids[name], seen, networks)
@@ -80,7 +89,7 @@ def find_subject(
         else seen
         for name, seen in matched.detections.items()
     }
-    return SubjectFaces(found, replace(matched, detections=with_eyes), tuple(_expected(placed, views)))
+    return SubjectFaces(found, replace(matched, detections=with_eyes), tuple(_expected(placed, views)), placed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +143,15 @@ def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...
         return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(towards, other)), towards @ other)))
 
     return min(left, key=lambda name: abs(apart_deg(name) - APART_DEG))
+
+
+def _placed_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> Similarity | None:
+    """How a face lies that is beyond doubt and the only one that any view shows."""
+    seen = [(name, faces) for name, faces in found.items() if faces]
+    if len(seen) != 1 or len(seen[0][1]) != 1 or seen[0][1][0].score < CERTAIN_SCORE:
+        return None
+    name, (face,) = seen[0]
+    return place_from_one_view(face, rig[name])
 
 
 def _look(

@@ -1,0 +1,48 @@
+"""How a face lies that one view alone shows, by the mean adult's points.
+
+Enters: a detection and its camera. Leaves: world_from_face. On rendered captures it is turned by 5 degrees against what
+all views say (median, to 75 degrees from the camera; 17 in profiles). Its distance follows from its size: 9 % off
+(RMS), 24 % in profiles, and as much as a head differs from the mean adult's.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.faces.detection import FaceDetection
+from pipeline.faces.points import point_table
+from pipeline.faces.triangulated_face import unbiased_px
+from rig.camera import Camera
+from rig.geometry import RigidTransform, Similarity, rotation_from_vector
+
+ROUNDS = 3  # of the pose, and the bias that follows from it
+MIN_COSINE = 0.2  # of the angle from a point's normal to the camera: those that it sees
+
+
+def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | None:
+    """Returns world_from_face of a mean adult whose points a camera sees where they were found, at scale 1. None where
+    no pose of a face explains them, or where they leave the lens."""
+    shape, pixels = point_table().shape_mm, face.landmarks_px
+    seen = np.ones(len(shape), bool)
+    placed: Similarity | None = None
+    for _ in range(ROUNDS):
+        pose = _pose(shape[seen], camera.undistort(pixels[seen]))
+        if pose is None:
+            return None
+        placed = Similarity.from_rigid(camera.camera_from_world.inverse() @ pose)
+        pixels = unbiased_px(face, placed, camera)
+        towards = camera.centre_world - placed.apply(shape)
+        normals = point_table().normals @ placed.rotation.T
+        seen = (normals * towards).sum(axis=1) > MIN_COSINE * np.linalg.norm(towards, axis=1)
+    return placed
+
+
+def _pose(points: Float[np.ndarray, "n 3"], normalised: Float[np.ndarray, "n 2"]) -> RigidTransform | None:
+    """camera_from_face of points and where they are seen (X / Z, Y / Z), by the least sum of squares."""
+    if len(points) < 6 or not np.isfinite(normalised).all():
+        return None
+    found, turn, shift = cv2.solvePnP(points, normalised, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP)
+    if not found or shift[2, 0] <= 0.0:
+        return None
+    turn, shift = cv2.solvePnPRefineLM(points, normalised, np.eye(3), np.zeros(5), turn, shift)
+    return RigidTransform(rotation_from_vector(turn.ravel()), shift.ravel())
