@@ -23,7 +23,7 @@ from pipeline.settings import Settings
 from rig.mesh import face_normals, vertex_normals
 from tests.support.subdivided_spheres import subdivided_sphere
 
-SEEDS_A_TEST = 20  # a slow test has five minutes
+SEEDS_A_TEST = 10  # a slow test has five minutes, also beside others
 EXPRESSIONS = 5  # at once, each up to its full weight
 HOSTILE_MM, LENGTH_MM = 1.5, 5.0  # standard deviation of a displacement along the normals, twice what the fine stage
 # takes for likely, and over which it fades, the fine stage's own
