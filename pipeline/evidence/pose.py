@@ -72,12 +72,17 @@ def judge_pose(
             warnings.append(ReportWarning("no-face", _no_face(len(facing))))
     unbeaten = rival is not None and rival < RIVAL_MARGIN
     if unbeaten:
-        text = f"another pose explains the outlines almost as well (its cost is {rival:.1%} higher)"
-        remedy = "look at the overlays; give feature points, --front or more views"
-        warnings.append(ReportWarning("pose-doubtful", f"{text}: {remedy}"))
+        text = (
+            f"another pose explains the outlines almost as well (its cost is {rival:.1%} higher): look at the overlays; "
+            "give feature points, --front or more views"
+        )
+        warnings.append(ReportWarning("pose-doubtful", text))
     if method == "silhouettes" and fan_strength(rig) > ONE_SIDED:
-        text = "no face was found, and the cameras look from nearly one side: outlines hardly tell how the head nods"
-        warnings.append(ReportWarning("pose-doubtful", f"{text}: give feature points, or views from the side"))
+        text = (
+            "no face was found, and the cameras look from nearly one side: outlines hardly tell how the head nods: "
+            "give feature points, or views from the side"
+        )
+        warnings.append(ReportWarning("pose-doubtful", text))
     doubtful = bool(warnings)
     return PoseEvidence(method, off, rival, doubtful), warnings
 

@@ -16,6 +16,7 @@ from rig.cache_folder import cache_folder
 FIRST_S = {
     "read": 0.4,
     "segmentation": 4.3,
+    "faces": 2.0,
     "alignment": 0.6,
     "fit": 3.7,
     "parts": 2.1,

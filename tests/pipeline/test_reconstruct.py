@@ -15,7 +15,7 @@ from rig.render.renderer import Renderer
 from rig.studio.scene.simulate import SimulatedCapture
 
 STAGES = (
-    "segmentation", "alignment", "fit", "parts", "fit", "depth", "fine", "texture", "bust", "evidence", "done",
+    "segmentation", "faces", "alignment", "fit", "parts", "fit", "depth", "fine", "texture", "bust", "evidence", "done",
 )  # fmt: skip
 SPAN = Settings(detail="span", outputs=OutputSettings(surface="head"))
 

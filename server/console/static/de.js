@@ -180,6 +180,7 @@ export default {
   "taking the pictures in": "Bilder werden übernommen",
   "reading the pictures": "Bilder werden gelesen",
   "finding silhouettes": "Silhouetten werden gesucht",
+  "finding the face": "Gesicht wird gesucht",
   "placing the head": "Kopf wird eingepasst",
   "fitting the head": "Kopf wird angepasst",
   "colouring the head": "Kopf wird eingefärbt",

@@ -30,7 +30,7 @@ export function fixed(value, digits) {
   return value === null || value === undefined ? "-" : decimal(Number(value).toFixed(digits));
 }
 
-const STAGES = { ingest: "taking the pictures in", read: "reading the pictures", segmentation: "finding silhouettes", alignment: "placing the head", fit: "fitting the head",
+const STAGES = { ingest: "taking the pictures in", read: "reading the pictures", segmentation: "finding silhouettes", faces: "finding the face", alignment: "placing the head", fit: "fitting the head",
   texture: "colouring the head", evidence: "judging the fit", write: "writing the files", parts: "telling skin, hair and clothes apart", "fit again": "fitting the head again", depth: "measuring depths in the photographs", fine: "drawing the head to the photographs",
   bust: "closing the surface of the bust", atlas: "painting the texture", compiling: "compiling, once on this machine", done: "done", detection: "finding the board in the pictures", lenses: "estimating the lenses", "pose graph": "placing the cameras", bundle: "adjusting cameras and boards together", checks: "checking the result",
   features: "finding distinct points in the photographs", matches: "finding the same points in other photographs", structure: "placing the cameras", scale: "measuring the scale", silhouettes: "comparing silhouettes" };

@@ -121,9 +121,9 @@ def explained(shares, rms_px, used=True):
 )  # fmt: skip
 def test_a_head_that_explains_no_outline_is_refused(shares, rms_px, pixel_mm, refused):
     cameras = explained(shares, rms_px)
-    text = unexplained_outlines(cameras, dict.fromkeys(cameras, pixel_mm))
+    text = unexplained_outlines(cameras, {name: pixel_mm for name in cameras})
     assert (text is not None) == refused
-    assert not refused or f"{sum(s >= 0.9 for s in shares)} of {len(shares)} views" in text
+    assert not refused or text is None or f"{sum(s >= 0.9 for s in shares)} of {len(shares)} views" in text
 
 
 def test_views_without_a_rim_and_views_left_out_have_no_say():
