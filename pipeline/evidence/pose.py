@@ -73,8 +73,8 @@ def judge_pose(
     unbeaten = rival is not None and rival < RIVAL_MARGIN
     if unbeaten:
         text = (
-            f"another pose explains the outlines almost as well (its cost is {rival:.1%} higher): look at the overlays; "
-            "give feature points, --front or more views"
+            f"another pose explains the outlines almost as well (its cost is {rival:.1%} higher): look at the "
+            "overlays; give feature points, --front or more views"
         )
         warnings.append(ReportWarning("pose-doubtful", text))
     if method == "silhouettes" and fan_strength(rig) > ONE_SIDED:
