@@ -36,7 +36,14 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 
 EYES = "eyes"
-SPEAKING = ("contour-implausible", "pose-doubtful", "scale-implausible", "shape-implausible")
+SPEAKING = (
+    "contour-implausible",
+    "face-elsewhere",
+    "no-face",
+    "pose-doubtful",
+    "scale-implausible",
+    "shape-implausible",
+)
 """Warnings that say of a result, not of its input, that it may be wrong."""
 MAX_TURN_DEG, MAX_SHIFT_MM, MAX_DEVIATIONS = 3.0, 5.0, 3.0  # of a result that needs no warning
 REFUSAL_LETTERS = 120  # of a refusal's sentence, in a row
