@@ -42,6 +42,7 @@ from pipeline.settings import Settings, document_from_settings
 from pipeline.silhouettes.segment import segment
 from pipeline.stages.alignment import align_head
 from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.faces import find_faces
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.views import find_views
 from pipeline.texture.vertex_colours import texture
@@ -195,7 +196,8 @@ def every_level(
     context = ReconstructionContext(capture, rig, model, Settings(), renderer)
     run = Recorder(discard_progress)
     views = run(find_views, context)
-    alignment = run(align_head, context, views)
+    faces = run(find_faces, context, views.capture)
+    alignment = run(align_head, context, views, faces)
     fitted = {}
     for level in levels:
         began = time.perf_counter()
