@@ -32,8 +32,10 @@ def test_the_cameras_of_photographs_are_found_and_what_was_assumed_is_told(http:
     photos = tmp_path / "photos"
     write_photographs(photos / "images", wedge_rig())
     write_image(photos / "images" / "dark.png", np.full((HEIGHT, WIDTH), 20, np.uint8))
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[20:-20, 20:-20] = 255
     for name in (*wedge_rig().names, "dark"):
-        write_image(photos / "masks" / f"{name}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+        write_image(photos / "masks" / f"{name}.png", mask)
     made = upload(http, packed(photos))
     assert made.status_code == 201, made.text
     capture = made.json()
