@@ -46,6 +46,7 @@ from calibration.quality.outliers import CORNER_SIGMAS, Dropped, bad_views, drop
 from calibration.result import Calibration, CalibrationRefused
 from rig.formats.serials import with_serials
 from rig.geometry import RigidTransform
+from rig.messages.message import Message, compose, message_of
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -115,15 +116,13 @@ def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) ->
     if not blind:
         return
     if len(blind) == len(detections.sizes) and not dropped:
-        raise WrongBoard(
-            ["no picture shows it: is board.toml the board that was used, and is it in the pictures whole?"]
-        )
+        raise WrongBoard([compose("board-in-no-picture")])
     reasons = []
     for name in blind:
         notes = [note for note in detections.notes if note.startswith(f"{name}/")]
-        lost = [str(drop) for drop in dropped if drop.camera == name]
-        why = notes[0] if notes else lost[0] if lost else "no picture shows the board"
-        reasons.append(f"{name} never sees the board ({why})")
+        lost = [drop.message() for drop in dropped if drop.camera == name]
+        why = notes[0] if notes else lost[0] if lost else compose("no-picture-of-board")
+        reasons.append(compose("camera-without-board", camera=name, why=why))
     raise CalibrationRefused(reasons)
 
 
@@ -175,8 +174,7 @@ def _finish(
     blind = [name for name in names if name not in {view.camera for view in views}]
     if blind:
         raise CalibrationRefused(
-            [f"{name}: every view of it contradicts the other cameras" for name in blind]
-            + [str(d) for d in dropped[:5]]
+            [compose("views-all-contradict", camera=name) for name in blind] + [drop.message() for drop in dropped[:5]]
         )
     shots = tuple(shot for shot in graph.shots if any(view.shot == shot for view in views))
     at = [graph.shots.index(shot) for shot in shots]
@@ -282,11 +280,13 @@ def _judged(
         fit.free.offsets,
         tuple(dropped),
         tuple(checks),
-        (*detections.remarks, *_warnings(fit, lenses, dropped)),
+        (*map(message_of, detections.remarks), *_warnings(fit, lenses, dropped)),
     )
     bad = failed(checks)
     if bad:
-        raise CalibrationRefused([f"{c.name}: {c.detail}: {c.advice}" for c in bad], calibration)
+        raise CalibrationRefused(
+            [compose("check-failed", check=c.name, detail=c.detail, advice=c.advice or "") for c in bad], calibration
+        )
     return calibration
 
 
@@ -335,14 +335,13 @@ def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np
     return table
 
 
-def _warnings(fit: _Fit, lenses: dict[str, Lens], dropped: Sequence[Dropped]) -> tuple[str, ...]:
+def _warnings(fit: _Fit, lenses: dict[str, Lens], dropped: Sequence[Dropped]) -> tuple[Message, ...]:
     found = [lens.weakness for lens in lenses.values() if lens.weakness]
-    found += [f"left out: {drop}" for drop in dropped]
+    found += [compose("left-out", what=drop.message()) for drop in dropped]
     if fit.sync_px > 0.3:
-        found.append(
-            f"cameras disagree by {fit.sync_px:.2f} px beyond the corners' noise: moments that differ, or a bent board"
-        )
+        found.append(compose("cameras-out-of-step", px=fit.sync_px))
     if fit.free.offsets:
-        late = ", ".join(f"{n} {o:+.2f}" for n, o in zip(fit.names, fit.solution.state.offsets, strict=True))
-        found.append(f"the cameras' moments differ; offsets in shots were estimated and used: {late}")
+        moments = zip(fit.names, fit.solution.state.offsets, strict=True)
+        offsets = [compose("camera-offset", camera=name, shots=offset).text for name, offset in moments]
+        found.append(compose("offsets-used", offsets=offsets))
     return tuple(found)

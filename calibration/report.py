@@ -12,6 +12,7 @@ from calibration.adjustment.state import INTRINSICS
 from calibration.result import Calibration
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
+from rig.messages.message import Message
 
 PICTURE_WIDTH = 420.0  # of a camera's drawing on the page, CSS pixels
 MAGNIFIED = 40.0  # residual vectors are drawn this many times longer
@@ -65,15 +66,15 @@ def _checks(calibration: Calibration) -> str:
     words = {True: ("good", "passed"), False: ("bad", "FAILED"), None: ("none", "not run")}
     rows = [
         f"<tr><td>{escape(check.name)}</td><td class='{words[check.passed][0]}'>{words[check.passed][1]}</td>"
-        f"<td>{escape(check.detail)}{escape(': ' + check.advice) if check.passed is False else ''}</td></tr>"
+        f"<td>{escape(check.detail.text)}{escape(f': {check.advice}') if check.passed is False else ''}</td></tr>"
         for check in calibration.checks
     ]
     return f"<table class='wide'>{''.join(rows)}</table>"
 
 
-def listed(title: str, lines: Iterable[str]) -> str:
+def listed(title: str, lines: Iterable[Message | str]) -> str:
     """A headed list, or nothing."""
-    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
     return f"<h2>{title}</h2><ul>{items}</ul>" if items else ""
 
 

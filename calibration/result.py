@@ -22,6 +22,7 @@ from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.formats.cameras_json import CamerasDocument, document_from_rig
+from rig.messages.message import Message, MessageDocument, compose, documents_of, message_of, texts_of
 from rig.rig import Rig
 
 CELLS = (4, 3)  # of a picture, across and down
@@ -30,10 +31,10 @@ CELLS = (4, 3)  # of a picture, across and down
 class CalibrationRefused(EigenheadError):
     """The pictures were understood, but what they give is not to be used. ``calibration`` is there for the report."""
 
-    def __init__(self, reasons: Iterable[str], calibration: "Calibration | None" = None) -> None:
-        self.reasons = tuple(reasons)
+    def __init__(self, reasons: Iterable[Message | str], calibration: "Calibration | None" = None) -> None:
+        self.reasons = tuple(message_of(reason) for reason in reasons)
         self.calibration = calibration
-        super().__init__("the calibration is refused: " + "; ".join(self.reasons))
+        super().__init__(compose("calibration-refused", reasons=self.reasons))
 
 
 class CameraFigures(TypedDict):
@@ -62,12 +63,15 @@ class CheckDocument(TypedDict):
     passed: bool | None
     detail: str
     advice: str
+    detail_message: MessageDocument
+    advice_message: MessageDocument | None
 
 
 class DroppedDocument(TypedDict):
     shot: str
     camera: str | None
     reason: str
+    reason_message: MessageDocument
 
 
 class OffsetsDocument(TypedDict):
@@ -84,11 +88,13 @@ class CalibrationDocument(TypedDict):
 
     verdict: Word
     missing: list[str]
+    missing_messages: list[MessageDocument]
     figures: Figures
     front: str
     checks: list[CheckDocument]
     dropped: list[DroppedDocument]
     warnings: list[str]
+    warning_messages: list[MessageDocument]
     time_offsets: OffsetsDocument | None
     intrinsics_sigma: dict[str, dict[str, float]]
     rig: CamerasDocument
@@ -117,7 +123,7 @@ class Calibration:
     offsets_used: bool
     dropped: tuple[Dropped, ...]
     checks: tuple[Check, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Message, ...]
 
     def figures(self) -> Figures:
         """The numbers of ``calibrate --json``."""
@@ -179,18 +185,37 @@ class Calibration:
         verdict = self.verdict()
         return {
             "verdict": verdict.word,
-            "missing": list(verdict.missing),
+            "missing": texts_of(verdict.missing),
+            "missing_messages": documents_of(verdict.missing),
             "figures": self.figures(),
             "front": self.front,
-            "checks": [
-                {"name": c.name, "passed": c.passed, "detail": c.detail, "advice": c.advice} for c in self.checks
+            "checks": [_check_document(check) for check in self.checks],
+            "dropped": [
+                {
+                    "shot": drop.shot,
+                    "camera": drop.camera,
+                    "reason": drop.reason.text,
+                    "reason_message": drop.reason.document(),
+                }
+                for drop in self.dropped
             ],
-            "dropped": [{"shot": d.shot, "camera": d.camera, "reason": d.reason} for d in self.dropped],
-            "warnings": list(self.warnings),
+            "warnings": texts_of(self.warnings),
+            "warning_messages": documents_of(self.warnings),
             "time_offsets": offsets,
             "intrinsics_sigma": sigma,
             "rig": document_from_rig(self.rig),
         }
+
+
+def _check_document(check: Check) -> CheckDocument:
+    return {
+        "name": check.name,
+        "passed": check.passed,
+        "detail": check.detail.text,
+        "advice": "" if check.advice is None else check.advice.text,
+        "detail_message": check.detail.document(),
+        "advice_message": None if check.advice is None else check.advice.document(),
+    }
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from rig.messages.message import Message
+
 WARNING_CODES = (
     "camera-gain",
     "camera-moved",
@@ -43,12 +45,8 @@ WARNING_CODES = (
 """Codes that a result's warnings may have; docs/operator.md says what each means and what to do."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReportWarning:
-    """Something that an operator should know: a stable ``code`` for programs, a sentence that says what to do."""
-
-    code: str
-    message: str
+ReportWarning = Message
+"""A warning of a result: a message whose code is one of ``WARNING_CODES``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,4 +54,4 @@ class Detail:
     """How deep the fit went, and why no deeper or why so deep."""
 
     level: Literal["span", "kernel", "photo", "fine"]
-    reason: str
+    reason: Message

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import TypeVar
 
 from rig.errors import WrongVariable
+from rig.messages.message import compose
 
 THREADS, THREADS_MOST = "EIGENHEAD_THREADS", 512
 Result = TypeVar("Result")
@@ -26,9 +27,7 @@ def thread_count() -> int:
     if not given:
         return len(os.sched_getaffinity(0))
     if not (given.isascii() and given.isdecimal() and 1 <= int(given[:9]) <= THREADS_MOST):
-        raise WrongVariable(
-            THREADS, [f"is {given!r}; give a whole number from 1 to {THREADS_MOST}, or unset it for one thread a CPU"]
-        )
+        raise WrongVariable(THREADS, [compose("threads-wrong", value=f"{given!r}", most=THREADS_MOST)])
     return int(given)
 
 

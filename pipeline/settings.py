@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 
 from pipeline.diagnostics import WARNING_CODES
 from rig.errors import InputError
+from rig.messages.message import Message, compose
 from rig.text import encodes, suggest
 
 T = TypeVar("T")
@@ -272,21 +273,21 @@ class Settings:
 
 def settings_from_document(document: Mapping[str, Any], subject: str = "settings") -> Settings:
     """Settings from decoded JSON or TOML. Raises InputError naming every unknown key and every wrong value."""
-    faults: list[str] = []
+    faults: list[Message] = []
     settings = _read(Settings, document, "", faults)
     unknown = [code for code in settings.fail_on if code not in WARNING_CODES]
-    faults += [f"fail_on: {code!r:.80} is none of {', '.join(WARNING_CODES)}" for code in unknown]
+    faults += [compose("setting-code-unknown", code=f"{code!r:.80}", known=WARNING_CODES) for code in unknown]
     least, most = SPACING_RANGE_MM
     if not least <= settings.bust.spacing_mm <= most:
-        faults.append(f"bust.spacing_mm is {settings.bust.spacing_mm:g}, wanted {least:g} to {most:g}")
+        faults.append(compose("setting-spacing-wrong", value=settings.bust.spacing_mm, least=least, most=most))
     strange = [name for name in settings.outputs.formats if name not in FORMATS]
-    faults += [f"outputs.formats: {name!r:.80} is none of {', '.join(FORMATS)}" for name in strange]
+    faults += [compose("setting-format-unknown", format=f"{name!r:.80}", known=FORMATS) for name in strange]
     size = settings.outputs.texture_size
     if size is not None and size not in TEXTURE_SIZES:
-        faults.append(f"outputs.texture_size is {size}, wanted {', '.join(map(str, TEXTURE_SIZES))} or null")
+        faults.append(compose("setting-texture-size-wrong", size=size, sizes=TEXTURE_SIZES))
     template = settings.outputs.template
     if template is not None and not TEMPLATE_NAME.fullmatch(template):
-        faults.append(f"outputs.template: {template!r:.60} is no name: letters, digits, - and _, 40 at most")
+        faults.append(compose("setting-template-wrong", template=f"{template!r:.60}"))
     if faults:
         raise InputError(subject, faults)
     return settings
@@ -294,7 +295,7 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
 
 def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
     """A frozen table of settings (a dataclass) from decoded JSON or TOML. Raises InputError as above."""
-    faults: list[str] = []
+    faults: list[Message] = []
     found = _read(kind, document, "", faults)
     if faults:
         raise InputError(subject, faults)
@@ -306,20 +307,25 @@ def document_from_settings(settings: Settings) -> dict[str, object]:
     return dataclasses.asdict(settings)
 
 
-def _read(kind: type[T], document: Any, where: str, faults: list[str]) -> T:
+def _read(kind: type[T], document: Any, where: str, faults: list[Message]) -> T:
     if not isinstance(document, Mapping):
-        faults.append(f"{where or 'settings'} is no object")
+        faults.append(compose("setting-no-object", where=where or "settings"))
         return kind()
     hints = typing.get_type_hints(kind)
     for key in document:
         if key not in hints:
             near = suggest(str(key), hints)
-            faults.append(f"unknown key {where + str(key)!r:.80}" + (f"; did you mean {near[0]!r}?" if near else ""))
+            shown = f"{where + str(key)!r:.80}"
+            faults.append(
+                compose("setting-unknown-near", key=shown, near=f"{near[0]!r}")
+                if near
+                else compose("setting-unknown", key=shown)
+            )
     values = {key: _value(hints[key], document[key], where + key, faults) for key in hints if key in document}
     return kind(**{key: value for key, value in values.items() if value is not ...})
 
 
-def _value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
+def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
     if dataclasses.is_dataclass(hint):
         return _read(typing.cast(type, hint), value, where + ".", faults)
     options = (
@@ -340,7 +346,7 @@ def _value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
             return value
         if option is str and _is_text(value):
             return value
-    faults.append(f"{where} is {_shown(value)}, wanted {_wanted(options)}")
+    faults.append(compose("setting-wrong", setting=where, value=_shown(value), wanted=_wanted(options)))
     return ...
 
 
@@ -363,12 +369,12 @@ def _are_texts(value: Any) -> bool:
     return isinstance(value, list | tuple) and all(map(_is_text, value))
 
 
-def _shown(value: Any) -> str:
+def _shown(value: Any) -> Message | str:
     """A wrong value in a fault. Python writes down no number of thousands of digits, and nothing nested deeply."""
     try:
         return f"{value!r:.80}"
     except (ValueError, RecursionError):
-        return "too large a value"
+        return compose("value-too-large")
 
 
 def _wanted(options: tuple[Any, ...]) -> str:

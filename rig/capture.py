@@ -4,24 +4,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from rig.image import ImageRgb
+from rig.messages.message import Message
 
 Filed = TypeVar("Filed")
 
 
 Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
-
-
-class Remark(NamedTuple):
-    """What a reader noticed and did not mind: one of the codes of a result's warnings, and a sentence."""
-
-    code: str
-    message: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +29,7 @@ class Capture:
     masks: Mapping[str, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
     features: Features = field(default_factory=dict)
     digests: Mapping[str, str] = field(default_factory=dict)
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Message, ...] = ()
     soft_masks: Mapping[str, UInt8[np.ndarray, "h w"]] = field(default_factory=dict)
 
 

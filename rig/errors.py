@@ -2,25 +2,35 @@
 
 from collections.abc import Iterable
 
+from rig.messages.message import Message, compose, message_of
+
 
 class EigenheadError(Exception):
-    """Root of every error this project raises on purpose; its text is fit for an operator."""
+    """Root of every error this project raises on purpose; its ``message`` is fit for an operator."""
+
+    def __init__(self, message: Message | str) -> None:
+        self.message = message_of(message)
+        super().__init__(self.message)
 
 
 class Cancelled(EigenheadError):
     """The owner of the work asked it to stop; raised by a progress report."""
 
     def __init__(self) -> None:
-        super().__init__("cancelled on request")
+        super().__init__(compose("cancelled"))
 
 
 class InputError(EigenheadError):
     """Input that cannot be used. ``faults`` names every fault found, not only the first."""
 
-    def __init__(self, subject: str, faults: Iterable[str]) -> None:
+    def __init__(self, subject: str, faults: Iterable[Message | str]) -> None:
         self.subject = subject
-        self.faults = tuple(faults)
-        super().__init__(f"{subject}: " + "; ".join(self.faults))
+        self.faults = tuple(message_of(fault) for fault in faults)
+        super().__init__(compose("input-refused", subject=subject, faults=self.faults))
+
+    def located(self, where: str | None = None) -> list[Message]:
+        """Returns the faults with the place where they are, the error's subject if no other is named."""
+        return [compose("located", where=where or self.subject, fault=fault) for fault in self.faults]
 
 
 class WrongVariable(InputError):

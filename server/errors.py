@@ -7,16 +7,24 @@
 from collections.abc import Iterable
 
 from rig.errors import EigenheadError, InputError
-
-URN = "urn:eigenhead:problem:"
+from rig.messages.message import Message, compose, message_of
+from server.problem_types import type_of_input
 
 
 class Refused(EigenheadError):
     """The root of what the service refuses."""
 
-    def __init__(self, kind: str, detail: str, errors: Iterable[str] = (), *, retry_after_s: int | None = None) -> None:
+    def __init__(
+        self,
+        kind: str,
+        detail: Message | str,
+        errors: Iterable[Message | str] = (),
+        *,
+        retry_after_s: int | None = None,
+    ) -> None:
         super().__init__(detail)
-        self.kind, self.detail, self.errors, self.retry_after_s = kind, detail, list(errors), retry_after_s
+        self.kind, self.detail, self.retry_after_s = kind, self.message, retry_after_s
+        self.errors = tuple(message_of(error) for error in errors)
 
 
 class Unknown(Refused):
@@ -30,8 +38,10 @@ class Forbidden(Refused):
 class NotFound(Refused):
     """What is not there."""
 
-    def __init__(self, what: str, identity: str, where: str = "GET the list to see what there is") -> None:
-        super().__init__("not-found", f"There is no {what} {identity!r:.80}; {where}.")
+    def __init__(self, what: Message, identity: str, hint: Message | None = None) -> None:
+        """``what``: a thing of the catalogue; ``hint``: where to look for what there is."""
+        where = hint or compose("hint-list")
+        super().__init__("not-found", compose("not-found", what=what, identity=f"{identity!r:.80}", where=where))
 
 
 class Conflict(Refused):
@@ -60,17 +70,12 @@ class Unavailable(Refused):
 
 class DiskFull(Refused):
     def __init__(self) -> None:
-        detail = "The disk of the service is full. Delete captures or jobs, then send it again."
-        super().__init__("disk-full", detail)
-
-
-SEND_AGAIN = "Mend what 'errors' lists and send it again."
+        super().__init__("disk-full", compose("service-disk-full"))
 
 
 def unusable_input(error: InputError) -> Unusable:
-    """An InputError as a refusal: its subject becomes part of the kind."""
-    kind = "invalid-" + ("".join(c for c in error.subject.split(".")[0] if c.isalnum() or c == "-").lower() or "input")
-    count = len(error.faults)
-    faults = "1 fault" if count == 1 else f"{count} faults"
-    detail = " ".join([f"{error.subject}: {faults} found.", SEND_AGAIN])
+    """An InputError as a refusal; its kind follows from its subject."""
+    kind = type_of_input(error.subject)
+    found = compose("faults-found", subject=error.subject, count=len(error.faults))
+    detail = compose("input-unusable", found=found)
     return Unusable(kind, detail, error.faults)

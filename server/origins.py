@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import httpx
 
+from rig.messages.message import Message, compose
 from server.errors import Unusable
 
 ANY_PUBLIC = "https://*"
@@ -37,14 +38,14 @@ def target(url: str, origins: Collection[str]) -> Target:
     """Where a request for ``url`` goes, if it may. Blocks on the name service. Raises Unusable ("url-refused")."""
     wanted = parsed(url)
     if wanted.userinfo:
-        raise _refused("has a user name in it; leave it out")
+        raise _refused(compose("url-with-user"))
     named = origin_of(wanted) in {origin_of(httpx.URL(origin)) for origin in origins if origin != ANY_PUBLIC}
     if not named and not (ANY_PUBLIC in origins and wanted.scheme == "https" and wanted.port in (None, 443)):
-        raise _refused(f"leads to {origin_of(wanted)}, which the operator of this service did not allow")
+        raise _refused(compose("url-not-allowed", origin=origin_of(wanted)))
     host = wanted.raw_host.decode("ascii")
     addresses = _addresses(host, wanted.port or PORTS[wanted.scheme])
     if not named and not all(is_public(address) for address in addresses):
-        raise _refused(f"leads to {origin_of(wanted)}, which is no public address")
+        raise _refused(compose("url-not-public", origin=origin_of(wanted)))
     return Target(
         wanted.copy_with(host=str(addresses[0]), fragment=None),
         {"Host": wanted.netloc.decode("ascii")},
@@ -59,11 +60,11 @@ def parsed(url: str) -> httpx.URL:
         shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked
         host.encode("idna")  # as getaddrinfo will
     except (httpx.InvalidURL, ValueError, TypeError) as error:  # UnicodeError, of what IDNA refuses, is a ValueError
-        raise _refused("is no URL") from error
+        raise _refused(compose("url-none")) from error
     if wanted.scheme not in PORTS or not shown:
-        raise _refused("is no https:// or http:// address")
+        raise _refused(compose("url-not-web"))
     if not HOST.fullmatch(host):
-        raise _refused(f"names no host that there can be: {host!r:.80}")
+        raise _refused(compose("url-host-impossible", host=f"{host!r:.80}"))
     return wanted
 
 
@@ -90,9 +91,9 @@ def _addresses(host: str, port: int) -> list[Address]:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except OSError as error:
-        raise _refused(f"names {host}, which nobody knows ({error.strerror})") from error
+        raise _refused(compose("url-host-unknown", host=host, reason=str(error.strerror))) from error
     return [ipaddress.ip_address(str(place[0]).partition("%")[0]) for *_, place in found]
 
 
-def _refused(why: str) -> Unusable:
-    return Unusable("url-refused", f"The address {why}.", [f"url: {why}"])
+def _refused(why: Message) -> Unusable:
+    return Unusable("url-refused", compose("url-refused", why=why), [compose("field-url-refused", why=why)])

@@ -27,6 +27,7 @@ from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
 from rig.camera import Intrinsics
 from rig.geometry import RigidTransform
+from rig.messages.message import Message, compose
 
 VIEWS_LEAST = 3  # two views of a plane determine fx, fy, cx, cy in theory; a third is the first check
 FOCAL_SHARE_MOST = 0.02  # a focal length looser than 2 % is called badly determined
@@ -52,16 +53,13 @@ class Lens:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def weakness(self) -> str | None:
+    def weakness(self) -> Message | None:
         """Why these views do not determine the lens well; None if they do."""
         if self.views < VIEWS_LEAST:
-            return f"{self.camera}: {self.views} good views of the board; at least {VIEWS_LEAST}, better 10, are needed"
+            return compose("lens-views-too-few", camera=self.camera, views=self.views, needed=VIEWS_LEAST)
         share = self.sigma[0] / self.intrinsics.fx
         if share > FOCAL_SHARE_MOST:
-            return (
-                f"{self.camera}: {self.views} views leave the focal length {100 * share:.1f} % uncertain: "
-                "add views with the board tilted by 30 to 45 degrees, near and far, and in the image's corners"
-            )
+            return compose("focal-uncertain", camera=self.camera, views=self.views, percent=100 * share)
         return None
 
 

@@ -21,6 +21,7 @@ from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
 from rig.errors import EigenheadError
 from rig.geometry import RigidTransform, rigid_fit
+from rig.messages.message import Message, compose
 
 # Distances below are in squares of the board, seen by the camera. Depth from a single view is good to a percent of the
 # camera's distance, half a square of a usual board; a turned or mirrored board is off by its whole length.
@@ -33,9 +34,9 @@ SAME_DEG = 15.0  # candidates closer than this are one hypothesis
 class PoseGraphError(EigenheadError):
     """The views do not determine how the cameras stand to each other. ``reasons`` names the cameras."""
 
-    def __init__(self, reasons: Iterable[str]) -> None:
+    def __init__(self, reasons: Iterable[Message]) -> None:
         self.reasons = tuple(reasons)
-        super().__init__("the cameras cannot be joined into one rig: " + "; ".join(self.reasons))
+        super().__init__(compose("cameras-not-joined", reasons=self.reasons))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,7 +251,7 @@ def _reasons(
     names: Sequence[str],
     edges: Sequence[Edge],
     options: dict[tuple[str, str], Candidates],
-) -> list[str]:
+) -> list[Message]:
     """One sentence per group of cameras that does not join the largest."""
     good = [edge for edge in edges if edge.consistent and not edge.ambiguous]
     groups: list[set[str]] = []
@@ -270,27 +271,17 @@ def _reason(
     lenses: dict[str, Lens],
     edges: Sequence[Edge],
     options: dict[tuple[str, str], Candidates],
-) -> str:
-    who = ", ".join(sorted(group))
-    others = f"the others ({', '.join(sorted(main))})"
+) -> Message:
+    who, others = sorted(group), sorted(main)
     between = [edge for edge in edges if len({edge.a, edge.b} & group) == 1 and len({edge.a, edge.b} & main) == 1]
     if not between:
-        return f"{who} shares no shot with {others}: take shots in which the board is seen by both at once"
+        return compose("group-shares-no-shot", cameras=who, others=others)
     torn = [edge for edge in between if not edge.consistent]
-    if torn and len(group) == 1:
-        name = next(iter(group))
-        if _fits_when_mirrored(name, main, detections, lenses, options):
-            return f"{name} is mirrored: turn off mirroring in the camera or its software, and take the shots again"
+    if torn and len(group) == 1 and _fits_when_mirrored(who[0], main, detections, lenses, options):
+        return compose("camera-mirrored", camera=who[0])
     if torn:
-        shared = max(edge.shared for edge in torn)
-        return (
-            f"{who} sees the board where {others} cannot, in up to {shared} shared shots: are its pictures sorted "
-            "under the right camera and shot names, and taken at the same moments?"
-        )
-    return (
-        f"{who} joins {others} in two ways, since the board looks the same when turned: take more shots that both see, "
-        "or a board whose columns and rows are not both even or both odd"
-    )
+        return compose("group-contradicts", cameras=who, others=others, shared=max(edge.shared for edge in torn))
+    return compose("group-joins-twice", cameras=who, others=others)
 
 
 def _fits_when_mirrored(

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from rig.errors import InputError
 from rig.geometry import RigidTransform
+from rig.messages.message import compose
 from rig.rig import Rig
 
 
@@ -30,7 +31,7 @@ def in_world_frame(rig: Rig, front: str | None = None) -> Rig:
     """The same rig in the project's world frame. ``front`` names the front camera; without it the middle one of the
     fan is taken. Covariances are those of left perturbations and do not change. Raises InputError if it is unknown."""
     if front is not None and front not in rig:
-        raise InputError("front camera", [f"{front!r} is no camera of the rig ({', '.join(rig.names)})"])
+        raise InputError("front camera", [compose("front-of-other-rig", front=f"{front!r}", cameras=rig.names)])
     origin, up = rig.centre_world(), up_direction(rig)
     forward = rig[front or rig.front_camera()].centre_world - origin
     forward = forward - up * (up @ forward)

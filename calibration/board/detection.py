@@ -21,6 +21,7 @@ from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras_json import name_fault
 from rig.formats.picture_names import PLAIN_SUFFIXES
+from rig.messages.message import Message, compose, verbatim
 from rig.progress import Progress
 
 VERSION = 2  # of the detector: part of the cache's key
@@ -63,13 +64,13 @@ class Detections:
 class WrongBoard(EigenheadError):
     """The pictures do not show the board that was described."""
 
-    def __init__(self, notes: Iterable[str]) -> None:
+    def __init__(self, notes: Iterable[Message | str]) -> None:
         pictures: dict[str, list[str]] = {}
-        for note in notes:
+        for note in map(str, notes):
             picture, colon, reason = note.partition(": ")
             pictures.setdefault(reason if colon else note, []).append(picture if colon else "")
         texts = [_of_pictures(names, reason) for reason, names in pictures.items()]
-        super().__init__("the pictures do not show the board of board.toml: " + "; ".join(texts))
+        super().__init__(compose("wrong-board", notes=[verbatim(text) for text in texts]))
 
 
 def _of_pictures(names: list[str], reason: str) -> str:

@@ -13,6 +13,7 @@ from calibration.adjustment.lens_prior import LensPrior, fixed_prior
 from calibration.adjustment.state import BundleState, Observations, residuals
 from calibration.board.board import Board
 from rig.geometry import rigid_fit
+from rig.messages.message import Message, compose
 from rig.parabola import second_difference, vertex_offset
 from rig.rig import Rig
 
@@ -29,8 +30,8 @@ class Check:
 
     name: str
     passed: bool | None
-    detail: str
-    advice: str = ""
+    detail: Message
+    advice: Message | None = None
 
 
 def check_cheirality(state: BundleState, seen: Observations, board: Board) -> Check:
@@ -43,9 +44,9 @@ def check_cheirality(state: BundleState, seen: Observations, board: Board) -> Ch
     backs = len(np.unique(seen.view_of[(normals * points).sum(axis=1) <= 0]))
     rotations = np.concatenate([state.camera_rotations, state.board_rotations])
     proper = bool((np.linalg.det(rotations) > 0).all())
-    told = "mirrored pictures would show" if board.is_chiral else "a wholly mirrored rig would not show with this board"
-    detail = f"{behind} corners behind a camera, {backs} views of the board's back; {told}"
-    advice = "take the shots again; if pictures are mirrored in a camera or its software, turn that off"
+    code = "cheirality-chiral" if board.is_chiral else "cheirality-symmetric"
+    detail = compose(code, corners=behind, views=backs)
+    advice = compose("advice-cheirality")
     return Check("cheirality", behind == 0 and backs == 0 and proper, detail, advice)
 
 
@@ -61,7 +62,7 @@ def check_held_out(
     several = np.flatnonzero(np.bincount(seen.shot, minlength=len(state.board_rotations)) >= 2)
     held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     if len(held) < 2 or len(several) - len(held) < 4:
-        return Check("held-out shots", None, f"{len(several)} shots with two cameras are too few to hold some out")
+        return Check("held-out shots", None, compose("held-out-too-few", shots=len(several)))
     out = np.isin(seen.shot[seen.view_of], held)
     trained = solve(state, seen.subset(~out), prior, sigma, free=free, loss=HUBER, tick=tick, steps=25).state
     boards = replace(free, intrinsics=False, poses=False, offsets=False)
@@ -70,11 +71,9 @@ def check_held_out(
     inside, outside = (
         float(np.sqrt((residuals(s, o) ** 2).sum(axis=1).mean())) for s, o in ((state, seen), (tested, rest))
     )
-    detail = f"{outside:.2f} px in {len(held)} held-out shots, {inside:.2f} px in all"
+    detail = compose("held-out", outside_px=outside, shots=len(held), inside_px=inside)
     passed = outside < max(HELD_OUT_RATIO * inside, inside + HELD_OUT_LEAST_PX)
-    return Check(
-        "held-out shots", passed, detail, "take more shots: the board near and far, tilted, all over each picture"
-    )
+    return Check("held-out shots", passed, detail, compose("advice-held-out"))
 
 
 def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
@@ -86,14 +85,16 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
     ]
     ratios = {name: value / (count * board.square_mm) for name, value, count in pairs if value is not None}
     off = [
-        f"{name} is {100 * (ratio - 1):+.2f} % off" for name, ratio in ratios.items() if abs(ratio - 1) > SCALE_SHARE
+        compose("print-off", side=name, percent=100 * (ratio - 1))
+        for name, ratio in ratios.items()
+        if abs(ratio - 1) > SCALE_SHARE
     ]
     skewed = abs(aspect - 1) > max(SCALE_SHARE, 5 * aspect_sigma)
-    detail = f"squares are {aspect:.4f} +- {aspect_sigma:.4f} times as high as wide"
-    detail += "; " + "; ".join(off) if off else ""
-    if not ratios:
-        detail += "; enter measured_width_mm in board.toml to check the scale itself"
-    advice = "measure the printed board, correct square_mm, or print again at 100 %"
+    notes = off if ratios else [compose("print-unmeasured")]
+    detail = compose("print-aspect", aspect=aspect, sigma=aspect_sigma)
+    if notes:
+        detail = compose("print-aspect-off", aspect=aspect, sigma=aspect_sigma, off=notes)
+    advice = compose("advice-scale")
     return Check("scale", not off and not skewed, detail, advice)
 
 
@@ -101,8 +102,8 @@ def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
     """Every camera's pose is known to a fraction of a pixel at the subject."""
     loose = [name for name, value in zip(rig.names, pose_sigma_px, strict=True) if not value < LOOSE_PX]
     worst = int(np.argmax(pose_sigma_px))
-    detail = f"poses to {pose_sigma_px.max():.2f} px at the subject (worst: {rig.names[worst]})"
-    advice = f"take more shots that {', '.join(loose)} and its neighbours see at once" if loose else ""
+    detail = compose("poses-determined", px=pose_sigma_px.max(), camera=rig.names[worst])
+    advice = compose("advice-determined", cameras=loose) if loose else None
     return Check("determined", not loose, detail, advice)
 
 
@@ -111,8 +112,8 @@ def check_against_previous(rig: Rig, previous: Rig | None) -> list[Check]:
     names = [name for name in rig.names if previous is not None and name in previous]
     if previous is None or len(names) < 3:
         return [
-            Check("known layout", None, "no earlier calibration to compare with"),
-            Check("lens stability", None, "no earlier calibration to compare with"),
+            Check("known layout", None, compose("no-earlier-calibration")),
+            Check("lens stability", None, compose("no-earlier-calibration")),
         ]
     now, then = rig.subset(names), Rig(tuple(previous[name] for name in names if name in rig))
     now = Rig(tuple(now[name] for name in names))
@@ -125,26 +126,28 @@ def _check_layout(now: Rig, then: Rig) -> Check:
     plain, mirrored = _misfit_mm(here, there, False), _misfit_mm(here, there, True)
     spread = float(np.sqrt(((there - there.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if mirrored < 0.2 * min(plain, cost) and plain > 0.05 * spread:
-        advice = "turn off mirroring in the cameras or their software, and take the shots again"
-        return Check("known layout", False, "the rig is the mirror image of the earlier one", advice)
+        advice = compose("advice-mirrored")
+        return Check("known layout", False, compose("layout-mirrored"), advice)
     if cost < 0.5 * identity and any(i != j for i, j in enumerate(order)):
-        swaps = [f"{now.names[i]} stands where {then.names[j]} stood" for i, j in enumerate(order) if i != j]
-        return Check(
-            "known layout", False, "; ".join(swaps), "correct the camera names, or drop the earlier calibration"
-        )
+        swaps = [
+            compose("camera-in-place-of", camera=now.names[i], other=then.names[j])
+            for i, j in enumerate(order)
+            if i != j
+        ]
+        return Check("known layout", False, compose("several", messages=swaps), compose("advice-swapped"))
     ratio = float(np.linalg.norm(here - here.mean(axis=0)) / np.linalg.norm(there - there.mean(axis=0)))
     distances = image_distance(now, then)
-    moved = [f"{name} by {px:.1f} px" for name, px in zip(now.names, distances, strict=True) if px > 3.0]
-    detail = f"{ratio:.4f} times the earlier size; " + (
-        f"moved since: {', '.join(moved)}" if moved else "no camera moved"
-    )
+    moved = [
+        compose("camera-by-px", camera=name, px=px).text
+        for name, px in zip(now.names, distances, strict=True)
+        if px > 3.0
+    ]
+    detail = compose("layout-moved", ratio=ratio, moved=moved) if moved else compose("layout-same", ratio=ratio)
     # Cameras move, all of them in step with a scale they do not: that is a board of another size.
     rescaled = image_distance(now, then, scale=True)
     same_shape = float(np.median(rescaled)) < 0.3 * float(np.median(distances))
     passed = not (abs(ratio - 1) > SCALE_SHARE and same_shape)
-    return Check(
-        "known layout", passed, detail, "the rig's size changed but not its shape: check square_mm of board.toml"
-    )
+    return Check("known layout", passed, detail, compose("advice-rescaled"))
 
 
 def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
@@ -176,10 +179,15 @@ def _check_lenses(now: Rig, then: Rig) -> Check:
         for camera in now
         if camera.intrinsics.width == then[camera.name].intrinsics.width
     }
-    off = [f"{name} by {100 * change:+.1f} %" for name, change in changes.items() if abs(change) > FOCAL_CHANGE]
+    off = [
+        compose("camera-by-percent", camera=name, percent=100 * change).text
+        for name, change in changes.items()
+        if abs(change) > FOCAL_CHANGE
+    ]
     largest = max((abs(change) for change in changes.values()), default=0.0)
-    detail = f"focal lengths changed: {', '.join(off)}" if off else f"focal lengths within {100 * largest:.2f} %"
-    advice = "was a lens zoomed or exchanged? If so calibrate without the earlier calibration; else add tilted views"
+    same = compose("focal-lengths-same", percent=100 * largest)
+    detail = compose("focal-lengths-changed", changes=off) if off else same
+    advice = compose("advice-lenses")
     return Check("lens stability", not off, detail, advice)
 
 

@@ -12,6 +12,7 @@ from calibration.board.board import Board
 from calibration.board.detection import Detections, View
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rigid_fit
+from rig.messages.message import Message, compose
 
 # A view is out if its RMS is this many times the median view's: with Gaussian corners the ratio passes 1.5 once in 1e4
 # views; moments that differ between cameras spread it to 5.
@@ -27,10 +28,16 @@ class Dropped:
 
     shot: str
     camera: str | None
-    reason: str
+    reason: Message
+
+    def message(self) -> Message:
+        """Returns all of it in one sentence."""
+        if self.camera is None:
+            return compose("dropped-shot", shot=self.shot, reason=self.reason)
+        return compose("dropped-view", shot=self.shot, camera=self.camera, reason=self.reason)
 
     def __str__(self) -> str:
-        return f"{self.shot}{f' of {self.camera}' if self.camera else ''}: {self.reason}"
+        return self.message().text
 
 
 def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
@@ -39,8 +46,9 @@ def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
     for view in detections.views:
         side = square_side_px(view, detections.board)
         if view.found.rise_px > max(BLUR_PX, BLUR_SQUARES * side):
-            width = "wider than the pattern" if np.isinf(view.found.rise_px) else f"{view.found.rise_px:.0f} px wide"
-            dropped.append(Dropped(view.shot, view.camera, f"blurred, edges are {width}: hold the board still"))
+            width_px = view.found.rise_px
+            endless = compose("view-blurred-beyond") if np.isinf(width_px) else None
+            dropped.append(Dropped(view.shot, view.camera, endless or compose("view-blurred", width_px=width_px)))
         else:
             kept.append(view)
     return replace(detections, views=tuple(kept)), dropped
@@ -68,9 +76,7 @@ def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detec
             view, Camera("", lens.intrinsics, RigidTransform.identity()), lens.poses[view.shot], detections.board
         )
         if rms > max(VIEW_RATIO * lens.noise_px, VIEW_LEAST_PX):
-            dropped.append(
-                Dropped(view.shot, view.camera, f"corners are {rms:.1f} px off a flat board: misread or bent")
-            )
+            dropped.append(Dropped(view.shot, view.camera, compose("corners-off-board", rms_px=rms)))
         else:
             kept.append(view)
     return replace(detections, views=tuple(kept)), dropped
@@ -110,26 +116,26 @@ def explain_shot(
         size, rms = scale
         if abs(size - 1) > 0.01 and rms < max(MATCH_RATIO * noise_px, VIEW_LEAST_PX):
             real = size * detections.board.square_mm
-            reason = f"its squares measure {real:.1f} mm, not {detections.board.square_mm:g}: another board"
+            reason = compose("squares-of-other-board", real_mm=real, square_mm=detections.board.square_mm)
             return [Dropped(shot, None, reason)]
     if len(bad) > len(views) / 2:
-        return [Dropped(shot, None, "its cameras disagree where the board is: it moved between their moments")]
+        return [Dropped(shot, None, compose("board-moved-between"))]
     return [Dropped(shot, view.camera, _why(view, cameras, detections, boards, noise_px)) for view in bad]
 
 
 def _why(
     view: View, cameras: dict[str, Camera], detections: Detections, boards: dict[str, RigidTransform], noise_px: float
-) -> str:
+) -> Message:
     """Whether the picture fits under another camera's name, or in another shot."""
     limit = max(10 * noise_px, 3.0)
     for name, camera in cameras.items():
         alike = name != view.camera and detections.sizes[name] == detections.sizes[view.camera]
         if alike and miss(view, camera, boards[view.shot], detections.board) < limit:
-            return f"it is a picture of {name}'s: names are swapped"
+            return compose("picture-of-camera", camera=name)
     for shot, pose in boards.items():
         if shot != view.shot and miss(view, cameras[view.camera], pose, detections.board) < limit:
-            return f"it is the picture of {shot}: shot names are mixed up"
-    return "it contradicts the other cameras: was it taken at another moment, or the camera moved?"
+            return compose("picture-of-shot", shot=shot)
+    return compose("view-contradicts")
 
 
 def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Board) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from calibration.quality.checks import Check
+from rig.messages.message import Message, compose
 
 Word = Literal["good", "usable", "poor"]
 
@@ -32,39 +33,31 @@ class Verdict:
     """``missing``: what would make it better, most urgent first; empty where it is good."""
 
     word: Word
-    missing: tuple[str, ...]
+    missing: tuple[Message, ...]
 
 
 def judge(cameras: Mapping[str, CameraEvidence], checks: Sequence[Check]) -> Verdict:
     """By its weakest camera."""
     severe, mild = [], []
 
-    def say(where: list[str], names: list[str], what: str) -> None:
-        if names:
-            where.append(f"{', '.join(names)}: {what}")
-
     def of(test: str, least: float, most: float) -> list[str]:
         return [name for name, camera in cameras.items() if least < getattr(camera, test) <= most]
 
     infinite = float("inf")
-    blind = [name for name, camera in cameras.items() if camera.views < VIEWS_LEAST]
-    say(severe, blind, f"fewer than {VIEWS_LEAST} views of the board: turn it towards them in further shots")
-    say(severe, of("focal_share", FOCAL_POOR, infinite), _focal(FOCAL_POOR))
-    say(severe, of("pose_sigma_px", POSE_POOR_PX, infinite), _pose(POSE_POOR_PX))
-    few = [name for name, camera in cameras.items() if VIEWS_LEAST <= camera.views < VIEWS_GOOD]
-    say(mild, few, f"fewer than {VIEWS_GOOD} views of the board: turn it towards them in further shots")
-    say(mild, of("focal_share", FOCAL_GOOD, FOCAL_POOR), _focal(FOCAL_GOOD))
-    say(mild, of("pose_sigma_px", POSE_GOOD_PX, POSE_POOR_PX), _pose(POSE_GOOD_PX))
-    bare = [name for name, camera in cameras.items() if camera.covered < COVERED_GOOD]
-    say(mild, bare, "the board was never near the rim of the picture: bring it there")
+    if blind := [name for name, camera in cameras.items() if camera.views < VIEWS_LEAST]:
+        severe.append(compose("views-too-few", cameras=blind, views=VIEWS_LEAST))
+    if vague := of("focal_share", FOCAL_POOR, infinite):
+        severe.append(compose("focal-poor", cameras=vague, percent=100 * FOCAL_POOR))
+    if loose := of("pose_sigma_px", POSE_POOR_PX, infinite):
+        severe.append(compose("pose-loose", cameras=loose, px=POSE_POOR_PX))
+    if few := [name for name, camera in cameras.items() if VIEWS_LEAST <= camera.views < VIEWS_GOOD]:
+        mild.append(compose("views-too-few", cameras=few, views=VIEWS_GOOD))
+    if vague := of("focal_share", FOCAL_GOOD, FOCAL_POOR):
+        mild.append(compose("focal-poor", cameras=vague, percent=100 * FOCAL_GOOD))
+    if loose := of("pose_sigma_px", POSE_GOOD_PX, POSE_POOR_PX):
+        mild.append(compose("pose-loose", cameras=loose, px=POSE_GOOD_PX))
+    if bare := [name for name, camera in cameras.items() if camera.covered < COVERED_GOOD]:
+        mild.append(compose("rim-uncovered", cameras=bare))
     if any(check.name == "held-out shots" and check.passed is None for check in checks):
-        mild.append("too few shots to hold some out and see whether the others foretell them: take 15 in all")
+        mild.append(compose("held-out-missing"))
     return Verdict("poor" if severe else "usable" if mild else "good", (*severe, *mild))
-
-
-def _focal(share: float) -> str:
-    return f"focal length known no better than {100 * share:.0f} %: take shots with the board tilted, near and far"
-
-
-def _pose(pixels: float) -> str:
-    return f"pose looser than {pixels:.1f} px at the subject: take shots that they and their neighbours see at once"

@@ -18,6 +18,7 @@ import numpy as np
 from calibration.scene.photographs import ONE_SHOT, Photographs
 from rig.errors import InputError
 from rig.formats.images import decode_image_file, write_image
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 
 SEED = 0
@@ -51,7 +52,7 @@ def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool
     if one_lens is None:
         one_lens = len(set(sizes.values())) == 1 and photographs.shots == (ONE_SHOT,)
     elif one_lens and len(set(sizes.values())) > 1:
-        raise InputError("photographs", [f"are of {len(set(sizes.values()))} sizes, and one lens makes one size"])
+        raise InputError("photographs", [compose("photographs-of-sizes", sizes=len(set(sizes.values())))])
     with quiet():
         _extract(photographs, scratch, report)
         _match_shots(photographs, scratch, report)
@@ -94,12 +95,21 @@ def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, 
     jobs = [(camera, shot, path) for camera, files in photographs.files.items() for shot, path in files.items()]
     with ThreadPoolExecutor(max_workers=4) as pool:
         done = list(pool.map(one, jobs))
-    faults = [fault for _, fault in done if fault]
+    faults: list[Message | str] = [fault for _, fault in done if fault]
     sizes: dict[str, tuple[int, int]] = {}
     for (camera, shot, _), (size, fault) in zip(jobs, done, strict=True):
         if not fault and sizes.setdefault(camera, size) != size:
             wanted = " x ".join(map(str, sizes[camera]))
-            faults.append(f"{camera}/{shot} is {size[0]} x {size[1]} pixels, its camera's other shots {wanted}")
+            faults.append(
+                compose(
+                    "photograph-size-differs",
+                    camera=camera,
+                    shot=shot,
+                    width=size[0],
+                    height=size[1],
+                    wanted=str(wanted),
+                )
+            )
     if faults:
         raise InputError("photographs", faults)
     return sizes

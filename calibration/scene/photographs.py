@@ -17,6 +17,7 @@ from rig.formats.capture_folder import capture_root, size_fault
 from rig.formats.capture_masks import mask_subjects
 from rig.formats.images import decode_image_file, is_picture
 from rig.formats.shot_files import BESIDE_PICTURES, find_files
+from rig.messages.message import compose
 from rig.rig import Rig
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
@@ -40,7 +41,7 @@ class Photographs:
 def find_photographs(folder: Path) -> Photographs:
     """The photographs of ``folder``. Raises InputError naming every fault."""
     if not folder.is_dir():
-        raise InputError(folder.name, ["is no folder; give the folder that holds the photographs"])
+        raise InputError(folder.name, [compose("no-folder-of-photographs")])
     root = capture_root(folder)
     root = root / "images" if (root / "images").is_dir() else root
     flat = _pictures(root)
@@ -48,17 +49,16 @@ def find_photographs(folder: Path) -> Photographs:
     folders = {path.name: _pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:
-        told = "photographs beside folders of photographs: put one picture a camera, or one folder a camera"
+        told = compose("photographs-beside-folders")
         raise InputError(folder.name, [told])
     files = folders or {path.stem: [path] for path in flat}
-    faults = [f"camera {fault}: rename it" for name in files if (fault := name_fault(name))]
+    faults = [compose("camera-rename", fault=fault) for name in files if (fault := name_fault(name))]
     if len(files) < CAMERAS_LEAST:
-        there = f"{len(files)} {'photograph' if len(files) == 1 else 'photographs'}"
-        faults.append(f"{there}; at least {CAMERAS_LEAST} from different places are needed, better 20")
+        faults.append(compose("photographs-too-few", count=len(files), needed=CAMERAS_LEAST))
     for name, paths in (folders or {"the folder": flat}).items():
         stems = [path.stem for path in paths]
         twice = sorted({stem for stem in stems if stems.count(stem) > 1})
-        faults += [f"{name} holds {stem} {stems.count(stem)} times, with different endings" for stem in twice]
+        faults += [compose("photograph-repeated", folder=name, name=stem, count=stems.count(stem)) for stem in twice]
     if faults:
         raise InputError(folder.name, faults)
     if folders:

@@ -9,6 +9,7 @@ from calibration.scene.covariance import Uncertainty
 from calibration.scene.scale import Scale
 from calibration.scene.structure import Structure
 from rig.formats.cameras_json import CamerasDocument, document_from_rig
+from rig.messages.message import Message, MessageDocument, compose, documents_of, texts_of
 from rig.rig import Rig
 
 
@@ -49,6 +50,7 @@ class SceneDocument(TypedDict):
     left_out: dict[str, str]
     refinement: str | None
     warnings: list[str]
+    warning_messages: list[MessageDocument]
     rig: CamerasDocument
 
 
@@ -63,11 +65,15 @@ class SceneCalibration:
     uncertainty: Uncertainty
     scale: Scale
     front: str
-    left_out: dict[str, str]
+    left_out: dict[str, Message]
     features: dict[str, int]
     matched: int
-    warnings: tuple[str, ...]
-    refinement: str | None = None
+    warnings: tuple[Message, ...]
+    refinement: Message | None = None
+
+    def absences(self) -> list[Message]:
+        """Returns, for every view that did not join, which and why."""
+        return [compose("located", where=name, fault=why) for name, why in self.left_out.items()]
 
     def figures(self) -> SceneFigures:
         """The numbers of ``calibrate --from scene --json``."""
@@ -101,12 +107,13 @@ class SceneCalibration:
             "scale": {
                 "source": self.scale.source,
                 "assumed": self.scale.assumed,
-                "told": self.scale.told,
+                "told": self.scale.told.text,
                 "share_sigma": self.scale.share,
             },
-            "left_out": dict(self.left_out),
-            "refinement": self.refinement,
-            "warnings": list(self.warnings),
+            "left_out": {name: f"{name}: {why}" for name, why in self.left_out.items()},
+            "refinement": None if self.refinement is None else self.refinement.text,
+            "warnings": texts_of(self.warnings),
+            "warning_messages": documents_of(self.warnings),
             "rig": document_from_rig(self.rig),
         }
 

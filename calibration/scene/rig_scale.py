@@ -15,16 +15,17 @@ from calibration.scene.scale import (
     scale_from_points,
     scale_from_tags,
 )
-from rig.capture import Capture, Remark
+from rig.capture import Capture
 from rig.formats.scale_json import CameraDistance, KnownLength, PointDistance
 from rig.formats.work_size import work_features
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 AGREES_SHARES = 3.0  # standard deviations of the known length
 AGREES_LEAST = 0.002  # and at least this share: half a millimetre of a head
 
 
-def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Remark]]:
+def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
     """Scales a rig by a known length.
 
     Args:
@@ -38,8 +39,7 @@ def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) 
     scale = _scale(capture, rig, full, known)
     if abs(np.log(scale.factor)) <= max(AGREES_LEAST, AGREES_SHARES * scale.share):
         return rig, []
-    text = f"the cameras were scaled by {scale.factor:.4g}: {scale.told}"
-    return times(rig, scale.factor), [Remark("cameras-scaled", text)]
+    return times(rig, scale.factor), [compose("cameras-scaled", factor=scale.factor, scale=scale.told)]
 
 
 def times(rig: Rig, factor: float) -> Rig:

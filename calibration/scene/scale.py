@@ -19,6 +19,7 @@ from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangu
 from rig.errors import InputError
 from rig.formats.images import decode_image_file
 from rig.formats.scale_json import CameraDistance, KnownLength, PointDistance, TagSize, dictionaries
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 PICKED_PX = 1.0  # of a point picked by hand, an axis
@@ -40,7 +41,7 @@ class Scale:
     factor: float
     share: float
     source: str
-    told: str
+    told: Message
 
     @property
     def assumed(self) -> bool:
@@ -67,10 +68,10 @@ def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
     """From the centres of two cameras; a lens's entrance pupil is known to some millimetres from outside."""
     lost = [name for name in known.cameras if name not in rig]
     if lost:
-        raise InputError("scale.json", [f"cameras: {name} did not join the others; name two that did" for name in lost])
+        raise InputError("scale.json", [compose("scale-camera-lost", camera=name) for name in lost])
     one, other = (rig[name].centre_world for name in known.cameras)
     factor = known.distance_mm / float(np.linalg.norm(one - other))
-    told = f"the {known.distance_mm:g} mm between {known.cameras[0]} and {known.cameras[1]}"
+    told = compose("scale-by-cameras", distance_mm=known.distance_mm, first=known.cameras[0], second=known.cameras[1])
     return Scale(factor, 2.0 / known.distance_mm, "cameras", told)
 
 
@@ -82,14 +83,18 @@ def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
         try:
             ends.append(triangulate(joined, rig, noise_px=PICKED_PX))
         except NoPoint as error:
-            lost = ", ".join(sorted(set(views) - set(joined)))
-            faults.append(f"points: the {name} ({error})" + (f"; {lost} did not join the others" if lost else ""))
+            lost = sorted(set(views) - set(joined))
+            faults.append(
+                compose("scale-points-lost", which=name, reason=error.message, lost=lost)
+                if lost
+                else compose("scale-points-unusable", which=name, reason=error.message)
+            )
     if faults:
         raise InputError("scale.json", faults)
-    return _between(ends, known.distance_mm, "points", f"the {known.distance_mm:g} mm between two picked points")
+    return _between(ends, known.distance_mm, "points", compose("scale-by-points", distance_mm=known.distance_mm))
 
 
-def _between(ends: list[TriangulatedPoint], length_mm: float, source: str, told: str) -> Scale:
+def _between(ends: list[TriangulatedPoint], length_mm: float, source: str, told: Message) -> Scale:
     across = ends[1].position_world - ends[0].position_world
     length = float(np.linalg.norm(across))
     along = across / length
@@ -152,16 +157,18 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
             continue
         worst = max(float(np.abs(miss).max()) for corner in corners for miss in corner.residuals_px.values())
         if worst < TAG_MISS_PX:
-            sides = [_between([corners[k], corners[(k + 1) % 4]], known.size_mm, "tag", "") for k in range(4)]
+            sides = [
+                _between([corners[k], corners[(k + 1) % 4]], known.size_mm, "tag", compose("scale-unsaid"))
+                for k in range(4)
+            ]
             found.append((np.mean([side.factor for side in sides]), np.mean([side.share for side in sides]), number[1]))
     if not found:
         seen = sorted({camera for views in tags.values() for camera in views})
-        told = f"tags of it were found in {', '.join(seen)}" if seen else "no tag of it was found in any photograph"
-        advice = "lay a larger one where several cameras see it whole, with a white rim, or check the dictionary"
-        raise InputError("scale.json", [f"tag: none is seen by two cameras that joined ({told}); {advice}"])
+        told = compose("scale-tag-seen", cameras=seen) if seen else compose("scale-tag-unseen")
+        raise InputError("scale.json", [told])
     factor = float(np.median([factor for factor, _, _ in found]))
     numbers = sorted({number for *_, number in found})
-    told = f"{len(numbers)} tag{'s' * (len(numbers) > 1)} of {known.size_mm:g} mm ({', '.join(map(str, numbers))})"
+    told = compose("scale-by-tags", count=len(numbers), size_mm=known.size_mm, numbers=numbers)
     return Scale(factor, float(np.median([share for _, share, _ in found])), "tag", told)
 
 
@@ -169,7 +176,7 @@ def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Sca
     """From the median distance of points from their middle, as in ``head`` (mm)."""
     points = _looked_at(structure)
     ratio = _spread(head) / _spread(points)
-    told = "an ASSUMPTION: the points in the middle are a head of the model's mean size; give scale.json to know it"
+    told = compose("scale-by-head")
     return Scale(ratio, HEAD_SHARE, ASSUMED, told)
 
 

@@ -29,6 +29,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.formats.scale_json import read_scale
 from rig.formats.serials import with_serials
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -58,7 +59,7 @@ def calibrate_scene(
     photographs = find_photographs(folder)
     names = photographs.names
     if front is not None and front not in names:
-        raise InputError("front camera", [f"{front!r} is none of the photographs' ({', '.join(names)})"])
+        raise InputError("front camera", [compose("front-of-no-photograph", front=f"{front!r}", cameras=names)])
     known = None if scale is None else read_scale(scale, names)
     with tempfile.TemporaryDirectory() as scratch:
         matches = match_photographs(photographs, Path(scratch), one_lens=one_lens, report=report)
@@ -74,42 +75,41 @@ def calibrate_scene(
     return replace(calibration, rig=with_serials(calibration.rig, first))
 
 
-def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, str]]:
+def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, Message]]:
     """The structure with why views are left out of it. Raises CalibrationRefused where too few joined."""
     names = list(matches.sizes)
     joined = structure.rig.names if structure is not None else ()
     left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
     if structure is None or len(joined) < max(CAMERAS_LEAST, JOINED_LEAST * len(names)):
-        told = f"only {len(joined)} of {len(names)} views join" if joined else f"none of the {len(names)} views join"
-        raise CalibrationRefused([told, *left_out.values()])
+        few = compose("scene-views-join", joined=len(joined), all=len(names))
+        told = few if joined else compose("scene-no-view-joins", all=len(names))
+        raise CalibrationRefused([told, *(compose("located", where=n, fault=why) for n, why in left_out.items())])
     return structure, left_out
 
 
 def placed(
-    structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, str], front: str | None
+    structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, Message], front: str | None
 ) -> SceneCalibration:
     """The calibration in millimetres and in the world frame, with its covariances."""
     if front in left_out:
-        raise CalibrationRefused([f"the front camera {left_out[str(front)]}"])
+        raise CalibrationRefused([compose("front-left-out", camera=str(front), why=left_out[str(front)])])
     here = transformed(structure, structure.rig, scale.factor)
     here = transformed(here, in_guessed_frame(here.rig, front), 1.0)
     spread = uncertainty(here)
     cameras = (replace(camera, covariance=block) for camera, block in zip(here.rig, spread.blocks, strict=True))
-    warnings = [f"left out: {why}" for why in left_out.values()]
+    reasons = (compose("located", where=name, fault=why) for name, why in left_out.items())
+    warnings = [compose("left-out", what=reason) for reason in reasons]
     if scale.assumed:
-        warnings.append(f"the scale is {scale.told}; it is good to {HEAD_SHARE:.0%}")
+        warnings.append(compose("scale-good-to", scale=scale.told, share=HEAD_SHARE))
     warnings += [
-        f"{name} is known to {px:.1f} px at the subject only: add views beside it"
+        compose("pose-known-to", camera=name, px=px)
         for name, px in zip(here.rig.names, spread.pose_sigma_px, strict=True)
         if px > LOOSE_PX
     ]
     if spread.misfit > MISFIT_MOST:
-        warnings.append(
-            f"the lenses differ: one of each camera's own would explain the points {spread.misfit:.1f} times better "
-            "than chance, and covariances are widened by that; a fixed rig's lenses are better calibrated with a board"
-        )
+        warnings.append(compose("lenses-differ", times=spread.misfit))
     if len(here.rig) > CAMERAS_MOST:
-        warnings.append(f"{len(here.rig)} cameras joined; a capture may have {CAMERAS_MOST} at most")
+        warnings.append(compose("joined-too-many", cameras=len(here.rig), most=CAMERAS_MOST))
     return SceneCalibration(
         Rig(tuple(cameras)),
         here,

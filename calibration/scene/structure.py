@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from calibration.scene.matching import SEED, Matches, quiet
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -151,19 +152,14 @@ def _camera(name: str, image: Any, lens: Any) -> Camera:
     return Camera(name, intrinsics, RigidTransform(pose.rotation.matrix(), np.asarray(pose.translation)))
 
 
-def why_not(name: str, matches: Matches, joined: Collection[str]) -> str:
+def why_not(name: str, matches: Matches, joined: Collection[str]) -> Message:
     """Why a view did not join the others, and what to add."""
     features = matches.features[name]
     if features < FEATURES_LEAST:
-        return f"{name}: only {features} distinct points in it: dark, blurred or bare; light and focus it"
+        return compose("join-points-bare", points=features)
     others = {b if a == name else a: n for (a, b), n in matches.matched.items() if name in (a, b) and n}
     if not others:
-        return (
-            f"{name}: none of its {features} points is found in another view; add views between it and its neighbours"
-        )
+        return compose("join-points-alone", points=features)
     best = max(others, key=lambda other: others[other])
-    where = best if best in joined or not joined else f"{best}, which did not join either"
-    return (
-        f"{name}: at most {others[best]} points in common with another view ({where}), and too few with those that "
-        "joined; add one or two views between them, 10 to 15 degrees apart"
-    )
+    code = "join-points-few" if best in joined or not joined else "join-points-few-neither"
+    return compose(code, points=others[best], other=best)

@@ -2,6 +2,7 @@
 
 from calibration.quality.verdict import POSE_GOOD_PX, POSE_POOR_PX, Verdict
 from calibration.scene.result import SceneCalibration
+from rig.messages.message import Message, compose
 
 
 def judge_scene(calibration: SceneCalibration) -> Verdict:
@@ -11,11 +12,11 @@ def judge_scene(calibration: SceneCalibration) -> Verdict:
     loose = [name for name, px in sigma.items() if POSE_GOOD_PX < px <= POSE_POOR_PX]
     mild = [_loose(loose, POSE_GOOD_PX)] if loose else []
     if calibration.scale.assumed:
-        mild.append(f"the scale is {calibration.scale.told}")
-    mild += calibration.left_out.values()
+        mild.append(compose("scale-assumed", scale=calibration.scale.told))
+    mild += calibration.absences()
     severe = [_loose(poor, POSE_POOR_PX)] if poor else []
     return Verdict("poor" if severe else "usable" if mild else "good", (*severe, *mild))
 
 
-def _loose(names: list[str], pixels: float) -> str:
-    return f"{', '.join(names)}: pose looser than {pixels:.1f} px at the subject: add views beside it"
+def _loose(names: list[str], pixels: float) -> Message:
+    return compose("scene-pose-loose", cameras=names, px=pixels)

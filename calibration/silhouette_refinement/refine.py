@@ -34,6 +34,7 @@ from pipeline.fitting.problem import camera_information
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import Tangency, find_tangencies
 from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -55,10 +56,7 @@ class TooFewCaptures(EigenheadError):
     """Nothing would be left to refine from."""
 
     def __init__(self, captures: int) -> None:
-        super().__init__(
-            f"silhouette refinement got {captures} captures, of which some are held out as a check: "
-            "take at least 2, better 5, of different subjects or head poses"
-        )
+        super().__init__(compose("refinement-too-few-captures", count=captures))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +86,7 @@ class Refinement:
     after_px: float
     noise_px: float
     kept: bool
-    reason: str
+    reason: Message
     change_px: Mapping[str, float]
 
 
@@ -125,11 +123,13 @@ def refine(
     gain, deviation = gain_of(before.px, after.px, noise)
     before_px, after_px = robust_rms(before.px, noise), robust_rms(after.px, noise)
     kept = gain > GAIN_SIGMAS * deviation
-    words = "shrink" if kept else "do not shrink"
-    reason = (
-        f"tangency residuals of the {len(captures)} captures, each held out in its turn, {words}: "
-        f"{before_px:.2f} to {after_px:.2f} px over {len(after.px)} equations, "
-        f"{gain / max(deviation, 1e-9):.1f} standard deviations"
+    reason = compose(
+        "refinement-captures-shrink" if kept else "refinement-captures-stay",
+        captures=len(captures),
+        before_px=before_px,
+        after_px=after_px,
+        equations=len(after.px),
+        sigmas=gain / max(deviation, 1e-9),
     )
     return Refinement(
         rig=proposed if kept else rig,

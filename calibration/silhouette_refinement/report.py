@@ -11,6 +11,7 @@ from calibration.report import STYLE, listed, table
 from calibration.silhouette_refinement.refine import Refinement, robust_rms
 from rig.formats.cameras_json import CamerasDocument, document_from_rig
 from rig.geometry import vector_from_rotation
+from rig.messages.message import Message, MessageDocument, documents_of, texts_of
 from rig.rig import Rig
 
 BINS, HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 24, 420.0, 160.0
@@ -40,10 +41,12 @@ class RefinementDocument(TypedDict):
 
     kept: bool
     reason: str
+    reason_message: MessageDocument
     captures: list[str]
     held_out: HeldOut
     cameras: dict[str, RefinedCamera]
     warnings: list[str]
+    warning_messages: list[MessageDocument]
     rig: CamerasDocument
 
 
@@ -54,14 +57,15 @@ class RefinementRun:
     refinement: Refinement
     start: Rig
     captures: tuple[str, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
 
     def document(self) -> RefinementDocument:
         """What ``refine --json`` prints."""
         found = self.refinement
         return {
             "kept": found.kept,
-            "reason": found.reason,
+            "reason": found.reason.text,
+            "reason_message": found.reason.document(),
             "captures": list(self.captures),
             "held_out": {
                 "before_px": found.before_px,
@@ -70,7 +74,8 @@ class RefinementRun:
                 "equations": len(found.after.px),
             },
             "cameras": {name: _camera(self, name) for name in self.start.names},
-            "warnings": list(self.warnings),
+            "warnings": texts_of(self.warnings),
+            "warning_messages": documents_of(self.warnings),
             "rig": document_from_rig(found.rig),
         }
 
@@ -101,7 +106,7 @@ def refinement_page(run: RefinementRun) -> str:
     parts = [
         "<!doctype html><html lang='en'><meta charset='utf-8'><title>Silhouette refinement</title>",
         f"<style>{STYLE}</style><h1>Silhouette refinement</h1>",
-        f"<p>The change is <b class='{kind}'>{verdict}</b>: {escape(found.reason)}.</p>",
+        f"<p>The change is <b class='{kind}'>{verdict}</b>: {escape(found.reason.text)}.</p>",
         f"<p>Captures: {escape(', '.join(run.captures))}. Each was judged with the cameras where the others alone put "
         "them.</p>",
         listed("Warnings", run.warnings),

@@ -22,6 +22,7 @@ from calibration.silhouette_refinement.refine import (
     robust_rms,
 )
 from pipeline.imaging.silhouette import Silhouette
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 VIEWS_LEAST = 8  # 28 pairs: fewer leave a camera without pairs of its own once a fifth is held out
@@ -36,7 +37,7 @@ class SingleRefinement:
     proposed: Rig
     kept: bool
     change_px: float
-    reason: str
+    reason: Message
 
 
 def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement | None:
@@ -55,10 +56,12 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
     noise = noise_of(after)
     gain, deviation = gain_of(before, after, noise)
     kept = gain > GAIN_SIGMAS * deviation
-    reason = (
-        f"tangency residuals of pairs of cameras, each held out in its turn, {'shrink' if kept else 'do not shrink'}: "
-        f"{robust_rms(before, noise):.2f} to {robust_rms(after, noise):.2f} px over {len(after)} equations, "
-        f"{gain / max(deviation, 1e-9):.1f} standard deviations"
+    reason = compose(
+        "refinement-pairs-shrink" if kept else "refinement-pairs-stay",
+        before_px=robust_rms(before, noise),
+        after_px=robust_rms(after, noise),
+        equations=len(after),
+        sigmas=gain / max(deviation, 1e-9),
     )
     change_px = float(np.median(image_distance(proposed, rig)))
     return SingleRefinement(proposed if kept else rig, proposed, kept, change_px, reason)

@@ -13,6 +13,7 @@ from scipy.special import chdtri
 
 from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, rays_of, triangulate
 from rig.capture import Features
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point in 10,000 is lost without need
@@ -23,7 +24,7 @@ class LocatedFeatures:
     """World points by landmark name, and a sentence for everything that was left out."""
 
     points: Mapping[str, TriangulatedPoint]
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Message, ...] = ()
 
 
 def locate_features(features: Features, rig: Rig, *, noise_px: float) -> LocatedFeatures:
@@ -32,18 +33,18 @@ def locate_features(features: Features, rig: Rig, *, noise_px: float) -> Located
     for name, pixels in features.items():
         known = {camera: pixel for camera, pixel in pixels.items() if camera in rig}
         if len(known) < 2:
-            remarks.append(f"feature {name} is picked in {len(known)} view, two are needed: left out")
+            remarks.append(compose("feature-view-missing", name=name, count=len(known)))
             continue
         try:
             point, dropped = _consistent(known, rig, noise_px)
         except NoPoint as error:
-            remarks.append(f"feature {name} is left out: {error}")
+            remarks.append(compose("feature-left-out", name=name, reason=error.message))
             continue
         if point is None:
-            remarks.append(f"feature {name} is left out: its views contradict each other")
+            remarks.append(compose("feature-contradictory", name=name))
             continue
         if dropped is not None:
-            remarks.append(f"feature {name} in {dropped} contradicts the other views: that view is left out")
+            remarks.append(compose("feature-view-contradicts", name=name, camera=dropped))
         points[name] = point
     return LocatedFeatures(points, tuple(remarks))
 

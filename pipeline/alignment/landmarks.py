@@ -26,6 +26,7 @@ from pipeline.settings import AlignmentSettings
 from rig.capture import Features
 from rig.errors import EigenheadError
 from rig.geometry import RigidTransform, Similarity
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 POINTS_LEAST = 3
@@ -36,14 +37,15 @@ OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points
 class TooFewFeatures(EigenheadError):
     """Feature points that determine no alignment."""
 
-    def __init__(self, usable: Mapping[str, TriangulatedPoint], why: str, remarks: tuple[str, ...]) -> None:
-        counts = ", ".join(f"{name} in {len(point.residuals_px)} views" for name, point in usable.items()) or "none"
-        told = "".join(f"; {remark}" for remark in remarks)
-        super().__init__(
-            f"the feature points determine no alignment: {why}. At least {POINTS_LEAST} landmarks of the model "
-            f"that are not on a line are needed, each in 2 views; usable are: {counts}{told}. Pick more points, "
-            "or remove features.json to let the silhouettes decide"
-        )
+    def __init__(self, usable: Mapping[str, TriangulatedPoint], why: Message, remarks: tuple[Message, ...]) -> None:
+        counts = [compose("landmark-views", name=n, views=len(point.residuals_px)) for n, point in usable.items()]
+        usable_told = counts or compose("nothing-usable")
+        if remarks:
+            super().__init__(
+                compose("too-few-features-remarks", why=why, needed=POINTS_LEAST, usable=usable_told, remarks=remarks)
+            )
+        else:
+            super().__init__(compose("too-few-features", why=why, needed=POINTS_LEAST, usable=usable_told))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +60,7 @@ class FeatureAlignment:
     points: Mapping[str, TriangulatedPoint]
     residuals_mm: Mapping[str, float]
     used: Mapping[str, bool]
-    remarks: tuple[str, ...]
+    remarks: tuple[Message, ...]
 
 
 def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> Similarity:
@@ -70,12 +72,14 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     """Alignment to picked points: outliers found, eq. (3) minimised, then weighed. Raises TooFewFeatures."""
     located = locate_features(features, rig, noise_px=settings.feature_noise_px)
     unknown = [
-        f"feature {name} is no landmark of model {model.name}" for name in located.points if name not in model.landmarks
+        compose("feature-not-of-model", name=name, model=model.name)
+        for name in located.points
+        if name not in model.landmarks
     ]
     points = {name: point for name, point in located.points.items() if name in model.landmarks}
     remarks = (*located.remarks, *unknown)
     if len(points) < POINTS_LEAST:
-        raise TooFewFeatures(points, f"{len(points)} points are usable", remarks)
+        raise TooFewFeatures(points, compose("points-usable", count=len(points)), remarks)
     names = list(points)
     target = np.stack([point.position_world for point in points.values()])
     source, spread = landmark_statistics(model, names, settings.landmark_noise_mm)
@@ -83,7 +87,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     expected = np.sqrt((_own_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
     kept = consensus(source, target, expected)
     if kept is None:
-        raise TooFewFeatures(points, "they lie on one line", remarks)
+        raise TooFewFeatures(points, compose("points-on-line"), remarks)
     procrustes_only = procrustes(source[kept], target[kept])
     rows = np.flatnonzero(np.repeat(kept, 3))
     aligned = generalised_procrustes(
@@ -91,7 +95,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     )
     distances = np.linalg.norm(target - aligned.apply(source), axis=1)
     remarks += tuple(
-        f"feature {name} lies {distance:.0f} mm off what the other points say: left out"
+        compose("feature-off", name=name, distance_mm=distance)
         for name, distance, keep in zip(names, distances, kept, strict=True)
         if not keep
     )

@@ -28,6 +28,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import Settings
 from rig.errors import EigenheadError
 from rig.geometry import Similarity, nearest_rotation, rotation_from_vector
+from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -55,10 +56,7 @@ class NoSubject(EigenheadError):
     """The silhouettes have no common volume near the middle of the rig."""
 
     def __init__(self) -> None:
-        super().__init__(
-            "the silhouettes do not meet in the middle of the rig: check that the calibration belongs to these images "
-            "and that cameras are not swapped, or give feature points"
-        )
+        super().__init__(compose("no-subject"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from pipeline.eigenheads.model import HeadModel
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.fitting.fit import Fit
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 
 COEFFICIENT_MOST = 4.6  # standard deviations of the largest; the same rig scaled by 0.88 gives 4.6, by 1.12 gives 6.8
 CHANCE_LEAST = 1e-9  # of a sum of squares this large; a posterior mean is shrunk, so that good heads stay far below
@@ -41,7 +42,8 @@ class ImplausibleResult(EigenheadError):
     """A result with warnings that the settings do not let pass."""
 
     def __init__(self, warnings: Sequence[ReportWarning]) -> None:
-        super().__init__("; ".join(f"{w.code}: {w.message}" for w in warnings) + " (settings.fail_on)")
+        told = [compose("warning-of-code", warning=warning.code, text=warning) for warning in warnings]
+        super().__init__(compose("result-refused", warnings=told))
 
 
 def plausibility_warnings(
@@ -62,7 +64,7 @@ def plausibility_warnings(
     ]
 
 
-def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mapping[str, float]) -> str | None:
+def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mapping[str, float]) -> ReportWarning | None:
     """Says that a head explains hardly any outline, whichever view is asked; None where it does.
 
     Args:
@@ -77,11 +79,8 @@ def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mappin
     if np.median(shares) < UNEXPLAINED_SHARE or np.median(misses_mm) < UNEXPLAINED_MM:
         return None
     poor = sum(share >= UNEXPLAINED_SHARE for share in shares)
-    return (
-        f"the fitted head explains hardly any outline: in {poor} of {len(shares)} views its contour lies "
-        f"{np.median(misses_mm):.0f} mm (median) from the subject's. Check that cameras and masks are of these "
-        "pictures and to scale, name the camera that the subject faces (--front), or give feature points"
-    )
+    off_mm = np.median(misses_mm)
+    return compose("outlines-unexplained", poor=poor, views=len(shares), off_mm=off_mm)
 
 
 def refuse(warnings: Iterable[ReportWarning], fail_on: Sequence[str]) -> None:
@@ -99,21 +98,15 @@ def _shape(coefficients: Float[np.ndarray, " m"]) -> list[ReportWarning]:
     total = float(coefficients @ coefficients)
     if largest <= COEFFICIENT_MOST and float(chdtrc(len(coefficients), total)) >= CHANCE_LEAST:
         return []
-    told = (
-        f"the head is farther from the model's mean than heads are: {largest:.1f} standard deviations in one mode, "
-        f"{np.sqrt(total / len(coefficients)):.2f} RMS. Look at the overlays; check calibration and masks"
-    )
-    return [ReportWarning("shape-implausible", told)]
+    told = compose("shape-implausible", largest=largest, rms=np.sqrt(total / len(coefficients)))
+    return [told]
 
 
 def _scale(scale: float) -> list[ReportWarning]:
     if abs(float(np.log(scale))) <= SCALE_OFF_MOST:
         return []
-    told = (
-        f"the head came out at {scale:.3f} of the size that its shape says: "
-        "check the board's square size and the unit of the translations"
-    )
-    return [ReportWarning("scale-implausible", told)]
+    told = compose("scale-implausible", finding=compose("head-scale-off", scale=scale))
+    return [told]
 
 
 def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
@@ -139,12 +132,8 @@ def size_by_mode(model: HeadModel) -> Float[np.ndarray, " m"]:
 def _size(size: float, sigmas: float) -> list[ReportWarning]:
     if abs(sigmas) <= SIZE_MOST:
         return []
-    told = (
-        f"the face is {size:.2f} times as large as a mean one ({abs(sigmas):.1f} standard deviations; of adults one in "
-        "300 is that far off): where it is no child's, compare a measurement with a tape, and check the board's square "
-        "size and the unit of the translations"
-    )
-    return [ReportWarning("size-unusual", told)]
+    told = compose("size-unusual", size=size, sigmas=abs(sigmas))
+    return [told]
 
 
 def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]) -> list[ReportWarning]:
@@ -157,10 +146,7 @@ def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
     median = float(np.median([rms[name] / widths_px[name] for name in rms]))
     limit = max(OUTSIDE_MOST_PX_PER_WIDTH, OUTSIDE_TIMES_MEDIAN * median)
     return [
-        ReportWarning(
-            "contour-implausible",
-            f"{name}: the head reaches {of:.0f} px (RMS) beyond its outline: look at overlays/{name}.png",
-        )
+        compose("contour-implausible", camera=name, outside_px=of)
         for name, of in rms.items()
         if of / widths_px[name] > limit
     ]

@@ -18,6 +18,7 @@ from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.subject import SubjectFaces
 from rig.geometry import Similarity
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from rig.rig import Rig
 
 ELSEWHERE = 0.12  # of the face's size in the picture, RMS over its points; of a right head 0.01 to 0.04
@@ -25,6 +26,7 @@ MIN_FACING = 0.5  # cosine: a camera that sees the head so far from the front mu
 MIN_VIEWS = 2
 ONE_SIDED = 0.95  # length of the cameras' mean direction: 0.98 for three within 12 degrees, 0.6 for the usual rig;
 # in three-brows a pose that nods by 30 degrees beat all others by 75 %
+NAMED_MOST = 4  # cameras of a warning
 RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best is not beaten
 
 
@@ -66,23 +68,14 @@ def judge_pose(
         off = landmark_offsets(subject, places, head_world, world_from_head, rig)
         elsewhere = [name for name, share in off.items() if share > ELSEWHERE]
         if len(elsewhere) >= MIN_VIEWS and 2 * len(elsewhere) > len(off):
-            warnings.append(ReportWarning("face-elsewhere", _elsewhere(elsewhere, off)))
+            warnings.append(_elsewhere(elsewhere, off))
         facing = cameras_in_front(world_from_head, rig)
         if not off and len(facing) >= MIN_VIEWS:
-            warnings.append(ReportWarning("no-face", _no_face(len(facing))))
-    unbeaten = rival is not None and rival < RIVAL_MARGIN
-    if unbeaten:
-        text = (
-            f"another pose explains the outlines almost as well (its cost is {rival:.1%} higher): look at the "
-            "overlays; give feature points, --front or more views"
-        )
-        warnings.append(ReportWarning("pose-doubtful", text))
+            warnings.append(compose("no-face", views=len(facing)))
+    if rival is not None and rival < RIVAL_MARGIN:
+        warnings.append(compose("pose-doubtful", finding=compose("pose-rival", share=rival)))
     if method == "silhouettes" and fan_strength(rig) > ONE_SIDED:
-        text = (
-            "no face was found, and the cameras look from nearly one side: outlines hardly tell how the head nods: "
-            "give feature points, or views from the side"
-        )
-        warnings.append(ReportWarning("pose-doubtful", text))
+        warnings.append(compose("pose-doubtful", finding=compose("pose-one-sided")))
     doubtful = bool(warnings)
     return PoseEvidence(method, off, rival, doubtful), warnings
 
@@ -123,17 +116,8 @@ def _offset(pixels: Float[np.ndarray, "n 2"], found: Float[np.ndarray, "n 2"], s
     return float(np.sqrt(((pixels - found) ** 2).sum(axis=1).mean()) / size_px)
 
 
-def _elsewhere(names: list[str], off: Mapping[str, float]) -> str:
-    where = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+def _elsewhere(names: list[str], off: Mapping[str, float]) -> ReportWarning:
     worst = max(min(off[name], 10.0) for name in names)
-    return (
-        f"the head's face is not where the photographs show one: in {where} it lies up to {worst:.1f} face sizes away. "
-        "Do not use this head: give feature points or --front, and check calibration and masks"
-    )
-
-
-def _no_face(views: int) -> str:
-    return (
-        f"no face was found in the photographs, though {views} cameras stand before the head as it was fitted: its "
-        "pose comes from outlines alone. Look at the overlays; give feature points or --front where it is wrong"
-    )
+    more = len(names) - NAMED_MOST
+    where = compose("names-and-more", names=names[:NAMED_MOST], more=more) if more > 0 else names
+    return compose("face-elsewhere", cameras=where, sizes=worst)

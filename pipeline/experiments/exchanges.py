@@ -114,7 +114,7 @@ def _exchanged_row(
             continue
         same = all(_same(good.silhouettes[name], found.silhouettes[name]) for name in rig.names)
         ratio = 1.0 if same else _error_mm(model, subject, found.silhouettes, rig) / base_mm
-        told = [warning.message for warning in found.warnings]
+        told = [warning.text for warning in found.warnings]
         named = _is_named(kind, filed, found)
         row[kind] = {"filed": filed, "named": named, "repaired": ratio <= WORST_RATIO, "ratio": ratio, "told": told}
         row[kind]["lost_view_only"] = _only_lost(good.silhouettes, found.silhouettes, filed)
@@ -158,7 +158,7 @@ def _is_named(kind: str, filed: Mapping[str, str], found: OwnPictures) -> bool:
     """Whether the cameras of an exchange are named, and no others; of a duplicate, the one that lost its picture."""
     if kind == "duplicate":
         (lost,) = filed
-        texts = [warning.message for warning in found.warnings if warning.code == "picture-duplicated"]
+        texts = [warning.text for warning in found.warnings if warning.code == "picture-duplicated"]
         return len(texts) == 1 and texts[0].startswith(f"{lost} ")
     return dict(found.pictures) == {picture: holder for holder, picture in filed.items()}
 

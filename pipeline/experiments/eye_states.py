@@ -87,7 +87,7 @@ def closed_sides(number: int) -> frozenset[str]:
 
 def told_sides(warnings: Sequence[ReportWarning]) -> frozenset[str]:
     """Returns the eyes that ``eyes-closed`` names; both where it names none."""
-    told = [warning.message for warning in warnings if warning.code == "eyes-closed"]
+    told = [warning.text for warning in warnings if warning.code == "eyes-closed"]
     return frozenset(side for side in SIDES for text in told if side in text or not any(s in text for s in SIDES))
 
 

@@ -223,7 +223,7 @@ def _texture(head: Reconstruction) -> Image:
 def albedo_of(head: Reconstruction) -> Albedo:
     """Raises EigenheadError where there is none."""
     if head.texturing.albedo is None:
-        raise EigenheadError("a capture of the studio has no albedo: " + "; ".join(w.message for w in head.warnings))
+        raise EigenheadError("a capture of the studio has no albedo: " + "; ".join(w.text for w in head.warnings))
     return head.texturing.albedo
 
 

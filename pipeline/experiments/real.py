@@ -110,7 +110,7 @@ def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings:
         "seconds": seconds,
         "outline_px_of": outline,
         "psnr_db_of": psnr,
-        "warnings": [f"{told.code}: {told.message}" for told in done.warnings],
+        "warnings": [f"{told.code}: {told.text}" for told in done.warnings],
     }
 
 

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.special import ndtri
 
+from rig.messages.message import Message
+
 CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a bend of radius r shifts by 1 / (2 r)
 
 
@@ -21,9 +23,9 @@ class ViewQuality:
     cut_off: tuple[str, ...] = ()  # image borders that the subject crosses
     components: int = 1
     holes: int = 0
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     figures: Mapping[str, float | list[float]] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Message, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

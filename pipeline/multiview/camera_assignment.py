@@ -27,6 +27,7 @@ from pipeline.multiview.tangency import (
     rays_about,
 )
 from rig.camera import Camera
+from rig.messages.message import Message, compose, texts_of
 from rig.rig import Rig
 
 NOISE_LEAST_PX, NOISE_MOST_PX = 0.5, 1.5  # of one tangency: what masks leave, and what exchanges may not hide in
@@ -58,8 +59,12 @@ class Assignment:
     gain: float = 0.0
     overwhelming: bool = False
 
+    def messages(self) -> list[Message]:
+        """Returns a sentence for every ring of the exchange."""
+        return ring_messages(self.pictures, compose("what-pictures"))
+
     def __str__(self) -> str:
-        return "; ".join(ring_texts(self.pictures, "pictures"))
+        return "; ".join(texts_of(self.messages()))
 
 
 NOTHING = Assignment({})
@@ -108,17 +113,20 @@ def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
     return found
 
 
-def ring_texts(pictures: Mapping[str, str], what: str) -> list[str]:
-    """A sentence for every ring of an exchange."""
-    return [_ring_text(ring, what) for ring in rings(pictures)]
+def ring_messages(pictures: Mapping[str, str], what: Message) -> list[Message]:
+    """Returns a sentence for every ring of an exchange."""
+    return [_ring_message(ring, what) for ring in rings(pictures)]
 
 
-def _ring_text(ring: tuple[str, ...], what: str) -> str:
-    told = f"{', '.join(ring[:-1])} and {ring[-1]} hold each other's {what}"
+def _ring_message(ring: tuple[str, ...], what: Message) -> Message:
+    names, last = ring[:-1], ring[-1]
     if len(ring) == 2:
-        return told
-    filed = [f"{name}'s {what} under {ring[(k + 1) % len(ring)]}" for k, name in enumerate(ring)]
-    return f"{told} ({', '.join(filed)})"
+        return compose("exchanged-pair", names=names, last=last, what=what)
+    filed = [
+        compose("filed-under", owner=name, what=what, name=ring[(k + 1) % len(ring)]).text
+        for k, name in enumerate(ring)
+    ]
+    return compose("exchanged-ring", names=names, last=last, what=what, filed=filed)
 
 
 def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:

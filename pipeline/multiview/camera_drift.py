@@ -28,6 +28,7 @@ from pipeline.estimation.terms import Problem, Quadratic, Residuals
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import Tangency, find_tangencies
 from rig.camera import Camera
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 INSET_MM = 2.2  # four pixels of the usual rig: a strand under a mask that is 2 px loose is 5 px wide
@@ -62,17 +63,18 @@ class Drift:
         """Of the warning that says it."""
         return "camera-moved" if self.moved else "mask-loose"
 
-    def __str__(self) -> str:
-        told = f"by {np.linalg.norm(self.shift_px):.1f} px in its image (a turn of {self.turn_deg:.2f} degrees"
-        if self.moved:
-            return (
-                f"{self.camera} has moved {told}, {self.sigmas:.0f} standard deviations) and is left out: "
-                "fasten it and calibrate again"
-            )
-        return (
-            f"{self.camera}: the mask is loose, or the camera moved {told}); the view is kept: "
-            "look at its overlay, and fasten the camera and calibrate again if the mask is tight"
+    def warning(self) -> Message:
+        """Returns what a report says of it."""
+        shift_px = float(np.linalg.norm(self.shift_px))
+        if not self.moved:
+            return compose("mask-loose", camera=self.camera, shift_px=shift_px, turn_deg=self.turn_deg)
+        shifted = compose(
+            "camera-shifted", camera=self.camera, shift_px=shift_px, turn_deg=self.turn_deg, sigmas=self.sigmas
         )
+        return compose("camera-moved", finding=shifted)
+
+    def __str__(self) -> str:
+        return self.warning().text
 
 
 def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, ...]:

@@ -18,15 +18,12 @@ from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera
 from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 HEAD_MM = 200.0  # median diameter of 32 heads with hair, 18 captures of the studio and 5 of a path tracer (174 to 230)
 WARNED_MM = (145.0, 270.0)  # bald heads of adults have 161 and more, hair 40 mm thick 245 at most
 REFUSED_MM = (122.0, 350.0)  # a bald child of three has 130, hair 60 mm thick 310 at most; twice a bald head has 322
-REMEDY = (
-    "give a known length (scale.json beside the cameras), or check the board's square size and the unit of the "
-    "translations"
-)
 STRAND_SHARE = 0.06  # of a mask's size (root of its area): a centimetre of a head, which loose strands do not fill
 VIEWS_LEAST = 3  # whose crown is in the picture
 
@@ -60,7 +57,8 @@ class WrongScale(EigenheadError):
     """Outlines of a head that no head has the size of: the unit of the cameras is not millimetres."""
 
     def __init__(self, diameter_mm: float) -> None:
-        super().__init__(f"{_size_text(diameter_mm)}: {REMEDY}")
+        told = compose("size-refused", size=_size_told(diameter_mm), remedy=compose("advice-known-length"))
+        super().__init__(told)
 
 
 def judge_head_size(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[ReportWarning]:
@@ -71,15 +69,20 @@ def judge_head_size(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Rep
     if not REFUSED_MM[0] < diameter < REFUSED_MM[1]:
         raise WrongScale(diameter)
     if not WARNED_MM[0] < diameter < WARNED_MM[1]:
-        unless = "much hair or a hat" if diameter > HEAD_MM else "a small child"
-        return [ReportWarning("scale-implausible", f"{_size_text(diameter)}: where it is not {unless}, {REMEDY}")]
+        return [compose("scale-implausible", finding=_outline_size(diameter))]
     return []
 
 
-def _size_text(diameter_mm: float) -> str:
+def _outline_size(diameter_mm: float) -> Message:
+    unless = compose("much-hair") if diameter_mm > HEAD_MM else compose("small-child")
+    remedy = compose("advice-known-length")
+    return compose("outline-size", size=_size_told(diameter_mm), unless=unless, remedy=remedy)
+
+
+def _size_told(diameter_mm: float) -> Message:
     factor = diameter_mm / HEAD_MM
     ratio = f"{factor:.1f}" if factor >= 0.95 else f"{factor:.2f}"
-    return f"the head in the outlines is about {ratio} times as large as a head ({diameter_mm:.0f} mm across)"
+    return compose("head-times-as-large", ratio=ratio, diameter_mm=diameter_mm)
 
 
 def crown_disc(mask: Bool[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, " 2"], float] | None:

@@ -21,6 +21,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, own_misses, with_masks
 from pipeline.multiview.tangency import outer_hull
 from rig.camera import Intrinsics
+from rig.messages.message import Message, compose
 from rig.plausibility import readings as other_conventions
 from rig.rig import Rig
 
@@ -39,7 +40,7 @@ Pixels = Float[np.ndarray, "_ 2"]
 Turn = Callable[[Pixels, Intrinsics], Pixels]
 
 
-def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
+def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
     """What is wrong with cameras and pictures as wholes, with the remedy; None where most cameras agree.
 
     Args:
@@ -56,11 +57,12 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
     readings = (*_READINGS, *(_SQUARE_READINGS if square else ()))
     found = [(_median_misfit(_read(hulls, seen, turn), seen), told) for told, turn in readings]
     for other, read, remedy in other_conventions(seen):
-        found.append((_median_misfit(hulls, read), _CONVENTION.format(other, remedy)))
+        told = compose("other-convention", convention=other, remedy=remedy)
+        found.append((_median_misfit(hulls, read), told))
     believed = [(misfit, told) for misfit, told in found if misfit <= RIGHT_MOST]
     if believed:
-        return min(believed)[1]
-    return None if _are_loose(hulls, seen) else OTHER_RIG
+        return min(believed, key=lambda one: one[0])[1]
+    return None if _are_loose(hulls, seen) else compose("other-rig")
 
 
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
@@ -133,31 +135,13 @@ def _turned_on(pixels: Pixels, k: Intrinsics) -> Pixels:
     return np.stack([pixels[:, 1], k.width - 1.0 - pixels[:, 0]], axis=1)
 
 
-OTHER_RIG = (
-    "the outlines contradict these cameras, whichever picture belongs to whom and however they are turned: "
-    "cameras.json is of another rig, or of this one before it was rearranged; give this rig's own, or calibrate it "
-    "again"
+_READINGS: tuple[tuple[Message, Turn], ...] = (
+    (compose("rig-mirrored"), _mirrored_across),
+    (compose("rig-mirrored"), _mirrored_down),
+    (compose("pictures-flipped"), _flipped_across),
+    (compose("pictures-turned", turn=compose("turn-180")), _turned_round),
 )
-_CONVENTION = "camera_from_world holds {}: the outlines agree once it is read so; {}"
-_MIRRORED = (
-    "the rig is mirrored: the outlines agree once its poses are reflected. cameras.json was written in a left-handed "
-    "world or with one axis negated; write it right-handed (x right, y down, z forward in each camera)"
-)
-_FLIPPED = (
-    "the pictures are flipped left to right against the calibration: the outlines agree once they are flipped back; "
-    "switch the mirror image off in the cameras"
-)
-_TURNED = (
-    "the pictures are turned by {} against the calibration: the outlines agree once they are turned back; turn them, "
-    "or calibrate with pictures that are turned alike"
-)
-_READINGS: tuple[tuple[str, Turn], ...] = (
-    (_MIRRORED, _mirrored_across),
-    (_MIRRORED, _mirrored_down),
-    (_FLIPPED, _flipped_across),
-    (_TURNED.format("180 degrees"), _turned_round),
-)
-_SQUARE_READINGS: tuple[tuple[str, Turn], ...] = (
-    (_TURNED.format("90 degrees anticlockwise"), _turned_back),
-    (_TURNED.format("90 degrees clockwise"), _turned_on),
+_SQUARE_READINGS: tuple[tuple[Message, Turn], ...] = (
+    (compose("pictures-turned", turn=compose("turn-90-anticlockwise")), _turned_back),
+    (compose("pictures-turned", turn=compose("turn-90-clockwise")), _turned_on),
 )

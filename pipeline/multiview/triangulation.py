@@ -14,6 +14,7 @@ from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.terms import Problem, Residuals
 from rig.camera import Camera, CameraStack
 from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 LIMITS = Limits(steps=50, tolerance=1e-12, tries=6)  # a step of 1e-6 standard deviations
@@ -25,8 +26,8 @@ RAYS_APART_LEAST = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1
 class NoPoint(EigenheadError):
     """Pixels that determine no point."""
 
-    def __init__(self, why: str) -> None:
-        super().__init__(f"{why}; pick the point again, in views that look from clearly different sides")
+    def __init__(self, why: Message) -> None:
+        super().__init__(compose("point-refused", reason=why))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,14 +73,14 @@ def triangulate(
     Raises NoPoint where fewer than two views, parallel rays or a point behind a camera leave nothing to determine.
     """
     if len(pixels) < 2:
-        raise NoPoint(f"{len(pixels)} view of a point; two at least are needed")
+        raise NoPoint(compose("point-in-few-views", count=len(pixels)))
     picked = np.array([np.asarray(pixel, float) for pixel in pixels.values()])
     term = ReprojectionTerm(picked, CameraStack.of([rig[name] for name in pixels]), noise_px)
     problem = Problem((term,), 3, np.add)
     start = _start(rays_of(pixels, rig) if rays_world is None else {name: rays_world[name] for name in pixels}, rig)
     at_start = problem.at(start)
     if not np.isfinite(at_start.cost):
-        raise NoPoint("the rays of a point meet behind a camera")
+        raise NoPoint(compose("point-behind-camera"))
     found = minimise(problem, start, LIMITS, at_start=at_start)
     miss_px = -noise_px * term.at(found.value).residual
     covariance = np.linalg.inv(problem.equations(found.at).matrix)
@@ -121,7 +122,7 @@ def triangulate_many(
     weights = 1.0 / noise_px[..., None]
     at_points = _whitened(points, pixels, cameras, weights)
     if not np.isfinite(at_points[0]).all():
-        raise NoPoint("the rays of a point meet behind a camera")
+        raise NoPoint(compose("point-behind-camera"))
     for _ in range(STEPS):
         residual, slopes = at_points
         matrix = np.einsum("vnki,vnkj->nij", slopes, slopes)
@@ -150,13 +151,13 @@ def _nearest_to_rays(
     rays_world = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
     centres_world = np.stack([camera.centre_world for camera in cameras])
     if not np.isfinite(rays_world).all():
-        raise NoPoint("a pixel lies where the lens model of its camera sees nothing")
+        raise NoPoint(compose("point-outside-lens"))
     weights = 1.0 / noise**2
     weights = weights / weights.sum(axis=0)
     off_rays = np.eye(3) - rays_world[..., :, None] * rays_world[..., None, :]
     normal = np.einsum("vn,vnij->nij", weights, off_rays)
     if np.linalg.eigvalsh(normal)[:, 0].min() < RAYS_APART_LEAST**2:
-        raise NoPoint("the rays of a point are parallel")
+        raise NoPoint(compose("point-rays-parallel"))
     right = np.einsum("vn,vnij,vj->ni", weights, off_rays, centres_world)
     return np.linalg.solve(normal, right[..., None])[..., 0]
 
@@ -183,8 +184,8 @@ def _start(rays_world: Mapping[str, Float[np.ndarray, " 3"]], rig: Rig) -> Float
         normal += off_ray
         right += off_ray @ rig[name].centre_world
     if not np.isfinite(normal).all():
-        raise NoPoint("a pixel lies where the lens model of its camera sees nothing")
+        raise NoPoint(compose("point-outside-lens"))
     # The smallest eigenvalue is the sum of squared sines between the rays and their mean direction.
     if np.linalg.eigvalsh(normal)[0] < RAYS_APART_LEAST**2:
-        raise NoPoint("the rays of a point are parallel")
+        raise NoPoint(compose("point-rays-parallel"))
     return np.linalg.solve(normal, right)

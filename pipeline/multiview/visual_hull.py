@@ -19,6 +19,7 @@ from pipeline.multiview.visual_hull_kernels import COARSE, carve_view, mark_occu
 from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from rig.rig import Rig
 
 SPACING_MM = 3.0
@@ -29,9 +30,7 @@ class NoHull(EigenheadError):
     """The silhouettes have no common body."""
 
     def __init__(self) -> None:
-        super().__init__(
-            "the silhouettes have no body in common: cameras.json does not belong to these images, or a mask is wrong"
-        )
+        super().__init__(compose("no-common-hull"))
 
 
 def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:

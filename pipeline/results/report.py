@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.dense.part_votes import PART_NAMES
-from pipeline.diagnostics import ReportWarning
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import Found, Posable
 from pipeline.evidence.pose import PoseEvidence
@@ -30,7 +29,6 @@ from pipeline.results.report_types import (
     TemplateReport,
     TextureReport,
     ViewReport,
-    WarningReport,
 )
 from pipeline.settings import document_from_settings
 from pipeline.stages.bust import Bust
@@ -41,6 +39,7 @@ from pipeline.texture.chart_colours import ChartColours
 from pipeline.texture.light import HARMONICS, Light
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
+from rig.messages.message import documents_of, texts_of
 
 ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 1 in each channel"
 
@@ -56,7 +55,11 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "version": version("eigenhead"),
         "model": {"name": result.model_name, "sha256": result.model_sha256},
         "method": head.fit.method,
-        "detail": {"level": refined.detail.level, "reason": refined.detail.reason},
+        "detail": {
+            "level": refined.detail.level,
+            "reason": refined.detail.reason.text,
+            "reason_message": refined.detail.reason.document(),
+        },
         "front": result.alignment.front,
         "pose": _pose(result.pose),
         "faces": {} if result.faces.subject is None else _faces(result.faces.subject, evidence.cameras),
@@ -86,7 +89,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "seconds": {"total": sum(result.seconds.values())} | dict(result.seconds),
         "settings": document_from_settings(result.settings),
         "inputs": dict(result.digests),
-        "warnings": [_warning(warning) for warning in result.warnings],
+        "warnings": documents_of(result.warnings),
     }
 
 
@@ -139,7 +142,8 @@ def _view(quality: ViewQuality) -> ViewReport:
         "cut_off": list(quality.cut_off),
         "components": quality.components,
         "holes": quality.holes,
-        "warnings": list(quality.warnings),
+        "warnings": texts_of(quality.warnings),
+        "warning_messages": documents_of(quality.warnings),
         "figures": _plain(quality.figures),
     }
 
@@ -221,10 +225,6 @@ def _bust(bust: Bust) -> BustReport:
         "quality": {"median_seen": _finite(median), "max": _finite(surface.deviation_mm.max())},
         "filled": int(np.count_nonzero(bust.views == 0)),
     }
-
-
-def _warning(warning: ReportWarning) -> WarningReport:
-    return {"code": warning.code, "message": warning.message}
 
 
 def _finite(value: float | np.floating | None) -> float | None:

@@ -1,6 +1,8 @@
 """The types of ``report.json``, format ``eigenhead-report/1``: what programs rely on."""
 
-from typing import TypedDict
+from typing import NotRequired, TypedDict
+
+from rig.messages.message import MessageDocument
 
 FORMAT = "eigenhead-report/1"
 
@@ -14,6 +16,7 @@ class ViewReport(TypedDict):
     components: int
     holes: int
     warnings: list[str]
+    warning_messages: NotRequired[list[MessageDocument]]  # not in files of earlier versions
     figures: dict[str, object]
 
 
@@ -29,11 +32,6 @@ class CameraReport(TypedDict):
     xor_cost_start: float | None
     camera_shift: list[float] | None
     view: ViewReport | None
-
-
-class WarningReport(TypedDict):
-    code: str
-    message: str
 
 
 class FaceReport(TypedDict):
@@ -134,6 +132,14 @@ class TextureReport(TypedDict):
     light: dict[str, object] | None
 
 
+class DetailReport(TypedDict):
+    """How deep the fit went, and why no deeper or why so deep."""
+
+    level: str
+    reason: str
+    reason_message: NotRequired[MessageDocument]  # not in files of earlier versions
+
+
 class Report(TypedDict):
     """``report.json``."""
 
@@ -141,7 +147,7 @@ class Report(TypedDict):
     version: str
     model: NamedModel
     method: str
-    detail: dict[str, str]
+    detail: DetailReport
     front: str
     pose: PoseReport
     faces: dict[str, FaceReport]
@@ -162,4 +168,4 @@ class Report(TypedDict):
     seconds: dict[str, float]
     settings: dict[str, object]
     inputs: dict[str, str]
-    warnings: list[WarningReport]
+    warnings: list[MessageDocument]

@@ -6,7 +6,7 @@ pictures first, by what they show beside the subject; then the pictures, with th
 (``pipeline.multiview.camera_assignment``).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,11 +16,18 @@ from jaxtyping import Float32, UInt8
 
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.camera_assignment import FITTING_MISFIT, Assignment, find_assignment, own_misfit, ring_texts
+from pipeline.multiview.camera_assignment import (
+    FITTING_MISFIT,
+    Assignment,
+    find_assignment,
+    own_misfit,
+    ring_messages,
+)
 from pipeline.multiview.rig_agreement import loose_outlines, wrong_rig
 from pipeline.multiview.triangulation import NoPoint, triangulate
 from rig.capture import Capture, Features, refiled
 from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 PLATE_SEEN = (
@@ -31,10 +38,6 @@ PLATE_COLUMNS = 64
 PLATE_TOLERANCE = 0.06  # of log level: 2 % of light drift, vignetting, and noise averaged over 16 x 16 pixels
 CLICK_PX, CLICK_MISFIT_MOST = 1.5, 50.0
 
-OUTLINES_LOOSE = (
-    "most outlines contradict each other by more than these cameras explain: look at the overlays for a shadow on the "
-    "wall, or hair that some masks miss; where the masks are tight, calibrate again"
-)
 
 Segmentation = Callable[[Capture], dict[str, Silhouette]]
 
@@ -54,9 +57,9 @@ class OwnPictures:
 class ExchangedPictures(EigenheadError):
     """Pictures filed under other cameras' names, and no leave or not enough evidence to file them back."""
 
-    def __init__(self, found: str, *, doubtful: bool) -> None:
-        reason = "too few tangent planes say so to exchange them unasked" if doubtful else "the settings refuse to"
-        super().__init__(f"{found}; {reason}. File every picture under the name of the camera that took it")
+    def __init__(self, found: Sequence[Message], *, doubtful: bool) -> None:
+        reason = compose("exchange-doubtful") if doubtful else compose("exchange-not-wanted")
+        super().__init__(compose("pictures-exchanged", exchange=found, reason=reason))
 
 
 class WrongRig(EigenheadError):
@@ -80,14 +83,14 @@ def own_pictures(
     """
     plates = misplaced_plates(capture, rig)
     if plates and exchanged == "refuse":
-        raise ExchangedPictures("; ".join(ring_texts(plates, "clean plates")), doubtful=False)
+        raise ExchangedPictures(ring_messages(plates, compose("what-plates")), doubtful=False)
     capture = refiled(capture, plates=plates) if plates else capture
     silhouettes = segmented(capture)
     duplicates = duplicate_views(capture, silhouettes, rig)
     distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
     assignment = find_assignment(distinct, rig)
     if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
-        raise ExchangedPictures(str(assignment), doubtful=not assignment.overwhelming)
+        raise ExchangedPictures(assignment.messages(), doubtful=not assignment.overwhelming)
     wrong = None if assignment.pictures else wrong_rig(distinct, rig)
     if wrong:
         raise WrongRig(wrong)
@@ -97,7 +100,7 @@ def own_pictures(
         plates = _composed(plates, assignment.pictures)
     warnings = _warnings(assignment, plates, duplicates)
     if not assignment.pictures and loose_outlines(distinct, rig):
-        warnings = (*warnings, ReportWarning("outlines-loose", OUTLINES_LOOSE))
+        warnings = (*warnings, compose("outlines-loose"))
     return OwnPictures(capture, _left_out(silhouettes, duplicates), assignment.pictures, plates, warnings)
 
 
@@ -212,12 +215,9 @@ def _warnings(
 ) -> tuple[ReportWarning, ...]:
     found = []
     if assignment.pictures:
-        told = f"{assignment}: they were put right for this result. Put the cables or the files right"
-        found.append(ReportWarning("cameras-exchanged", told))
+        found.append(compose("cameras-exchanged", exchange=assignment.messages()))
     if plates and not assignment.pictures:
-        told = "; ".join(ring_texts(plates, "clean plates"))
-        found.append(ReportWarning("plates-exchanged", f"{told}: they were put right for this result"))
+        found.append(compose("plates-exchanged", exchange=ring_messages(plates, compose("what-plates"))))
     for name, owner in duplicates.items():
-        told = f"{name} holds the same picture as {owner} and is left out: look what became of its own"
-        found.append(ReportWarning("picture-duplicated", told))
+        found.append(compose("picture-duplicated", camera=name, owner=owner))
     return tuple(found)

@@ -28,6 +28,7 @@ from pipeline.silhouettes.view_consistency import judge_agreement
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -36,7 +37,6 @@ SOLID_HOLE = 0.995  # mean coarse probability: 1.000 in false holes of noisy cap
 UNDECIDED = 0.3  # from one half: share of a cut's windows that is neither yes nor no
 UNDECIDED_PX = 15  # side of a window ...
 UNDECIDED_FILLED = 0.6  # ... and its part that is undecided where the outline is a guess
-WEAK = "of the contour hardly differs from the background"
 NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
 SEEDED_VIEWS = 8  # fewer do not tell the subject by each other, and begin with its face
 BODY_FILLS = 0.75  # of the subject's width is on the border where shoulders leave; a cut above the brow leaves less
@@ -50,9 +50,7 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
         return _without_plates(capture, rig, settings, report)
     blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
     if blind:
-        raise InputError(
-            "capture", [f"{name} has neither a clean plate nor a mask: record one of them" for name in blind]
-        )
+        raise InputError("capture", [compose("neither-plate-nor-mask", camera=name) for name in blind])
     silhouettes: dict[str, Silhouette] = {}
     with ThreadPoolExecutor(thread_count()) as pool:  # cv2 and the compiled kernels release the interpreter lock
         given = {
@@ -108,11 +106,17 @@ def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouet
     quality, weak = silhouette.quality, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0)))
     if weak <= settings.weak_share_warned:
         return silhouette
-    text = f"found without a clean plate, and {weak:.0%} of its outline is a guess: give its clean plate or mask"
-    kept = tuple(told for told in quality.warnings if WEAK not in told)
+    text = compose("outline-guessed", share=weak)
+    kept = tuple(told for told in quality.warnings if not _speaks_of(told, "outline-weak"))
     if weak > settings.weak_share_unusable:
-        return replace(silhouette, quality=replace(quality, warnings=(*kept, f"{text}; the view is left out")))
+        return replace(silhouette, quality=replace(quality, warnings=(*kept, compose("view-unused", remark=text))))
     return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
+
+
+def _speaks_of(told: Message, code: str) -> bool:
+    """Whether a message has a code, or says why a view is left out by one that has."""
+    remark = told.parameters.get("remark")
+    return told.code == code or (isinstance(remark, Message) and remark.code == code)
 
 
 def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
@@ -223,23 +227,22 @@ def _quality(
     warnings, fatal = [], []
     crown = _crown_side(mask)
     if crown in cut_off:
-        remedy = "tilt it up" if crown == "top" else "turn it"
-        warnings.append(f"the head is cut off at the {crown} of the image: move the camera back or {remedy}")
+        code = "head-cut-off-at-top" if crown == "top" else "head-cut-off-at-side"
+        warnings.append(compose(code, side=crown))
     apart = figures.get("other_pieces", 0.0)
     if apart > settings.other_pieces_warned:
-        text = f"pieces of {apart:.1%} of the subject's area stand apart from it and are left out: did something move"
-        text += " since the plate, or do the clothes match the backdrop?"
+        text = compose("pieces-apart", share=apart)
         (fatal if apart > settings.other_pieces_unusable else warnings).append(text)
     if weak > settings.weak_share_warned:
-        text = f"{weak:.0%} {WEAK}: change the backdrop or the clothes"
+        text = compose("outline-weak", share=weak)
         (fatal if weak > settings.weak_share_unusable else warnings).append(text)
     share = np.count_nonzero(mask) / mask.size
     if share < settings.least_area or share > 0.95:
-        fatal.append(f"the subject covers {share:.1%} of the image, which no head does")
+        fatal.append(compose("subject-area-absurd", share=share))
     gains = figures.get("gain", [1.0])
     if not all(LEAST_GAIN < g < MOST_GAIN for g in gains):
-        fatal.append(f"the light differs from the plate's by a factor {max(gains):.2f}: record a new plate")
-    warnings += [f"{text}; the view is left out" for text in fatal]
+        fatal.append(compose("light-changed", factor=max(gains)))
+    warnings += [compose("view-unused", remark=text) for text in fatal]
     components, holes = components_holes
     return ViewQuality(not fatal, contrast, cut_off, components, holes, tuple(warnings), figures)
 
@@ -259,7 +262,7 @@ _OPPOSITE = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
 
 def _nothing(shape: tuple[int, ...], background: Background) -> Silhouette:
     mask = np.zeros(shape, bool)
-    text = "no subject stands out from the clean plate; the view is left out"
+    text = compose("no-subject-stands-out")
     figures = {"background_share": float(background.inliers.mean())}
     far = np.full(shape, float(sum(shape)), np.float32)  # no contour: farther than any pixel
     return Silhouette(mask, far, ViewQuality(False, 0.0, (), 0, 0, (text,), figures))

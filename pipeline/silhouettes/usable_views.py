@@ -17,6 +17,7 @@ from pipeline.multiview.rig_agreement import misplaced_camera
 from pipeline.silhouettes.own_pictures import own_pictures
 from rig.capture import Capture
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 from rig.rig import Rig
 
 VIEWS_LEAST = 3
@@ -27,16 +28,19 @@ class TooFewViews(EigenheadError):
 
     def __init__(self, silhouettes: Mapping[str, Silhouette], capture: Capture) -> None:
         poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
-        reasons = "; ".join(f"{name}: {', '.join(texts) or 'unusable'}" for name, texts in poor.items())
+        reasons = [
+            compose("view-reasons", camera=name, reasons=why) if why else compose("view-unusable", camera=name)
+            for name, why in poor.items()
+        ]
         if capture.masks:
-            remedy = "Correct these masks, or take them away and supply clean plates"
+            remedy = compose("advice-correct-masks")
         elif capture.backgrounds:
-            remedy = "Take new clean plates with the same light, or supply masks/"
+            remedy = compose("advice-new-plates")
         else:
-            remedy = "Supply clean plates (background/), or masks/"
+            remedy = compose("advice-supply-plates")
+        usable, every = len(silhouettes) - len(poor), len(silhouettes)
         super().__init__(
-            f"only {len(silhouettes) - len(poor)} of {len(silhouettes)} views have a usable silhouette, "
-            f"{VIEWS_LEAST} are needed ({reasons}). {remedy}"
+            compose("too-few-views", usable=usable, all=every, needed=VIEWS_LEAST, reasons=reasons, remedy=remedy)
         )
 
 
@@ -75,9 +79,8 @@ def usable_views(
     if sum(silhouette.quality.usable for silhouette in own.silhouettes.values()) < VIEWS_LEAST:
         raise TooFewViews(own.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(own.silhouettes, rig)
-    remarks = [ReportWarning(remark.code, remark.message) for remark in capture.remarks]
     size = judge_head_size(silhouettes, rig)
-    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *size, *remarks)
+    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *size, *capture.remarks)
     return UsableViews(own.capture, silhouettes, own.pictures, warnings)
 
 
@@ -91,15 +94,11 @@ def without_moved_cameras(
         if drift.moved:
             quality = replace(silhouettes[drift.camera].quality, usable=False)
             kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
-        warnings.append(ReportWarning(drift.code, str(drift)))
+        warnings.append(drift.warning())
     misplaced = misplaced_camera(kept, rig)
     if misplaced is not None:
         kept[misplaced] = replace(kept[misplaced], quality=replace(kept[misplaced].quality, usable=False))
-        told = (
-            "contradicts all other cameras, and no shift of its picture explains it; it is left out: it was moved far"
-        )
-        remedy = "its pose in cameras.json is wrong, or its mask; look at its overlay, and calibrate again"
-        warnings.append(ReportWarning("camera-moved", f"{misplaced} {told}, {remedy}"))
+        warnings.append(compose("camera-moved", finding=compose("camera-misplaced", camera=misplaced)))
     return kept, warnings
 
 
@@ -107,7 +106,9 @@ def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
     """What the views' qualities say, as warnings of the report."""
     found = []
     for name, silhouette in silhouettes.items():
-        code = "view" if silhouette.quality.usable else "view-left-out"
-        found += [ReportWarning(code, f"{name}: {text}") for text in silhouette.quality.warnings]
-        found += [ReportWarning("mask-doubtful", f"{name}: {text}") for text in silhouette.quality.doubts]
+        for remark in silhouette.quality.warnings:
+            located = compose("located", where=name, fault=remark)
+            usable = silhouette.quality.usable
+            found.append(compose("view", remark=located) if usable else compose("view-left-out", remark=located))
+        found += [compose("mask-doubtful", camera=name, remark=remark) for remark in silhouette.quality.doubts]
     return found

@@ -24,6 +24,7 @@ from pipeline.multiview.visual_hull import depth_of, hull_extent
 from pipeline.parallel_for import thread_count
 from pipeline.settings import SegmentationSettings
 from rig.camera import Camera
+from rig.messages.message import compose
 from rig.rig import Rig
 
 GRID = 32  # voxels a side: 12 mm on a subject of 400 mm
@@ -166,18 +167,15 @@ def _judged(
 ) -> Silhouette:
     quality = silhouette.quality
     warnings, usable = list(quality.warnings), quality.usable
-    left_out = "; the view is left out"
     if strange > settings.strange_share_warned:
         bad = strange > settings.strange_share_unusable and not ready
         usable &= not bad
-        why = "correct the mask" if ready else "did something move since the plate?"
-        text = f"{strange:.1%} of the mask is where the other cameras see nothing: {why}"
-        warnings.append(text + (left_out if bad else ""))
+        text = compose("mask-alone-ready" if ready else "mask-alone", share=strange)
+        warnings.append(compose("view-unused", remark=text) if bad else text)
     if missing > settings.missing_share_warned:
         bad = missing > settings.missing_share_unusable and not ready
         usable &= not bad
-        why = "correct the mask" if ready else "hair or clothes in the backdrop's colour?"
-        text = f"the mask lacks {missing:.1%} of what the other cameras show: {why}"
-        warnings.append(text + (left_out if bad else ""))
+        text = compose("mask-incomplete-ready" if ready else "mask-incomplete", share=missing)
+        warnings.append(compose("view-unused", remark=text) if bad else text)
     figures = {**quality.figures, "strange_share": round(strange, 4), "missing_share": round(missing, 4)}
     return replace(silhouette, quality=replace(quality, usable=usable, warnings=tuple(warnings), figures=figures))

@@ -6,7 +6,6 @@ from typing import Literal
 from pipeline.alignment.face_alignment import align_to_face, frontmost_camera
 from pipeline.alignment.landmarks import feature_alignment
 from pipeline.alignment.silhouette_search import search_alignment
-from pipeline.diagnostics import ReportWarning
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.model_basis import model_basis
 from pipeline.faces.landmark_map import landmark_map
@@ -18,6 +17,7 @@ from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
+from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -42,7 +42,7 @@ def front_camera(rig: Rig, settings: Settings) -> str:
     if settings.front is None:
         return rig.front_camera()
     if settings.front not in rig:
-        raise EigenheadError(f"front camera {settings.front!r} is not in the rig; it has {', '.join(rig.names)}")
+        raise EigenheadError(compose("front-not-in-rig", front=f"{settings.front!r}", cameras=rig.names))
     return settings.front
 
 
@@ -73,5 +73,5 @@ def align_to_views(
             front = frontmost_camera(pose.rotation[:, 2], pose.translation, rig)
         return Staged(Alignment(pose, front, "silhouettes", rival=found.rival))
     found = feature_alignment(model, views.capture.features, rig, settings.alignment)
-    warnings = [ReportWarning("features", remark) for remark in found.remarks]
+    warnings = [compose("features", remark=remark) for remark in found.remarks]
     return Staged(Alignment(found.world_from_head, front, "features"), warnings)

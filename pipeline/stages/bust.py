@@ -8,7 +8,6 @@ from jaxtyping import Float, UInt8
 from pipeline.dense.surface.fusion import BustSurface, fuse
 from pipeline.dense.surface.signed_distance import NoSurface
 from pipeline.dense.surface.skin import part_of
-from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
@@ -18,6 +17,7 @@ from pipeline.stages.views import Views
 from pipeline.texture.vertex_colours import texture
 from rig.capture import Capture
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ def fuse_bust(
             report=context.progress,
         )
     except NoSurface as reason:
-        return Staged(None, [ReportWarning("no-bust", str(reason))])
+        return Staged(None, [compose("no-bust", reason=reason.message)])
     mesh = surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings.texture)

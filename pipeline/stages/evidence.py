@@ -32,6 +32,7 @@ from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
+from rig.messages.message import compose
 
 Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
@@ -86,7 +87,7 @@ def judge_head(
     unexplained = unexplained_outlines(cameras, pixels_mm)
     if unexplained is not None and context.settings.unexplained_outlines == "refuse":
         raise UnexplainedOutlines(unexplained)
-    warnings += [] if unexplained is None else [ReportWarning("outlines-unexplained", unexplained)]
+    warnings += [] if unexplained is None else [unexplained]
     return Staged(evidence, [*warnings, *eye_warnings(shut_eyes(model, made) | closed_eyes)])
 
 
@@ -116,5 +117,5 @@ def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:
     """Warns of closed eyes: they are no fault, but most studios want another shot."""
     if not closed:
         return []
-    which = "both eyes are" if len(closed) == 2 else f"the {min(closed)} eye is"
-    return [ReportWarning("eyes-closed", f"{which} closed: no white and no iris in the photographs, or lids that meet")]
+    both = len(closed) == 2
+    return [compose("eyes-closed", eyes=compose("both-eyes-are") if both else compose("one-eye-is", side=min(closed)))]

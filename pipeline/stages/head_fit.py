@@ -22,6 +22,7 @@ from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +90,8 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
     """Goes on with what the photographs show inside the outlines, as deep as settings and photographs let it."""
     settings, model, solved = context.settings, outlines.model, outlines.solution
     if isinstance(solved, Fit):
-        return Staged(HeadFit(solved, model, Detail("span", "the simplex searches the eigenheads alone")))
-    detail = Detail("span" if settings.detail == "span" else "kernel", "the settings ask for it")
+        return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))
+    detail = Detail("span" if settings.detail == "span" else "kernel", compose("level-asked"))
     if settings.detail in PHOTO_LEVELS:
         images, hair = views.capture.images, labels.hair_probability()
         solved, detail = refine_with_photographs(solved, images, settings.photo, hair=hair)

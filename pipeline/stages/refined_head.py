@@ -19,6 +19,7 @@ from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,8 +59,8 @@ def refine_head(
     )
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), settings.fine.least_share
     if share < needed:
-        reason = f"the dense surface shows only {share:.0%} of the face, {needed:.0%} are needed"
+        reason = compose("level-surface-too-small", share=share, needed=needed)
         return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), Detail("photo", reason)))
-    detail = Detail("fine", f"the dense surface shows {share:.0%} of the face")
+    detail = Detail("fine", compose("level-surface", share=share))
     refined = Mesh(displaced.vertices, mesh.faces)
     return Staged(RefinedHead(refined, displaced.deviation_mm, detail, displaced))

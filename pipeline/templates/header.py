@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.eigenheads.model_names import model_path, model_sha256
 from pipeline.templates.names import template_path
 from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
 
 FORMAT = "eigenhead-template/1"
 WORDS = ("name", "source", "source_sha256", "model_name", "model_sha256")
@@ -23,11 +24,8 @@ DAMAGE = (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.Bad
 class BadTemplate(EigenheadError):
     """A file that is no template of this project, or a damaged one."""
 
-    def __init__(self, path: Path, why: str) -> None:
-        super().__init__(
-            f"{path} cannot be used as a template: {why}. Register it again: eigenhead template add FILE.obj "
-            f"--name {path.stem} --overwrite"
-        )
+    def __init__(self, path: Path, why: Message | str) -> None:
+        super().__init__(compose("template-unusable", path=str(path), why=why, name=path.stem))
         self.why = why
 
 
@@ -35,11 +33,17 @@ class OtherModel(EigenheadError):
     """A template that another model carries than the one in use."""
 
     def __init__(self, template: "TemplateHeader", model_name: str) -> None:
-        same = " of another version" if template.model_name == model_name else ""
+        same = template.model_name == model_name
         super().__init__(
-            f"the template {template.name!r} was registered to the model {template.model_name!r}{same}, and the job's "
-            f"is {model_name!r}: use that model (--model), or register the mesh to this one: eigenhead template add "
-            f"{template.source} --name {template.name[:20]}-2 --model {model_name}"
+            compose(
+                "template-of-other-version" if same else "template-of-other-model",
+                template=f"{template.name!r}",
+                model=f"{template.model_name!r}",
+                wanted=f"{model_name!r}",
+                source=template.source,
+                name=f"{template.name[:20]}-2",
+                wanted_name=model_name,
+            )
         )
 
 
@@ -67,18 +71,18 @@ def read_header(path: Path) -> TemplateHeader:
             meta = read_meta(path, file)
         return TemplateHeader(**header_words(meta), figures=meta["figures"])
     except OSError as error:
-        raise BadTemplate(path, error.strerror or "cannot be read") from None
+        raise BadTemplate(path, error.strerror or compose("file-unreadable")) from None
     except DAMAGE as fault:
-        raise BadTemplate(path, f"damaged or incomplete ({fault})") from None
+        raise BadTemplate(path, compose("file-incomplete", reason=str(fault))) from None
 
 
 def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """The decoded ``meta`` of an open template file. Raises BadTemplate for another kind of file."""
     if "meta" not in file:
-        raise BadTemplate(path, "it does not carry this project's template format")
+        raise BadTemplate(path, compose("template-without-format"))
     meta = json.loads(file["meta"].tobytes())
     if meta.get("format") != FORMAT:
-        raise BadTemplate(path, f"format {meta.get('format')!r:.40}, wanted {FORMAT!r}")
+        raise BadTemplate(path, compose("format-other", format=f"{meta.get('format')!r:.40}", wanted=f"{FORMAT!r}"))
     return meta
 
 

@@ -8,25 +8,22 @@ from pathlib import Path
 from pipeline.eigenheads.data_folder import data_folder
 from pipeline.settings import TEMPLATE_NAME
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 
 
 class UnknownTemplate(EigenheadError):
     """A name that no template has."""
 
     def __init__(self, name: str) -> None:
-        known = ", ".join(list_templates()) or "none"
-        super().__init__(
-            f"no template {name!r:.60}: known are {known}. Register one with `eigenhead template add FILE.obj`"
-        )
+        known = [*list_templates()] or ["none"]
+        super().__init__(compose("template-unknown", name=f"{name!r:.60}", known=known))
 
 
 class WrongName(EigenheadError):
     """A name that no template can have."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(
-            f"{name!r:.60} cannot be a template's name (letters, digits, - and _, 40 at most): give one with --name"
-        )
+        super().__init__(compose("template-name-wrong", name=f"{name!r:.60}"))
 
 
 def is_name(name: str) -> bool:

@@ -19,6 +19,7 @@ from pipeline.eigenheads.regions import head_regions
 from rig.errors import InputError
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
+from rig.messages.message import compose
 
 UNITS = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0}
 EXTENT_MM = (110.0, 750.0)  # of a face alone, and of a bust
@@ -56,12 +57,12 @@ def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarra
     """head_from_template from landmarks of the mesh. Raises InputError."""
     names = [each for each in landmarks if each in model.landmarks]
     if len(names) < 4:
-        raise InputError(name, [f"{len(names)} landmarks are known, 4 are needed: {', '.join(names) or 'none'}"])
+        raise InputError(name, [compose("template-landmarks-too-few", count=len(names), names=names or ["none"])])
     ours = model.vertices(np.zeros(0))[[model.landmarks[each] for each in names]]
     try:
         return procrustes(np.array([landmarks[each] for each in names]), ours)
     except ValueError as error:
-        raise InputError(name, [f"its landmarks cannot place it: {error}"]) from None
+        raise InputError(name, [compose("template-landmarks-do-not-place", reason=str(error))]) from None
 
 
 def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
@@ -70,8 +71,7 @@ def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
     extent = float(np.ptp(used, axis=0).max())
     factors = [f for f in UNITS.values() if EXTENT_MM[0] < extent * f < EXTENT_MM[1]]
     if not factors:
-        told = f"is {extent:.3g} units large, which is no head in {', '.join(UNITS)}"
-        raise InputError(name, [f"{told}: scale it, or give its landmarks (--landmarks)"])
+        raise InputError(name, [compose("extent-absurd", extent=extent, units=UNITS)])
     points, normals, weights = _model_points(model, FINE)
     some = slice(None, None, max(1, len(points) // COARSE))
     there = [part[:: max(1, len(part) // SAMPLES)] for part in samples(mesh)]
@@ -90,8 +90,8 @@ def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
     ]
     off_mm, place = min(fine, key=lambda found: found[0])
     if off_mm > UNLIKE_MM:
-        why = f"lies {off_mm:.0f} mm off the model's face at best"
-        raise InputError(name, [f"{why}, so it is no head, or one turned askew: give its landmarks (--landmarks)"])
+        why = compose("template-off-face", off_mm=off_mm)
+        raise InputError(name, [compose("template-no-head", reason=why)])
     return place
 
 

@@ -26,6 +26,7 @@ from rig.errors import InputError
 from rig.formats.polygon_obj import PolygonMesh
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges, vertex_normals
+from rig.messages.message import compose
 from rig.progress import Progress
 
 DRAWN = Search(steps=0, reach_mm=5.0, normal_mm=2.0, plane_mm=0.0)
@@ -104,7 +105,7 @@ def register(
     on_skin &= ~parting(attachment, rest, on_skin, welded.faces, model)
     on_skin = without_specks(without_edge(on_skin, welded.faces), welded.faces)
     if not on_skin.any():
-        raise NotRegistered(name, ["no part of it lies on the model's skin: give its landmarks (--landmarks)"])
+        raise NotRegistered(name, [compose("template-off-skin")])
     rest = _followed(welded.vertices, rest, on_skin)
     rows = np.flatnonzero(on_skin[joined])
     carried = carrier(
@@ -121,14 +122,14 @@ def _check(like: Likeness, name: str, *, marked: bool) -> float:
     covered = float(area[met].sum() / area.sum())
     faults = []
     if covered < COVERED_SHARE:
-        faults.append(f"shows {covered:.0%} of the model's face, {COVERED_SHARE:.0%} are needed")
+        faults.append(compose("template-shows-little", share=covered, needed=COVERED_SHARE))
     face = like.distances[met & like.in_face]
     if len(face) and np.median(face) > LIKE_MM:
-        faults.append(f"lies {np.median(face):.1f} mm (median) off every face that the model can make")
+        faults.append(compose("template-off-all-faces", off_mm=np.median(face)))
     if like.deviation > STRANGE and not marked:
-        faults.append(f"is {like.deviation:.1f} standard deviations (RMS) from the model's mean, which no head is")
+        faults.append(compose("template-far-from-mean", sigmas=like.deviation))
     if faults:
-        raise NotRegistered(name, [*faults, "give its landmarks (--landmarks), or a mesh that is a human head"])
+        raise NotRegistered(name, [*faults, compose("template-give-landmarks")])
     return covered
 
 

@@ -13,6 +13,7 @@ from pipeline.templates.carrying import Attachment, Carrier
 from pipeline.templates.header import DAMAGE, FORMAT, WORDS, BadTemplate, TemplateHeader, header_words, read_meta
 from rig.atomic_write import write_atomically
 from rig.formats.polygon_obj import PolygonMesh
+from rig.messages.message import compose
 
 MESH = {"sizes": "i", "corners": "i", "uv": "f", "corner_uv": "i"}
 ATTACHMENT = {"triangles": "i", "weights": "f", "offsets": "f"}
@@ -57,9 +58,9 @@ def read_template(path: Path) -> Template:
             arrays = {name: np.asarray(file[name], int if kinds[name] == "i" else float) for name in kinds}
         template = _template(meta, arrays)
     except OSError as error:
-        raise BadTemplate(path, error.strerror or "cannot be read") from None
+        raise BadTemplate(path, error.strerror or compose("file-unreadable")) from None
     except DAMAGE as fault:
-        raise BadTemplate(path, f"damaged or incomplete ({fault})") from None
+        raise BadTemplate(path, compose("file-incomplete", reason=str(fault))) from None
     _check(path, template)
     return template
 
@@ -86,10 +87,10 @@ def _check(path: Path, template: Template) -> None:
     count = len(carrier.rest)
     rows = (mesh.corners, carrier.skin, carrier.anchors, carrier.whole_anchors)
     if any(part.size and (part.min() < 0 or part.max() >= count) for part in rows):
-        raise BadTemplate(path, "it names vertices that it does not have")
+        raise BadTemplate(path, compose("template-vertices-missing"))
     same = len(carrier.skin) == len(carrier.attachment.triangles) == len(carrier.attachment.weights)
     if not same or len(carrier.wholes) != count or mesh.sizes.sum() != len(mesh.corners) != len(mesh.corner_uv):
-        raise BadTemplate(path, "its arrays do not fit each other")
+        raise BadTemplate(path, compose("template-arrays-unfit"))
     numbers = (carrier.rest, carrier.attachment.weights, carrier.attachment.offsets, mesh.uv)
     if not all(np.isfinite(part).all() for part in numbers):
-        raise BadTemplate(path, "it holds values that are not finite")
+        raise BadTemplate(path, compose("template-not-finite"))

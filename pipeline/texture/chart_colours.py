@@ -21,6 +21,7 @@ from pipeline.parallel_for import thread_count
 from pipeline.texture.light import BAND_FACTORS, Light, harmonics
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
+from rig.messages.message import compose
 from rig.rig import Rig
 
 CODES = 4095
@@ -48,9 +49,7 @@ def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[Char
     found = {name: chart_correction(own) for name, own in charts.items() if own}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:
-        why = "no clean plate shows a ColorChecker Classic that can be read, so that colours are the cameras' own"
-        what = "put a picture with the chart, nearer, sharper or turned out of a lamp's reflection, into"
-        return None, [ReportWarning("no-chart", f"{why}: {what} background/<camera>/")]
+        return None, [compose("no-chart")]
     normals = [chart_normal(chart, rig[name]) for name in cameras for chart in charts[name]]
     mean = np.mean(normals, axis=0)
     return ChartColours(cameras, mean / np.linalg.norm(mean)), []

@@ -24,6 +24,7 @@ from pipeline.texture.uv_unwrap import Atlas, Layout
 from pipeline.texture.vertex_colours import Texture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 DIM_SHARE = 0.3  # of a vertex' weight in dimmer views: of four views the second dimmest, which noise hardly makes
 MOST_SHINE = 0.5  # of a texture's light that may be taken for a highlight
@@ -54,16 +55,14 @@ def delight(
     """The albedo of a textured head; a warning where it cannot be told. With a ``chart`` it is the skin's own in level
     and colour, too; else by convention (``pipeline.texture.light``)."""
     if atlas is None or around is None or coloured.dim is None:
-        return None, [ReportWarning("no-albedo", "there is no texture that light could be taken off")]
+        return None, [compose("no-albedo", reason=compose("albedo-without-texture"))]
     seen = coloured.views > 0
     shown = linear_from_srgb(coloured.colours / 255.0)
     matt = shown * shine_left(shown, coloured.dim, seen, around)[:, None]
     white = transfer(mesh_world, normals, around)
     light = fit_light(white, matt, seen & face_region)
     if light is None:
-        return None, [
-            ReportWarning("no-albedo", "too little of the face is seen, or it is black: no light can be told")
-        ]
+        return None, [compose("no-albedo", reason=compose("albedo-without-face"))]
     if chart is not None:
         light = levelled_by_chart(light, chart.normal_world)
     shading = white @ light.coefficients

@@ -11,23 +11,20 @@ from pipeline.texture.paint import paint_texture, texture_size
 from pipeline.texture.uv_unwrap import Atlas, NoLayout
 from pipeline.texture.vertex_colours import Texture
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 
 def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
     """The model's texture layout where a file of the result has a texture, and warnings of settings and model."""
     outputs = settings.outputs
     old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
-    told = [
-        ReportWarning("old-setting", f"{name} is read as it was meant; write outputs.formats in its place")
-        for name, given in old.items()
-        if given
-    ]
+    told = [compose("old-setting", setting=name) for name, given in old.items() if given]
     if not outputs.textured or settings.texture.blend == "reference":
         return None, told
     try:
         return model_layout(model), told
     except NoLayout as reason:
-        return None, [*told, ReportWarning("no-texture-layout", str(reason))]
+        return None, [*told, compose("no-texture-layout", reason=reason.message)]
 
 
 def paint_head(

@@ -20,6 +20,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float, Int, UInt8
 
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 
 ROUNDS = 4  # of reweighting
 BULGE = 0.02  # of the square's side
@@ -29,10 +30,7 @@ SIDE_SHARE = 2 / 3  # of the cut that is one of the square's sides; the rest is 
 
 class NoLayout(EigenheadError):
     def __init__(self) -> None:
-        super().__init__(
-            "no texture can be laid out for this model, whose surface is not one piece with one open border at the "
-            "neck: its head has vertex colours alone"
-        )
+        super().__init__(compose("model-without-layout"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,6 +37,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from rig.rig import Rig
 
 REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
@@ -171,7 +172,7 @@ def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
 
 def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
     return tuple(
-        ReportWarning("camera-gain", f"{name} is {1 / min(gain):.2f} times as bright as the others: check its exposure")
+        compose("camera-gain", camera=name, factor=1 / min(gain))
         for name, gain in gains.items()
         if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
     )
@@ -179,7 +180,7 @@ def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
 
 def _untextured(count: int) -> Texture:
     code = round(255 * float(srgb_from_linear(np.array(GREY))))
-    warning = ReportWarning("no-texture", "no camera with a usable silhouette sees the head, so that it is grey")
+    warning = compose("no-texture")
     return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), filled=count, warnings=(warning,))
 
 

@@ -29,6 +29,7 @@ from rig.formats.capture_folder import write_capture
 from rig.formats.images import write_image
 from rig.formats.rig_toml import RigConfig
 from rig.image import ImageRgb
+from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -40,7 +41,7 @@ class NoCalibration(EigenheadError):
     """A capture folder needs cameras.json."""
 
     def __init__(self) -> None:
-        super().__init__('rig.toml names no calibration: set calibration = "cameras.json" (see `eigenhead calibrate`)')
+        super().__init__(compose("rig-without-calibration"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,7 @@ def capture(
     ``out`` is there already. Warnings are in the shot that is returned, and in shot.json of the folder.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(str(out), ["is there already; name a folder that is not"])
+        raise InputError(str(out), [compose("folder-exists")])
     report("warm up", 0.0)
     with RigSession(config, make_driver) as session:
         session.warm_up()

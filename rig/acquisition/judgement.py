@@ -10,6 +10,7 @@ from rig.acquisition.plates import Plates
 from rig.acquisition.shot import Fault, PictureCheck
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb
+from rig.messages.message import compose
 
 OtherView = Callable[[str, Registration], str | None]
 
@@ -64,9 +65,9 @@ def judge_checks(
     for name, check in checks.items():
         if check.exposure.clipped_share > shot.clipped_most:
             share = check.exposure.clipped_share * 100
-            faults.append(Fault("overexposed", name, f"{share:.1f} % of the picture is burnt out"))
+            faults.append(Fault("overexposed", name, compose("picture-burnt-out", percent=share)))
         if lit[name] and check.blur_px is not None and check.blur_px > shot.blur_most_px:
-            width = f"edges are {check.blur_px:.1f} px wide, {shot.blur_most_px:g} px allowed"
+            width = compose("picture-blurred", width_px=check.blur_px, allowed_px=shot.blur_most_px)
             faults.append(Fault("blurred", name, width))
         if check.registration is not None:
             faults.extend(_view_faults(name, check.registration, lit[name], shot, whose_view))
@@ -81,11 +82,11 @@ def _light_faults(
     common = median(ratios.values()) if len(ratios) >= 3 else 1.0
     faults: list[Fault] = []
     if common < shot.dark_below:
-        faults.append(Fault("lights-off", None, f"the pictures have {common * 100:.0f} % of their usual brightness"))
+        faults.append(Fault("lights-off", None, compose("pictures-dark", percent=common * 100)))
     for name, ratio in ratios.items():
         if ratio < shot.dark_below * min(1.0, common):
-            of = "the other cameras' share" if common < shot.dark_below else "its usual brightness"
-            faults.append(Fault("dark", name, f"{ratio / min(1.0, common) * 100:.0f} % of {of}"))
+            code = "picture-uneven-brightness" if common < shot.dark_below else "picture-dark"
+            faults.append(Fault("dark", name, compose(code, percent=ratio / min(1.0, common) * 100)))
     return faults, {name: ratios.get(name, 1.0) >= shot.dark_below for name in checks}
 
 
@@ -95,12 +96,12 @@ def _view_faults(name: str, found: Registration, lit: bool, shot: ShotConfig, wh
     if found.found < (FOUND_SURELY if lit else FOUND_LEAST):
         other = whose_view(name, found)
         if other is not None:
-            return [Fault("swapped", name, f"it shows the view of {other}")]
+            return [Fault("swapped", name, compose("picture-of-other-camera", other=other))]
         if found.found < FOUND_LEAST:
-            return [Fault("view", name, "its background is not that of its clean plates")]
+            return [Fault("view", name, compose("background-unknown"))]
     most_px = shot.moved_most_px if lit else max(shot.moved_most_px, MOVED_DARK_PX)
     if found.moved_px > most_px:
-        return [Fault("moved", name, f"its background lies {found.moved_px:.1f} px from its clean plates")]
+        return [Fault("moved", name, compose("background-moved", moved_px=found.moved_px))]
     return []
 
 

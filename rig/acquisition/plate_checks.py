@@ -12,6 +12,7 @@ from rig.acquisition.shot import Fault, ShotFailed
 from rig.acquisition.subject_place import find_subject
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb
+from rig.messages.message import compose
 
 SEEN_SHARE = 0.5  # of the cameras: a person in the seat is seen by all; what one camera sees is its own wall or a bump
 
@@ -29,9 +30,9 @@ def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str],
     faults = []
     for name, images in taken.items():
         if name in live and any(np.array_equal(images[0], other) for other in images[1:2]):
-            faults.append(Fault("frozen", name, "two clean plates are equal to the last bit"))
+            faults.append(Fault("frozen", name, compose("plates-equal")))
         if disturbed(images, noise_of(images) or 0.0):
-            faults.append(Fault("disturbed", name, "something moved between them"))
+            faults.append(Fault("disturbed", name, compose("plates-disturbed")))
     first = {name: images[0] for name, images in taken.items()}
     light = judge(first, examine(first, NO_PLATES), NO_PLATES, shot)
     return faults + [fault for fault in light if fault.is_error]
@@ -43,7 +44,7 @@ def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fa
     compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
     seen = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
     faults = [
-        Fault("occupied", name, f"{place.share * 100:.0f} % of its picture differ in one piece from the plates in use")
+        Fault("occupied", name, compose("plate-differs", percent=place.share * 100))
         for name, place in seen.items()
         if place is not None
     ]

@@ -23,6 +23,7 @@ from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.images import IMAGE_SUFFIXES, read_image, write_image
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose, documents_of, read_message
 
 FORMAT = "eigenhead-plates/1"
 VERSIONS_MOST = 6  # the one in use and refused ones included
@@ -59,7 +60,7 @@ def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
     except OSError:
         pass  # plates of a recorded capture
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError("plates.json", [f"is damaged ({error}); take new clean plates"]) from error
+        raise InputError("plates.json", [compose("plates-file-damaged", reason=str(error))]) from error
     return Plates(files, first, noise, taken)
 
 
@@ -71,7 +72,7 @@ class PlatesVersion:
     id: str
     taken: str
     cameras: tuple[str, ...]
-    refused: tuple[str, ...]
+    refused: tuple[Message, ...]
     in_use: bool
 
 
@@ -80,7 +81,7 @@ def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Pl
     return use_plates(folder, keep_plates(folder, images), tuple(images))
 
 
-def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refused: tuple[str, ...] = ()) -> str:
+def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refused: tuple[Message, ...] = ()) -> str:
     """Writes plates as a version beside those in use; its id. ``refused``: why they are not put to use."""
     moment = datetime.now(UTC)
     identity = moment.strftime("%Y%m%dT%H%M%S%fZ")
@@ -93,7 +94,7 @@ def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refuse
         list(pool.map(lambda target: write_image(*target), targets))
         noise = dict(zip(images, pool.map(noise_of, images.values()), strict=True))
     taken = moment.isoformat(timespec="seconds")
-    document = {"format": FORMAT, "id": identity, "taken": taken, "noise": noise, "refused": [*refused]}
+    document = {"format": FORMAT, "id": identity, "taken": taken, "noise": noise, "refused": documents_of(refused)}
     write_atomically(fresh / "plates.json", json.dumps(document, indent=1).encode())
     fresh.rename(fresh.with_suffix(""))
     _remove_old(folder)
@@ -106,7 +107,7 @@ def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
     if version in kept and kept[version].in_use:
         return read_plates(folder, names)
     if version not in kept:
-        raise InputError("clean plates", [f"version {version!r:.40} is not kept"])
+        raise InputError("clean plates", [compose("plates-version-not-kept", version=f"{version!r:.40}")])
     if folder.exists():
         folder.rename(_versions(folder) / _version_of(folder).id)
     wanted.rename(folder)
@@ -145,7 +146,7 @@ def _version_of(folder: Path) -> PlatesVersion:
         document = json.loads((folder / "plates.json").read_text(encoding="utf-8"))
         taken = str(document["taken"])
         identity = str(document.get("id") or datetime.fromisoformat(taken).strftime("%Y%m%dT%H%M%S%fZ"))
-        refused = tuple(map(str, document.get("refused", ())))
+        refused = tuple(map(read_message, document.get("refused", ())))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         moment = datetime.fromtimestamp(folder.stat().st_mtime, UTC)
         identity, taken, refused = moment.strftime("%Y%m%dT%H%M%S%fZ"), moment.isoformat(timespec="seconds"), ()

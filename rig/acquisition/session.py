@@ -28,6 +28,7 @@ from rig.drivers.registry import driver_for
 from rig.formats.cameras_json import read_rig
 from rig.formats.rig_toml import CameraConfig, RigConfig
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 MakeDriver = Callable[[CameraConfig, Path], Driver]
@@ -55,7 +56,7 @@ class RigSession:
         self.rig: Rig | None = None if config.calibration_file is None else read_rig(config.calibration_file)
         self.plates: Plates = read_plates(config.plates_folder, config.names)
         self._feeds: dict[str, CameraFeed] = {}
-        self._broken: dict[str, str] = {}
+        self._broken: dict[str, Message] = {}
         self._box: TriggerBox | None = None
         self._box_error: TriggerError | None = None
         self._last_seen: dict[str, Frame] = {}  # for what stands still
@@ -67,7 +68,7 @@ class RigSession:
                     camera, make_driver(camera, config.folder), config.shot.open_timeout_s
                 )
             except DriverError as error:
-                self._broken[camera.name] = str(error)
+                self._broken[camera.name] = error.message
 
     def __enter__(self) -> "RigSession":
         try:
@@ -108,9 +109,9 @@ class RigSession:
         """What is known of each camera at this moment; those without a driver are left out."""
         return {name: feed.state() for name, feed in self._feeds.items()}
 
-    def trigger_error(self) -> str | None:
+    def trigger_error(self) -> Message | None:
         """Why the box cannot be used; None where it can, or where there is none to use."""
-        return None if self._box_error is None else str(self._box_error)
+        return None if self._box_error is None else self._box_error.message
 
     def warm_up(self) -> None:
         """Lamps on, and every camera's first frames seen and forgotten: exposure and lamps settle meanwhile."""
@@ -159,9 +160,7 @@ class RigSession:
                 raise ShotFailed(faults)
             images = {name: tuple(images) for name, images in taken.items()}
             if somebody := occupied(images, self.plates):
-                version = keep_plates(
-                    self.config.plates_folder, images, tuple(f"{fault.camera}: {fault.detail}" for fault in somebody)
-                )
+                version = keep_plates(self.config.plates_folder, images, tuple(fault.measured() for fault in somebody))
                 raise PlatesRefused(somebody, version)
             self.plates = write_plates(self.config.plates_folder, images)
             return self.plates
@@ -202,7 +201,7 @@ class RigSession:
         return True
 
     def _box_faults(self) -> list[Fault]:
-        return [] if self._box_error is None else [Fault("trigger", None, str(self._box_error))]
+        return [] if self._box_error is None else [Fault("trigger", None, self._box_error.message)]
 
     def _lights_on(self) -> None:
         self._open_box()
@@ -284,7 +283,7 @@ class RigSession:
             late_s = fired.time_s - fired.asked_s - fired.uncertainty_s
             faults: tuple[Fault, ...] = ()
             if late_s > self.config.shot.skew_most_ms / 1000:
-                faults = (Fault("late-trigger", None, f"the box fired {late_s * 1000:.0f} ms after the command"),)
+                faults = (Fault("late-trigger", None, compose("box-late", late_ms=late_s * 1000)),)
             return _Release(fired.time_s, fired.uncertainty_s, True, faults)
         for feed in self._feeds.values():
             feed.trigger()
@@ -346,12 +345,12 @@ class RigSession:
             if frame is not None or (not fired and state.opened and waits):
                 continue  # a camera that waits for a trigger that never came is not at fault
             timeout_s = self.config.shot.timeout_s if fired else min(_DIAGNOSIS_S, self.config.shot.timeout_s)
-            faults.append(Fault("missing", name, state.error or f"no frame within {timeout_s:g} s of the release"))
+            faults.append(Fault("missing", name, state.error or compose("frame-missing", seconds=timeout_s)))
         return faults
 
     def _still(self, images: Mapping[str, ImageRgb]) -> list[Fault]:
         return [
-            Fault("frozen", name, "its picture is the one before the release, to the last bit")
+            Fault("frozen", name, compose("picture-repeated"))
             for name, image in images.items()
             if self._feeds[name].live and name in self._last_seen and np.array_equal(self._last_seen[name].image, image)
         ]
@@ -362,19 +361,19 @@ class RigSession:
         faults = []
         for name, image in images.items():
             if name not in self.rig:
-                faults.append(Fault("size", name, "it is not in the calibration"))
+                faults.append(Fault("size", name, compose("camera-not-calibrated")))
                 continue
             lens = self.rig[name].intrinsics
-            if image.shape[:2] != (lens.height, lens.width):
-                sizes = f"{image.shape[1]} x {image.shape[0]}, calibrated {lens.width} x {lens.height}"
-                faults.append(Fault("size", name, sizes))
+            size, wanted = f"{image.shape[1]} x {image.shape[0]}", f"{lens.width} x {lens.height}"
+            if size != wanted:
+                faults.append(Fault("size", name, compose("picture-size-wrong", size=size, wanted=wanted)))
         return faults
 
     def _notes(self, images: Mapping[str, ImageRgb]) -> list[Fault]:
         unmet = {name: feed.state().unmet for name, feed in self._feeds.items()}
         notes = [Fault("setting", name, line) for name, lines in unmet.items() for line in lines]
         missing = [name for name in images if name not in self.plates]
-        return notes + [Fault("plates", name, "there are none of it") for name in missing]
+        return notes + [Fault("plates", name, compose("camera-without-plates")) for name in missing]
 
     def _plate_faults(self, taken: Mapping[str, list[ImageRgb]]) -> list[Fault]:
         wanted, faults = self.config.shot.plates, []
@@ -382,7 +381,9 @@ class RigSession:
             if len(images) < wanted:
                 state = self._feeds[name].state() if name in self._feeds else None
                 why = self._broken.get(name) or (state.error if state is not None else None)
-                faults.append(Fault("missing", name, why or f"{len(images)} of {wanted} frames came"))
+                faults.append(
+                    Fault("missing", name, why or compose("plates-incomplete", came=len(images), wanted=wanted))
+                )
         came = {name: images for name, images in taken.items() if images}
         complete = {name: images for name, images in came.items() if len(images) >= wanted}
         live = [name for name in complete if self._feeds[name].live]

@@ -7,12 +7,13 @@ rig.acquisition.session does the shooting.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Literal, TypedDict
+from typing import Any, Literal, TypedDict
 
 from rig.acquisition.image_checks import Exposure, Registration
 from rig.drivers.base import Frame
 from rig.errors import EigenheadError
 from rig.image import ImageRgb
+from rig.messages.message import Message, MessageDocument, compose, read_message
 
 Status = Literal["in sync", "late", "dropped", "missing", "recorded"]
 
@@ -38,27 +39,27 @@ FAULTS = {
     "disturbed": "something moved while the clean plates were taken",
     "occupied": "the new clean plates show somebody whom the old ones do not",
 }
-REMEDIES = {
-    "trigger": "check the box's cable and power, and its port in rig.toml",
-    "late-trigger": "look at the box's outputs and their delays in rig.toml",
-    "missing": "check its cable, power and driver",
-    "dropped": "shoot again; if it stays, lower its frame rate or give it a network port of its own",
-    "late": "shoot again; if it stays, raise its frame rate or trigger it by the box",
-    "frozen": "start the camera anew",
-    "size": "set its resolution back, or calibrate again",
-    "lights-off": "turn the lamps on",
-    "dark": "look at its lens cap, iris and exposure",
-    "swapped": "their cables or identities are swapped: change them back",
-    "view": "put it back where it was, or take new clean plates and calibrate again",
-    "moved": "calibrate again, or put it back; until then its view is left out",
-    "overexposed": "close the iris, shorten the exposure or dim the lamps",
-    "blurred": "focus on the near eye, and have the subject sit still",
-    "setting": "set it at the camera, or take it out of rig.toml",
-    "plates": "take clean plates of the empty studio",
-    "empty": "seat the subject where all cameras look, and shoot again",
-    "cut-off": "move the seat or the camera so that the whole head is in the picture",
-    "disturbed": "take them again with nobody and nothing moving",
-    "occupied": "send everybody out and take them again, or use them all the same where the studio itself changed",
+REMEDIES: dict[str, Message] = {
+    "trigger": compose("remedy-trigger"),
+    "late-trigger": compose("remedy-late-trigger"),
+    "missing": compose("remedy-missing"),
+    "dropped": compose("remedy-dropped"),
+    "late": compose("remedy-late"),
+    "frozen": compose("remedy-frozen"),
+    "size": compose("remedy-size"),
+    "lights-off": compose("remedy-lights-off"),
+    "dark": compose("remedy-dark"),
+    "swapped": compose("remedy-swapped"),
+    "view": compose("remedy-view"),
+    "moved": compose("remedy-moved"),
+    "overexposed": compose("remedy-overexposed"),
+    "blurred": compose("remedy-blurred"),
+    "setting": compose("remedy-setting"),
+    "plates": compose("remedy-plates"),
+    "empty": compose("remedy-empty"),
+    "cut-off": compose("remedy-cut-off"),
+    "disturbed": compose("remedy-disturbed"),
+    "occupied": compose("remedy-occupied"),
 }
 WARNINGS = frozenset({"moved", "overexposed", "blurred", "setting", "plates", "empty", "cut-off"})
 """Faults with which a capture is still worth reconstructing; the others end it."""
@@ -71,6 +72,7 @@ class FaultDocument(TypedDict):
     camera: str | None
     detail: str
     remedy: str
+    detail_message: MessageDocument
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +81,7 @@ class Fault:
 
     code: str
     camera: str | None
-    detail: str
+    detail: Message
 
     @property
     def is_error(self) -> bool:
@@ -87,16 +89,36 @@ class Fault:
         return self.code not in WARNINGS
 
     @property
-    def remedy(self) -> str:
+    def remedy(self) -> Message:
         """What to do."""
         return REMEDIES[self.code]
 
     def document(self) -> FaultDocument:
         """For JSON."""
-        return {"code": self.code, "camera": self.camera, "detail": self.detail, "remedy": self.remedy}
+        return {
+            "code": self.code,
+            "camera": self.camera,
+            "detail": self.detail.text,
+            "remedy": self.remedy.text,
+            "detail_message": self.detail.document(),
+        }
+
+    def measured(self) -> Message:
+        """Returns what was measured, with the camera."""
+        return compose("fault-measured", camera=self.camera or "rig", measured=self.detail)
+
+    def message(self) -> Message:
+        """Returns all of it in one sentence."""
+        camera = self.camera or "rig"
+        return compose("fault-told", camera=camera, fault=self.code, measured=self.detail, remedy=self.remedy)
 
     def __str__(self) -> str:
-        return f"{self.camera or 'rig'}: {self.code}: {self.detail}: {self.remedy}"
+        return self.message().text
+
+
+def read_fault(document: Mapping[str, Any]) -> Fault:
+    """Reads ``Fault.document``; in that of an earlier version the detail is a text alone."""
+    return Fault(document["code"], document["camera"], read_message(document.get("detail_message", document["detail"])))
 
 
 class ShotFailed(EigenheadError):
@@ -104,7 +126,7 @@ class ShotFailed(EigenheadError):
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
-        super().__init__("the shot failed: " + "; ".join(map(str, self.faults)))
+        super().__init__(compose("shot-failed", faults=[fault.message() for fault in self.faults]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +292,7 @@ def certify(
     common_s = median(of_outputs) if len(of_outputs) >= 3 else 0.0
     faults: list[Fault] = []
     if common_s > skew_most_s:
-        faults.append(Fault("late-trigger", None, f"frames came {common_s * 1000:.0f} ms after the release"))
+        faults.append(Fault("late-trigger", None, compose("frames-late", late_ms=common_s * 1000)))
     else:
         common_s = 0.0
     lines = []
@@ -295,11 +317,10 @@ def _status(frame: Frame | None, skew_s: float | None, common_s: float, timing: 
     return "dropped" if lost else "late"
 
 
-def _lateness(status: Status, skew_s: float, timing: Timing) -> str:
-    after = f"came {skew_s * 1000:.0f} ms after it was due"
+def _lateness(status: Status, skew_s: float, timing: Timing) -> Message:
     if status == "dropped":
-        return f"no frame of the release, the next one {after}"
-    return f"its frame {after}" if timing.triggered else f"it runs freely, and its next frame {after}"
+        return compose("frame-lost", late_ms=skew_s * 1000)
+    return compose("frame-late" if timing.triggered else "free-frame-late", late_ms=skew_s * 1000)
 
 
 def _ms(seconds: float | None) -> float | None:

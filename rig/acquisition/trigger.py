@@ -15,6 +15,7 @@ import serial
 
 from rig.errors import EigenheadError
 from rig.formats.trigger_lines import BAUD, CLOCK_PERIOD_US, PROTOCOL, REPLY, REQUEST, LineReader, encode_line
+from rig.messages.message import Message, compose
 
 BUSY_S = 1.5  # the longest delay and the longest pulse, 1 s in all, with room for the lines between
 
@@ -27,35 +28,29 @@ class TriggerUnplugged(TriggerError):
     """The serial port is not there, or went away."""
 
     def __init__(self, port: str, why: str) -> None:
-        super().__init__(f"trigger box: {port} is unplugged or cannot be opened ({why}); check its USB cable and power")
+        super().__init__(compose("trigger-unplugged", port=port, reason=why))
 
 
 class TriggerSilent(TriggerError):
     """The port is there, but nothing answers."""
 
     def __init__(self, port: str, body: str, waited_s: float) -> None:
-        super().__init__(
-            f"trigger box: no answer on {port} to {body.split()[0]} within {waited_s:.1f} s; check that the box "
-            "has power and that rig.toml names its port and baud rate"
-        )
+        super().__init__(compose("trigger-silent", port=port, command=body.split()[0], waited_s=waited_s))
 
 
 class WrongDevice(TriggerError):
     """Something else than a trigger box is on the port."""
 
     def __init__(self, port: str, said: str) -> None:
-        super().__init__(
-            f"trigger box: the device on {port} does not speak {PROTOCOL} (it said {said!r}); "
-            "put the box's own port from /dev/serial/by-id into rig.toml"
-        )
+        super().__init__(compose("trigger-other-device", port=port, protocol=PROTOCOL, said=f"{said!r}"))
 
 
 class TriggerRefused(TriggerError):
     """The box understood and refused: ``code`` is one of UNKNOWN, ARGUMENT, NOT-ARMED, BUSY."""
 
-    def __init__(self, body: str, code: str) -> None:
+    def __init__(self, body: str, code: Message | str) -> None:
         self.code = code
-        super().__init__(f"trigger box: refused {body!r}: {code}")
+        super().__init__(compose("trigger-refused", command=f"{body!r}", reason=code))
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +249,7 @@ def _integers(command: str, words: list[str], count: int) -> list[int]:
     except ValueError:
         numbers = []
     if len(numbers) < count:
-        raise TriggerRefused(command, f"answered {' '.join(words)!r}, which is no answer")
+        raise TriggerRefused(command, compose("trigger-answer-unknown", answer=f"{' '.join(words)!r}"))
     return numbers
 
 

@@ -15,6 +15,7 @@ from rig.acquisition.shot import CheckDocument, Fault, PictureCheck
 from rig.acquisition.subject_place import SubjectPlace, find_subject, subject_of_mask
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb
+from rig.messages.message import compose
 
 Verdict = Literal["good", "usable", "poor"]
 
@@ -101,13 +102,13 @@ def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
 def _place_faults(views: Mapping[str, ViewCheck]) -> list[Fault]:
     looked = {name: view.place for name, view in views.items() if view.looked}
     if looked and not any(looked.values()):
-        return [Fault("empty", None, "no picture differs from its clean plate as a head would")]
+        return [Fault("empty", None, compose("nobody-in-pictures"))]
     faults = []
     for name, place in looked.items():
         if place is None:
-            faults.append(Fault("empty", name, "its picture does not differ from its clean plate as a head would"))
+            faults.append(Fault("empty", name, compose("nobody-in-picture")))
         elif place.cut_off:
-            faults.append(Fault("cut-off", name, f"the head reaches the picture's edge ({', '.join(place.cut_off)})"))
+            faults.append(Fault("cut-off", name, compose("head-cut-off", sides=place.cut_off)))
     return faults
 
 

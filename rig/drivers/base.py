@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from rig.errors import EigenheadError
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class Driver(Protocol):
         """Finds the camera by its identity and starts it."""
         ...
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         """Applies the settings of rig.toml; one line for each that the camera did not take."""
         ...
 
@@ -71,39 +72,37 @@ class Driver(Protocol):
 class DriverError(EigenheadError):
     """A camera does not do what it should; the message starts with its name."""
 
-    def __init__(self, camera: str, message: str) -> None:
+    def __init__(self, camera: str, message: Message) -> None:
         self.camera = camera
-        super().__init__(f"{camera}: {message}")
+        super().__init__(compose("located", where=camera, fault=message))
 
 
 class CameraNotFound(DriverError):
     """No camera with this identity."""
 
-    def __init__(self, camera: CameraConfig, why: str) -> None:
-        super().__init__(
-            camera.name, f"no camera {camera.identity!r} ({why}); check its cable and power, and identity in rig.toml"
-        )
+    def __init__(self, camera: CameraConfig, why: Message | str) -> None:
+        super().__init__(camera.name, compose("camera-not-found", identity=f"{camera.identity!r}", reason=why))
 
 
 class CameraLost(DriverError):
     """The camera went away, or sends what is no picture."""
 
-    def __init__(self, camera: CameraConfig, why: str) -> None:
-        super().__init__(camera.name, f"lost ({why}); check its cable and power")
+    def __init__(self, camera: CameraConfig, why: Message | str) -> None:
+        super().__init__(camera.name, compose("camera-lost", reason=why))
 
 
 class GrabTimeout(DriverError):
     """No frame in time; the camera may still be well."""
 
     def __init__(self, camera: CameraConfig, timeout_s: float) -> None:
-        super().__init__(camera.name, f"no frame within {timeout_s:.2f} s")
+        super().__init__(camera.name, compose("no-frame-within", seconds=timeout_s))
 
 
 class DriverMissing(DriverError):
     """The vendor's library is not installed."""
 
-    def __init__(self, camera: CameraConfig, needs: str) -> None:
-        super().__init__(camera.name, f"driver {camera.driver!r} needs {needs}")
+    def __init__(self, camera: CameraConfig, needs: Message | str) -> None:
+        super().__init__(camera.name, compose("driver-needs", driver=f"{camera.driver!r}", needs=needs))
 
 
 def grab_frame(driver: Driver, timeout_s: float) -> Frame:

@@ -13,6 +13,7 @@ from statistics import median
 
 from rig.drivers.base import Arrival, CameraLost, Driver, DriverError, Frame, GrabTimeout, upright
 from rig.formats.rig_toml import CameraConfig
+from rig.messages.message import Message, compose
 
 _SLICE_S = 0.2  # how long a grab may hold up closing
 _SOFTWARE_SLICE_S = 0.02  # and the command to a camera that is triggered by software
@@ -29,8 +30,8 @@ class FeedState:
     frames: int  # since it was opened
     last_seen_s: float | None
     period_s: float | None  # between frames of a camera that runs by itself
-    error: str | None
-    unmet: tuple[str, ...]  # settings that the camera did not take
+    error: Message | None
+    unmet: tuple[Message, ...]  # settings that the camera did not take
 
 
 class CameraFeed:
@@ -51,7 +52,7 @@ class CameraFeed:
         self._opened = False
         self._count = 0
         self._error: DriverError | None = None
-        self._unmet: tuple[str, ...] = ()
+        self._unmet: tuple[Message, ...] = ()
         self._thread = threading.Thread(target=self._run, name=f"camera {camera.name}", daemon=True)
 
     def start(self) -> None:
@@ -78,7 +79,7 @@ class CameraFeed:
                 self._count,
                 self._arrivals_s[-1] if self._arrivals_s else None,
                 median(gaps) if gaps and median(gaps) <= _SLOWEST_S else None,
-                None if self._error is None else str(self._error),
+                None if self._error is None else self._error.message,
                 self._unmet,
             )
 
@@ -135,7 +136,11 @@ class CameraFeed:
             except DriverError as error:
                 self._note_error(error)
             except Exception as error:  # a vendor's library may raise anything; the other cameras go on
-                self._note_error(DriverError(self.camera.name, f"driver failed: {type(error).__name__}: {error}"))
+                self._note_error(
+                    DriverError(
+                        self.camera.name, compose("driver-failed", kind=type(error).__name__, reason=str(error))
+                    )
+                )
             self._driver.close()
             self._stop.wait(_REOPEN_S)
 
@@ -175,7 +180,7 @@ class CameraFeed:
             return None  # one damaged frame is a dropped frame; the camera is well
         return Frame(upright(image, self.camera.rotation_deg), arrival.time_s, arrival.sequence)
 
-    def _note_opened(self, unmet: tuple[str, ...]) -> None:
+    def _note_opened(self, unmet: tuple[Message, ...]) -> None:
         with self._changed:
             self._opened, self._unmet, self._error, self._count = True, unmet, None, 0
             self._arrivals_s.clear()

@@ -25,6 +25,7 @@ from rig.drivers.base import (
 )
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 
 _BUFFERS = 4
 _SOURCES = {"external": b"Line1", "software": b"Software"}
@@ -47,7 +48,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     try:
         return GenicamDriver(camera, library())
     except OSError as error:
-        raise DriverMissing(camera, "Aravis: apt-get install libaravis-0.8-0") from error
+        raise DriverMissing(camera, compose("needs-aravis")) from error
 
 
 class GenicamDriver:
@@ -61,7 +62,7 @@ class GenicamDriver:
         self._device: int | None = None
         self._stream: int | None = None
         self._buffer: int | None = None
-        self._unmet: tuple[str, ...] = ()
+        self._unmet: tuple[Message, ...] = ()
         self._sequence = 0
 
     def open(self, timeout_s: float) -> None:
@@ -74,12 +75,12 @@ class GenicamDriver:
             self.close()
             raise CameraNotFound(self._camera, str(error)) from error
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         return self._unmet  # applied before the acquisition started: sizes cannot change after it
 
     def grab(self, timeout_s: float) -> Arrival:
         if self._stream is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         deadline_s = time.monotonic() + timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0:
             buffer = self._aravis.call("arv_stream_timeout_pop_buffer", self._stream, round(left_s * 1e6))
@@ -96,7 +97,7 @@ class GenicamDriver:
 
     def retrieve(self) -> ImageRgb:
         if self._buffer is None:
-            raise CameraLost(self._camera, "no frame was grabbed")
+            raise CameraLost(self._camera, compose("no-frame-grabbed"))
         width = self._aravis.call("arv_buffer_get_image_width", self._buffer)
         height = self._aravis.call("arv_buffer_get_image_height", self._buffer)
         pixel_format = self._aravis.call("arv_buffer_get_image_pixel_format", self._buffer)
@@ -108,7 +109,7 @@ class GenicamDriver:
         try:
             self._aravis.call("arv_camera_software_trigger", self._device)
         except AravisError as error:
-            raise CameraLost(self._camera, f"does not release: {error}") from error
+            raise CameraLost(self._camera, compose("camera-does-not-release", reason=str(error))) from error
 
     def close(self) -> None:
         device, stream = self._device, self._stream
@@ -137,9 +138,9 @@ class GenicamDriver:
                 if wanted in (device_id, serial, self._aravis.call("arv_get_device_physical_id", index)):
                     return device_id
                 found.append(serial or device_id)
-        raise CameraNotFound(self._camera, f"serial numbers found: {', '.join(found) or 'none'}")
+        raise CameraNotFound(self._camera, compose("serial-numbers-found", found=found or ["none"]))
 
-    def _apply(self) -> tuple[str, ...]:
+    def _apply(self) -> tuple[Message, ...]:
         camera, unmet = self._camera, []
         settings: list[tuple[str, object, list[tuple]]] = []
         if camera.pixel_format is not None:
@@ -149,7 +150,7 @@ class GenicamDriver:
             region = ("set_region", 0, 0, camera.width, camera.height)
             settings.append(("width x height", f"{camera.width} x {camera.height}", [region]))
         elif camera.width is not None or camera.height is not None:
-            unmet.append("width and height are set together: one of them is missing")
+            unmet.append(compose("sizes-set-together"))
         if camera.exposure_ms is not None:
             self._switch_off("exposure_time_auto")
             settings.append(("exposure_ms", camera.exposure_ms, [("set_exposure_time", camera.exposure_ms * 1000)]))
@@ -157,7 +158,7 @@ class GenicamDriver:
             self._switch_off("gain_auto")
             settings.append(("gain_db", camera.gain_db, [("set_gain", camera.gain_db)]))
         if camera.white_balance_k is not None:
-            unmet.append("white_balance_k is no GenICam feature: balance the camera with its vendor's tool")
+            unmet.append(compose("no-genicam-white-balance"))
         source = _SOURCES.get(camera.trigger)
         if source is not None:
             settings.append(("trigger", camera.trigger, [("set_trigger", source)]))
@@ -169,7 +170,7 @@ class GenicamDriver:
                 for name, *arguments in calls:
                     self._aravis.call(f"arv_camera_{name}", self._device, *arguments)
             except AravisError as error:
-                unmet.append(f"{key} {value} was not taken ({error})")
+                unmet.append(compose("setting-not-taken-because", setting=key, value=str(value), reason=str(error)))
         return tuple(unmet)
 
     def _switch_off(self, automatic: str) -> None:
@@ -198,11 +199,11 @@ class GenicamDriver:
         if pixel_format not in _CONVERSIONS:
             raise DriverError(
                 self._camera.name,
-                f"pixel format 0x{pixel_format:08X} is not read; set pixel_format to Mono8, RGB8 or BayerRG8",
+                compose("pixel-format-unread", pixel_format=f"{pixel_format:08X}"),
             )
         channels = pixel_format >> 16 & 0xFF
         if len(data) < width * height * channels // 8:
-            raise CameraLost(self._camera, "a frame is incomplete")
+            raise CameraLost(self._camera, compose("frame-incomplete"))
         shape = (height, width, 3) if channels == 24 else (height, width)
         image = data[: width * height * channels // 8].reshape(shape)
         conversion = _CONVERSIONS[pixel_format]

@@ -16,6 +16,7 @@ from rig.drivers.opencv import decode_jpeg
 from rig.errors import how_to_install
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 
 # Two cameras that open at once would both walk the USB bus and claim each other's interface.
 _bus = threading.Lock()
@@ -51,7 +52,7 @@ class GphotoDriver:
             _ports_by_serial.pop(_serial_of(self._camera), None)  # plugged in anew it has another port
             raise CameraNotFound(self._camera, str(error)) from error
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         camera = self._camera
         wanted: list[tuple[str, str, Any]] = [("capturetarget", "capturetarget", "Internal RAM")]
         if camera.pixel_format is not None:
@@ -60,11 +61,11 @@ class GphotoDriver:
             wanted.append(("exposure_ms", "shutterspeed", camera.exposure_ms / 1000))
         if camera.white_balance_k is not None:
             wanted.append(("white_balance_k", "colortemperature", camera.white_balance_k))
-        unmet = [] if camera.gain_db is None else ["gain_db is not a setting of this camera: set its ISO on the body"]
+        unmet = [] if camera.gain_db is None else [compose("no-gain-on-camera")]
         for key, name, value in wanted:
-            if not self._set(name, value):
-                unmet.append(f"{key} {value} was not taken")
-        return tuple(line for line in unmet if not line.startswith("capturetarget"))
+            if not self._set(name, value) and key != "capturetarget":
+                unmet.append(compose("setting-refused", setting=key, value=str(value)))
+        return tuple(unmet)
 
     def grab(self, timeout_s: float) -> Arrival:
         deadline_s = time.monotonic() + timeout_s
@@ -81,7 +82,7 @@ class GphotoDriver:
 
     def retrieve(self) -> ImageRgb:
         if self._file is None:
-            raise CameraLost(self._camera, "no picture was grabbed")
+            raise CameraLost(self._camera, compose("no-picture-grabbed"))
         try:
             file = self._opened().file_get(*self._file, self._gp.GP_FILE_TYPE_NORMAL)
             return decode_jpeg(self._camera, bytes(memoryview(file.get_data_and_size())))
@@ -94,7 +95,7 @@ class GphotoDriver:
         try:
             self._opened().trigger_capture()
         except self._gp.GPhoto2Error as error:
-            raise CameraLost(self._camera, f"does not release: {error}") from error
+            raise CameraLost(self._camera, compose("camera-does-not-release", reason=str(error))) from error
 
     def close(self) -> None:
         device, self._device = self._device, None
@@ -104,7 +105,7 @@ class GphotoDriver:
 
     def _opened(self) -> Any:
         if self._device is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         return self._device
 
     def _port(self) -> str:
@@ -121,7 +122,7 @@ class GphotoDriver:
         port = _ports_by_serial.get(sought)
         if port is None:
             found = ", ".join(sorted(_ports_by_serial)) or "none"
-            raise CameraNotFound(self._camera, f"serial numbers found: {found}")
+            raise CameraNotFound(self._camera, compose("serial-numbers-found", found=found))
         return port
 
     def _serial(self, port: str) -> str | None:

@@ -15,6 +15,7 @@ from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, Driver
 from rig.drivers.mjpeg import MjpegStream, StreamBroken, StreamTimeout
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 
 _READ_LIMIT_S = 1.0  # of VideoCapture.grab, which takes no timeout of its own: it may overstay by that much
 _STALE_S = 1.0  # a kernel stamp further from now than this is of another clock
@@ -43,21 +44,21 @@ class MjpegDriver:
         try:
             self._stream = MjpegStream(self._camera.identity, timeout_s)
         except (OSError, StreamBroken, StreamTimeout, ValueError) as error:
-            raise CameraNotFound(self._camera, _reason(error, "no answer")) from error
+            raise CameraNotFound(self._camera, _reason(error, compose("no-answer"))) from error
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         asked = [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None]
-        return tuple(f"{key} cannot be set over HTTP: set it on the camera's own page" for key in asked)
+        return tuple(compose("not-set-over-http", setting=key) for key in asked)
 
     def grab(self, timeout_s: float) -> Arrival:
         if self._stream is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         try:
             time_s, self._jpeg = self._stream.next_part(timeout_s)
         except StreamTimeout as error:
             raise GrabTimeout(self._camera, timeout_s) from error
         except (OSError, StreamBroken) as error:
-            raise CameraLost(self._camera, _reason(error, "connection lost")) from error
+            raise CameraLost(self._camera, _reason(error, compose("connection-lost"))) from error
         self._sequence += 1
         return Arrival(time_s, self._sequence)
 
@@ -89,20 +90,20 @@ class VideoCaptureDriver:
         target, backend = self._camera.identity, cv2.CAP_FFMPEG
         if self._is_device:
             if not Path(target).exists():
-                raise CameraNotFound(self._camera, "no such device")
+                raise CameraNotFound(self._camera, compose("no-such-device"))
             target, backend = str(Path(target).resolve()), cv2.CAP_V4L2
         options = [] if self._is_device else [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, max(1, round(timeout_s * 1000))]
         read = [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(_READ_LIMIT_S * 1000)]
         capture = cv2.VideoCapture(target, backend, [*options, *read])
         if not capture.isOpened():
             capture.release()
-            raise CameraNotFound(self._camera, "cannot be opened as a video source")
+            raise CameraNotFound(self._camera, compose("no-video-source"))
         self._capture = capture
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         capture = self._opened()
         unmet = [
-            f"{key} {wanted} was not taken (it is {capture.get(prop):g})"
+            compose("setting-not-taken", setting=key, value=str(wanted), actual=capture.get(prop))
             for key, wanted, prop, value in self._settings()
             if not capture.set(prop, value) or not _is_taken(prop, value, capture.get(prop))
         ]
@@ -115,14 +116,14 @@ class VideoCaptureDriver:
             # OpenCV tells a timeout and a lost camera apart by nothing but the time that they took.
             if time.monotonic() - started_s >= 0.9 * _READ_LIMIT_S:
                 raise GrabTimeout(self._camera, timeout_s)
-            raise CameraLost(self._camera, "it delivers no more frames")
+            raise CameraLost(self._camera, compose("no-more-frames"))
         self._sequence += 1
         return Arrival(self._stamp_s(capture), self._sequence)
 
     def retrieve(self) -> ImageRgb:
         done, image = self._opened().retrieve()
         if not done or image is None:
-            raise DriverError(self._camera.name, "a frame could not be decoded")
+            raise DriverError(self._camera.name, compose("frame-not-decoded"))
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB)
 
     def trigger(self) -> None:
@@ -135,7 +136,7 @@ class VideoCaptureDriver:
 
     def _opened(self) -> cv2.VideoCapture:
         if self._capture is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         return self._capture
 
     def _stamp_s(self, capture: cv2.VideoCapture) -> float:
@@ -174,7 +175,7 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
     """RGB pixels of an encoded picture. Raises DriverError where it is damaged."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
     if image is None:
-        raise DriverError(camera.name, f"a frame of {len(data)} bytes is no picture that OpenCV can decode")
+        raise DriverError(camera.name, compose("frame-no-picture", bytes=len(data)))
     return image
 
 
@@ -183,5 +184,5 @@ def _is_taken(prop: int, wanted: float, found: float) -> bool:
     return abs(found - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 
-def _reason(error: Exception, otherwise: str) -> str:
+def _reason(error: Exception, otherwise: Message) -> Message | str:
     return str(error).splitlines()[0] if str(error) else otherwise

@@ -13,6 +13,7 @@ from rig.errors import InputError
 from rig.formats.images import IMAGE_SUFFIXES, read_image
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 
 _FPS = 10.0
 
@@ -39,26 +40,28 @@ class ReplayDriver:
         paths = [self._images / (self._recorded + suffix) for suffix in IMAGE_SUFFIXES]
         path = next((path for path in paths if path.is_file()), None)
         if path is None:
-            raise CameraNotFound(self._camera, f"no picture of {self._recorded} in {self._images.parent.name}/images")
+            raise CameraNotFound(
+                self._camera, compose("no-recorded-picture", camera=self._recorded, folder=self._images.parent.name)
+            )
         try:
             self._image = read_image(path)
         except InputError as error:
             raise CameraNotFound(self._camera, str(error)) from error
         self._pace = Pace(self._camera.fps or _FPS)
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         return ()
 
     def grab(self, timeout_s: float) -> Arrival:
         if self._pace is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         if not self._pace.wait(timeout_s):
             raise GrabTimeout(self._camera, timeout_s)
         return Arrival(time.monotonic(), self._pace.beat)
 
     def retrieve(self) -> ImageRgb:
         if self._image is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         return self._image
 
     def trigger(self) -> None:

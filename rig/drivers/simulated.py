@@ -13,6 +13,7 @@ from rig.drivers.frame_clock import Pace
 from rig.errors import InputError
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 from rig.studio.devices.sources import ImageSource, SceneImages, scene_of_file
 
 _FPS = 10.0
@@ -43,20 +44,20 @@ class SimulatedDriver:
             self._source = self._build()
         self._pace = Pace(self._camera.fps or _FPS)
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         asked = [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None]
-        return tuple(f"{key} is no setting of a simulated camera" for key in asked)
+        return tuple(compose("no-setting-of-simulated", setting=key) for key in asked)
 
     def grab(self, timeout_s: float) -> Arrival:
         if self._pace is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         if not self._pace.wait(timeout_s):
             raise GrabTimeout(self._camera, timeout_s)
         return Arrival(time.monotonic(), self._pace.beat)
 
     def retrieve(self) -> ImageRgb:
         if self._source is None or self._pace is None:
-            raise CameraLost(self._camera, "not open")
+            raise CameraLost(self._camera, compose("camera-not-open"))
         return self._source(self._view, time.monotonic())
 
     def trigger(self) -> None:
@@ -72,5 +73,5 @@ class SimulatedDriver:
         except InputError as error:
             raise CameraNotFound(self._camera, str(error)) from error
         if self._view not in scene.rig:
-            raise CameraNotFound(self._camera, f"the studio has {', '.join(scene.rig.names)}")
+            raise CameraNotFound(self._camera, compose("studio-has", names=scene.rig.names))
         return SceneImages(scene, seated=True)

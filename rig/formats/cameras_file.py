@@ -12,7 +12,6 @@ scale is free and taken as millimetres; aniposelib's, nerfstudio's and OpenCV's 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rig.capture import Remark
 from rig.errors import InputError
 from rig.formats.blender_script import write_blender
 from rig.formats.cameras_json import read_rig, write_rig
@@ -24,6 +23,7 @@ from rig.formats.reading import CamerasRead
 from rig.formats.realitycapture import COLUMNS, read_csv, read_xmp, write_csv, write_xmp
 from rig.formats.transforms_json import read_transforms, write_transforms
 from rig.formats.unread_keys import unread_keys
+from rig.messages.message import compose
 from rig.rig import Rig
 
 WRITERS: dict[str, Callable[[Rig, Path], None]] = {
@@ -103,7 +103,7 @@ def read_cameras(path: Path) -> CamerasRead:
     if path.name == "transforms.json":
         return read_transforms(path)
     if path.suffix == ".json":
-        return CamerasRead(read_rig(path), tuple(Remark("unknown-key", told) for told in unread_keys(path)))
+        return CamerasRead(read_rig(path), tuple(compose("unknown-key", remark=told) for told in unread_keys(path)))
     if path.suffix in (".bin", ".txt"):
         return read_colmap(path.parent, path.suffix)
     if path.suffix == ".xmp":

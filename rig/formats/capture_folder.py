@@ -21,7 +21,7 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
-from rig.capture import Capture, Features, Remark
+from rig.capture import Capture, Features
 from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
@@ -39,6 +39,7 @@ from rig.formats.shot_files import (
     stray_sentence,
 )
 from rig.formats.work_size import work_features, work_rig, work_share
+from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.text import suggest
@@ -86,7 +87,7 @@ def read_rig_of(rig_file: Path) -> CamerasRead:
         raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
 
 
-def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Remark]:
+def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
     """Pictures that belong to no camera, and folders of pictures that are nobody's."""
     told = [stray_sentence(files.strays, rig)] if files.strays else []
     known = ("images", *BESIDE_PICTURES, *rig.names)
@@ -95,15 +96,15 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Remark]:
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
         if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
             told.append(f"{path.name}/ is not read: pictures lie in images/, masks/ and background/")
-    return [Remark("file-unread", message) for message in told]
+    return [compose("file-unread", remark=message) for message in told]
 
 
-def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Remark]:
+def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
     """Cameras of another program: files that do nothing here."""
     read, *others = (path.relative_to(folder).as_posix() for path in rigs)
     others += _other_models(folder, rigs[0])
     told = [f"{other} is not read: the cameras come from {read}" for other in others]
-    return [Remark("file-unread", message) for message in told]
+    return [compose("file-unread", remark=message) for message in told]
 
 
 def _other_models(folder: Path, rig_file: Path) -> list[str]:
@@ -198,7 +199,7 @@ def read_shot(
     )
 
 
-def _sample_bits(jobs: Sequence[tuple[str, str, Path]], faults: list[str]) -> tuple[Mapping[str, int], list[Remark]]:
+def _sample_bits(jobs: Sequence[tuple[str, str, Path]], faults: list[str]) -> tuple[Mapping[str, int], list[Message]]:
     """Bits that the files of each kind use of 16, and what is said of fewer; undeveloped mosaics are a fault."""
     kinds = ("images", "background")
     samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
@@ -213,7 +214,7 @@ def _sample_bits(jobs: Sequence[tuple[str, str, Path]], faults: list[str]) -> tu
     for used in sorted({bits[kind] for kind in kinds} - {WHOLE_BITS}):
         folders = " and ".join(f"{kind}/" for kind in kinds if bits[kind] == used)
         text = f"no pixel of {folders} is above {2**used - 1} of 65535: read as {used} bits"
-        remarks.append(Remark("picture-levels", f"{text}; shift them by {WHOLE_BITS - used} when writing"))
+        remarks.append(compose("picture-levels", remark=f"{text}; shift them by {WHOLE_BITS - used} when writing"))
     return bits, remarks
 
 

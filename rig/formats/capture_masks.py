@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from rig.capture import Remark
 from rig.formats.mask_values import MaskReading, Plane, Share, read_masks
 from rig.formats.work_size import at_share, work_rig, work_share
 from rig.mask_polarity import inverted_masks
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 
@@ -24,7 +24,7 @@ class MaskSubjects:
 
     masks: Mapping[str, Bool[np.ndarray, "_ _"]]
     soft: Mapping[str, UInt8[np.ndarray, "_ _"]]
-    remarks: tuple[Remark, ...]
+    remarks: tuple[Message, ...]
 
 
 def mask_subjects(
@@ -53,9 +53,11 @@ def mask_subjects(
         elif reading.soft:
             soft[name] = share
             soft[name].setflags(write=False)
-    remarks = [Remark("mask-undecided", text) for text in _by_text({files[n]: r.remark for n, r in usable.items()})]
+    remarks = [
+        compose("mask-undecided", remark=text) for text in _by_text({files[n]: r.remark for n, r in usable.items()})
+    ]
     if inverted:
-        remarks.append(Remark("mask-inverted", _inverted_text([files[name] for name in inverted], len(planes))))
+        remarks.append(compose("mask-inverted", remark=_inverted_text([files[name] for name in inverted], len(planes))))
     return MaskSubjects(masks, soft, tuple(remarks))
 
 

@@ -5,10 +5,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from rig.capture import Remark
 from rig.errors import InputError
 from rig.formats.cameras_json import FORMAT, rig_from_document
 from rig.formats.foreign_keys import ForeignKey, Table, says_nothing
+from rig.messages.message import Message, compose, message_of
 from rig.rig import Rig
 
 NAMED_MOST = 4  # cameras or keys that one sentence names
@@ -21,7 +21,7 @@ class CamerasRead:
     """A rig, what its reader noticed and did not mind, and the cameras of the file that take no part, with reasons."""
 
     rig: Rig
-    remarks: tuple[Remark, ...] = ()
+    remarks: tuple[Message, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -51,18 +51,18 @@ class Reading:
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
         """The rig of ``eigenhead-cameras/1`` entries. Raises InputError naming every fault."""
-        told: list[Remark] = []
+        told: list[Message] = []
         for (key, rule), cases in self._meant.items():
             sentence = f"{_whose([name for name, _ in cases], key)} is {shown(cases[0][1])}: {rule.why}"
             if rule.treatment == "refused":
                 self.faults.append(sentence)
             else:
-                told.append(Remark("unknown-key", f"{self.subject}: {sentence}; it is not used"))
+                told.append(compose("unknown-key", remark=f"{self.subject}: {sentence}; it is not used"))
         if self._unknown:
             keys = listed([shown(key) for key in self._unknown])
             what = "key is" if len(self._unknown) == 1 else "keys are"
-            told.append(Remark("unknown-key", f"{self.subject}: the {what} not known and not read: {keys}"))
-        told += [Remark("view-left-out", sentence) for sentence in self._left_out()]
+            told.append(compose("unknown-key", remark=f"{self.subject}: the {what} not known and not read: {keys}"))
+        told += [compose("view-left-out", remark=sentence) for sentence in self._left_out()]
         names = [str(entry.get("name")) for entry in entries]
         try:
             rig = rig_from_document({"format": FORMAT, "unit": "mm", "cameras": list(entries)}, self.subject)
@@ -80,24 +80,30 @@ class Reading:
         return [f"{listed(names)} {why} in {self.subject}: taking no part" for why, names in reasons.items()]
 
 
-def say_once(faults: Sequence[str], names: Iterable[str]) -> list[str]:
+def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Message]:
     """Faults that differ only in the names of cameras and of their files, as one sentence that names the first and how
     many others there are."""
     ordered = sorted(set(names), key=len, reverse=True)
     name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
     plate = re.compile(r"\b(background/)\S+")
-    groups: dict[str, list[str]] = {}
-    for fault in dict.fromkeys(faults):
-        masked = plate.sub(r"\1", fault)
+    groups: dict[str, list[Message]] = {}
+    for fault in dict.fromkeys(message_of(fault) for fault in faults):
+        masked = plate.sub(r"\1", fault.text)
         groups.setdefault(masked if name is None else name.sub("\0", masked), []).append(fault)
     told = []
     for group in groups.values():
         if len(group) < SAME_LEAST or name is None:
             told += group
             continue
-        others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault)))
-        told.append(f"{group[0]}; the same is true of {len(group) - 1} more ({listed([*others])})")
+        others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault.text)))
+        told.append(compose("same-of-more", fault=group[0], count=len(group) - 1, names=some_of([*others])))
     return told
+
+
+def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Message:
+    """A few names, and how many more there are, for a message."""
+    more = len(names) - most
+    return compose("names-and-more", names=names[:most], more=more) if more > 0 else names
 
 
 def listed(names: Sequence[str], most: int = NAMED_MOST) -> str:

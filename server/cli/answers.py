@@ -15,6 +15,7 @@ import typer
 
 from pipeline.eigenheads.data_folder import DATA
 from rig.errors import EigenheadError, InputError
+from rig.messages.message import texts_of
 from rig.progress import Progress
 
 # Before OpenCV is loaded, here and in workers: what it has to say of a damaged picture, an error of ours says in words.
@@ -132,7 +133,7 @@ def wrong_usage(option: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise typer.BadParameter("; ".join(error.faults), param_hint=option) from error
+        raise typer.BadParameter("; ".join(texts_of(error.faults)), param_hint=option) from error
 
 
 def prepare_file(path: Path, *, overwrite: bool = True) -> None:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from rig.messages.message import texts_of
 from server.cli.answers import (
     Json,
     Overwrite,
@@ -139,7 +140,7 @@ def _calibrate_board(
     figures = found.figures()
     cameras = [f"{name}  {figure['rms_px']:.3f} px" for name, figure in figures["cameras"].items()]
     total = f"{figures['rms_px']:.3f} px over {figures['used_share']:.1%} of the corners"
-    answer(found.document(), json_out, [str(out), str(page), *cameras, total, *found.warnings])
+    answer(found.document(), json_out, [str(out), str(page), *cameras, total, *texts_of(found.warnings)])
 
 
 def _calibrate_scene(
@@ -162,7 +163,7 @@ def _calibrate_scene(
     ]
     total = f"{figures['rms_px']:.3f} px over {figures['points']} points; front camera {found.front}"
     for warning in found.warnings:
-        warn(warning)
+        warn(warning.text)
     answer(found.document(), json_out, [str(out), str(page), *cameras, total, f"scale: {found.scale.told}"])
 
 
@@ -193,7 +194,11 @@ def refine(
     write_atomically(page, refinement_page(run).encode())
     verdict = "refined" if run.refinement.kept else "not changed"
     cameras = [f"{name}  {px:.2f} px at the subject" for name, px in run.refinement.change_px.items()]
-    answer(run.document(), json_out, [f"{out}  {verdict}: {run.refinement.reason}", str(page), *cameras, *run.warnings])
+    answer(
+        run.document(),
+        json_out,
+        [f"{out}  {verdict}: {run.refinement.reason}", str(page), *cameras, *texts_of(run.warnings)],
+    )
 
 
 @app.command(epilog="Example: eigenhead convert cameras.json --to colmap --out sparse/0")
@@ -222,7 +227,7 @@ def convert(
     read = read_cameras(file)
     rig = read.rig
     for remark in read.remarks:
-        warn(f"{remark.code}: {remark.message}")
+        warn(f"{remark.code}: {remark}")
     prepare = prepare_folder if to in FOLDER_FORMATS else prepare_file
     prepare(out)
     write_rig_file(rig, out, to)

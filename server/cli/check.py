@@ -15,6 +15,7 @@ from rig.formats.cameras_file import read_cameras, rig_files
 from rig.formats.capture_folder import SCALE, capture_root, unread_files, unread_pictures
 from rig.formats.images import decode_image_file
 from rig.formats.shot_files import BESIDE_PICTURES, find_files, listed_pictures
+from rig.messages.message import MessageDocument, compose, documents_of, texts_of
 from rig.progress import Progress
 from server.cli.answers import service_settings
 from server.cli.reconstruct_local import folder_of
@@ -30,11 +31,6 @@ if TYPE_CHECKING:
 RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 
 
-class Warned(TypedDict):
-    code: str
-    message: str
-
-
 class Checked(TypedDict):
     """What `eigenhead check --json` prints: with ``faults`` a reconstruction fails, with ``warnings`` it goes on."""
 
@@ -42,7 +38,8 @@ class Checked(TypedDict):
     cameras: list[str]
     front: str | None
     faults: list[str]
-    warnings: list[Warned]
+    fault_messages: list[MessageDocument]
+    warnings: list[MessageDocument]
     will: list[str]
 
 
@@ -52,7 +49,7 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
-    found = Checked(capture=str(capture), cameras=[], front=None, faults=[], warnings=[], will=[])
+    found = Checked(capture=str(capture), cameras=[], front=None, faults=[], fault_messages=[], warnings=[], will=[])
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
@@ -69,18 +66,18 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     except (WrongVariable, WorkFailed):
         raise
     except InputError as error:
-        found["faults"] = list(error.faults)
+        found["faults"], found["fault_messages"] = texts_of(error.faults), documents_of(error.faults)
     except EigenheadError as error:
-        found["faults"] = [str(error)]
+        found["faults"], found["fault_messages"] = [error.message.text], [error.message.document()]
     return found
 
 
 def _check_front(front: str | None, cameras: list[str]) -> None:
     if front is not None and front not in cameras:
-        raise InputError("front", [f"front camera {front!r:.80} is none of the capture's ({', '.join(cameras)})"])
+        raise InputError("front", [compose("front-of-other-capture", front=f"{front!r:.80}", cameras=cameras)])
 
 
-def _told_by_files(root: Path) -> list[Warned]:
+def _told_by_files(root: Path) -> list[MessageDocument]:
     """What the reader of a capture folder notices and does not mind; nothing where its cameras cannot be read, which
     ``check_capture`` tells."""
     rigs = [*rig_files(root)]
@@ -92,8 +89,7 @@ def _told_by_files(root: Path) -> list[Warned]:
         return []
     files = find_files(root, read.rig, read.left_out)
     strays = () if files.faults else unread_pictures(root, files, read.rig)  # what is missing is said with them
-    remarks = [*read.remarks, *unread_files(root, rigs), *strays]
-    return [Warned(code=remark.code, message=remark.message) for remark in remarks]
+    return documents_of([*read.remarks, *unread_files(root, rigs), *strays])
 
 
 def _told_by_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
@@ -131,7 +127,7 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
         raise InputError("photographs", filter(None, faults))
 
 
-def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> list[Warned]:
+def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
     from pipeline.settings import OutputSettings
     from pipeline.silhouettes.segment import segment
     from pipeline.silhouettes.usable_views import usable_views
@@ -145,7 +141,7 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> lis
 
     views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures)
     warnings = [*views.warnings, *(chart_colours(shot, rig)[1] if chosen.texture.chart else ())]
-    return [Warned(code=warning.code, message=warning.message) for warning in warnings]
+    return documents_of(warnings)
 
 
 def lines(found: Checked) -> list[str]:

@@ -87,7 +87,7 @@ def _egl(settings: ServiceSettings) -> tuple[bool, str]:
     try:
         return True, child.remote(try_egl)()
     except WorkFailed as error:
-        return False, error.message
+        return False, error.message.text
     finally:
         child.close()
 

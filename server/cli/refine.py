@@ -18,6 +18,7 @@ from pipeline.stages.views import Views
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
 from rig.geometry import RigidTransform, Similarity
+from rig.messages.message import compose
 from rig.progress import Progress, discard_progress
 from rig.rig import Rig
 from server.cli.reconstruct_local import folder_of
@@ -48,7 +49,7 @@ def refine_locally(
         rig = rig or own
         faults = _differences(own, rig, same_poses=calibration is None)
         if faults:
-            raise InputError(path.name, [*faults, "the captures must be of one rig, calibrated once"])
+            raise InputError(path.name, [*faults, compose("captures-of-one-rig")])
         found = segment(capture, rig, settings.segmentation, report=discard_progress)
         kept, warnings = without_moved_cameras(found, rig)
         seen.append(kept)
@@ -66,11 +67,7 @@ def refine_locally(
         heads=None if head is None else Heads(head, starts, settings.fitting),
         report=lambda stage, fraction: report(stage, 0.5 + 0.5 * fraction),
     )
-    told = [
-        f"{name} has moved in {', '.join(where)} and took no part there: calibrate with the board again, "
-        "for refinement is for fractions of a pixel"
-        for name, where in sorted(moved.items())
-    ]
+    told = [compose("refinement-camera-moved", camera=name, captures=where) for name, where in sorted(moved.items())]
     return RefinementRun(refined, rig, tuple(path.name for path in captures), tuple(told))
 
 

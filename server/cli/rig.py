@@ -24,7 +24,7 @@ def rig_check(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
     lines = ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)) for row in (COLUMNS, *found.rows)]
     lines += [str(fault) for fault in found.faults if fault.camera is None]
     rows = [dict(zip(COLUMNS, row, strict=True)) for row in found.rows]
-    faults = [{"code": f.code, "camera": f.camera, "detail": f.detail} for f in found.faults]
+    faults = [fault.document() for fault in found.faults]
     answer({"healthy": found.healthy, "cameras": rows, "faults": faults}, json_out, lines)
     if not found.healthy:
         sys.exit(1)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from server.errors import NotFound
 from server.services.truth import surface_distance
 
@@ -31,7 +32,7 @@ def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
         elif words[0] == "property" and element == "vertex":
             fields.append((words[2], TYPES[words[1]]))
     if name not in dict(fields):
-        raise NotFound("number by vertex", name, f"{path.name} holds others")
+        raise NotFound(compose("thing-vertex-number"), name, compose("hint-other-numbers", file=path.name))
     return np.frombuffer(data, np.dtype(fields), count, end)[name].astype(np.float32)
 
 

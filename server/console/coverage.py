@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from calibration.board.board import board_from_document
 from calibration.board.corners import detect
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 from server.tasks.child import Bench
 
@@ -79,18 +80,17 @@ def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
     return lines
 
 
-def advice(lines: list[Coverage]) -> str:
+def advice(lines: list[Coverage]) -> Message:
     """The next thing to do."""
     if not lines or not any(line["views"] for line in lines):
-        return "Hold the board where several cameras see it whole, and take a shot."
+        return compose("board-hold")
     blind = [line["name"] for line in lines if line["views"] == 0]
     if blind:
-        return f"No view yet: {', '.join(blind)}. Turn the board towards them."
+        return compose("board-turn-to", cameras=blind)
     poor = sorted((line for line in lines if not line["enough"]), key=lambda line: (line["covered"], line["views"]))
     if poor:
-        names = ", ".join(line["name"] for line in poor[:3])
-        return f"Least covered: {names}. Tilt the board, and go to the rim of their images."
-    return "Every camera is covered. Calibrate."
+        return compose("board-cover", cameras=[line["name"] for line in poor[:3]])
+    return compose("board-covered")
 
 
 def _thinned(corners: list[list[float]]) -> list[list[float]]:

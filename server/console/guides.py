@@ -16,6 +16,7 @@ from pipeline.alignment.procrustes import procrustes
 from pipeline.multiview.triangulation import NoPoint, triangulate
 from pipeline.settings import CLICK_NOISE_PX
 from rig.camera import Camera
+from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress
 from rig.rig import Rig
 from server.tasks.child import Bench
@@ -49,7 +50,7 @@ class Helps(TypedDict):
     reprojected: dict[str, dict[str, list[float]]]
     off_px: dict[str, dict[str, float]]
     predicted: dict[str, dict[str, list[float]]]
-    contradictions: dict[str, str]
+    contradictions: dict[str, MessageDocument]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ class Located:
     position: Float[np.ndarray, " 3"] | None
     reprojected: dict[str, list[float]]
     off_px: dict[str, float]
-    contradiction: str | None
+    contradiction: Message | None
 
 
 class Guides:
@@ -85,7 +86,9 @@ class Guides:
             "reprojected": {name: found.reprojected for name, found in located.items() if found.reprojected},
             "off_px": {name: found.off_px for name, found in located.items() if found.off_px},
             "predicted": self._predict(places, landmarks),
-            "contradictions": {n: found.contradiction for n, found in located.items() if found.contradiction},
+            "contradictions": {
+                n: found.contradiction.document() for n, found in located.items() if found.contradiction
+            },
         }
 
     def _of(self, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
@@ -128,7 +131,7 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
     remarks = locate_features({name: views}, rig, noise_px=CLICK_NOISE_PX).remarks
     off = {camera: round(float(np.linalg.norm(r)), 2) for camera, r in found.residuals_px.items()}
     seen = _seen(rig, {name: found.position_world})[name]
-    return Located(found.position_world, seen, off, "; ".join(remarks) or None)
+    return Located(found.position_world, seen, off, _together(remarks))
 
 
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
@@ -187,3 +190,8 @@ def _near_image(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         near = (pixels > -OUTSIDE * size) & (pixels < (1 + OUTSIDE) * size)  # NaN is neither
     return np.asarray(near.all(axis=1))
+
+
+def _together(remarks: tuple[Message, ...]) -> Message | None:
+    """All remarks as one; None where there are none."""
+    return compose("several", messages=remarks) if len(remarks) > 1 else next(iter(remarks), None)

@@ -14,6 +14,7 @@ from rig.errors import EigenheadError
 from rig.formats.images import write_image
 from rig.formats.ply import write_ply
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from server.console.first_view import first_view
 from server.console.portrait import portrait
 from server.errors import Conflict, NotFound
@@ -30,7 +31,7 @@ def result_folder(service: Service, job_id: str) -> Path:
     """Raises Conflict where the job has no result."""
     state = service.jobs.state(job_id)
     if state != "succeeded":
-        raise Conflict("no-result", f"The job is {state}; it has no result.")
+        raise Conflict("no-result", compose("job-without-result", state=state))
     return service.store.folder("jobs", job_id) / "result"
 
 
@@ -44,7 +45,7 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
                 try:  # the folder of a job that is erased meanwhile is not made anew: the face would stay
                     write_image(kept, DRAWN[name](result), quality=QUALITY, parents=False)
                 except FileNotFoundError as error:
-                    raise NotFound("job", job_id) from error
+                    raise NotFound(compose("thing-job"), job_id) from error
     return kept
 
 

@@ -14,6 +14,7 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from rig.atomic_write import write_atomically
+from rig.messages.message import compose
 from server.address import is_loopback
 from server.errors import Forbidden, Unknown
 from server.services.keys import LOCAL, SCOPES, Caller
@@ -45,9 +46,9 @@ def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
 def permit(caller: Caller | None, scope: str) -> Caller:
     """``caller``, if it may do ``scope``. Raises Unknown, Forbidden."""
     if caller is None:
-        raise Unknown("key-missing", "An API key is needed: sign in again.")
+        raise Unknown("key-missing", compose("sign-in-again"))
     if not caller.may(scope):
-        raise Forbidden("scope-missing", f"Your key may not do that: it lacks the scope {scope!r}.")
+        raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope=f"{scope!r}"))
     return caller
 
 

@@ -12,6 +12,7 @@ import structlog
 
 from rig.acquisition.image_checks import blur_px, exposure
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 from server.console.live_frame import LiveFrame
 from server.console.studio_view import frames
 from server.services.rigs import RigBackend, jpeg, reduced
@@ -68,7 +69,7 @@ class RigSource:
 
 def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
     if picture is None:
-        return {"name": name, "jpeg": None, "fault": "The camera shows nothing. Check its cable and power."}
+        return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
     small = reduced(picture, WIDTH)
     level = exposure(small)
     found: LiveFrame = {
@@ -92,7 +93,7 @@ class LiveView:
         self._thread: threading.Thread | None = None
         self._watched = 0.0
         self._latest: tuple[int, bytes] = (0, b"")
-        self.fault = ""
+        self.fault: Message | None = None
 
     async def stream(self) -> AsyncIterator[bytes]:
         """Looks as they come: 4 bytes of header length, 4 of body length, a JSON header, the JPEGs in its order."""
@@ -134,22 +135,22 @@ class LiveView:
 
     def _look(self, source: Source, blur: dict[str, float | None]) -> bytes:
         try:
-            found, self.fault = source.frames(), ""
+            found, self.fault = source.frames(), None
         except Exception as error:  # the rig may come back
             problem = problem_from(error)
-            log.warning("no live view", error=problem.detail)
+            log.warning("no live view", error=problem.detail.text)
             found, self.fault = [], problem.detail
             time.sleep(1.0)
         for frame in found:
             if "blur_px" in frame:
                 blur[frame["name"]] = frame["blur_px"]
             frame["blur_px"] = blur.get(frame["name"])
-        return message_of(found, self.fault)
+        return look_bytes(found, self.fault)
 
 
-def message_of(frames: list[LiveFrame], fault: str) -> bytes:
+def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:
     """A look on the wire; ``bytes`` in the header is the length of each camera's JPEG."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
-    text = json.dumps({"cameras": header, "fault": fault}).encode()
+    text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document()}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)
     return struct.pack(">II", len(text), len(body)) + text + body

@@ -2,6 +2,8 @@
 
 from typing import NotRequired, TypedDict
 
+from rig.messages.message import MessageDocument
+
 
 class LiveFrame(TypedDict):
     """A camera's picture (None: it shows nothing) and what was measured on it."""
@@ -11,4 +13,4 @@ class LiveFrame(TypedDict):
     mean: NotRequired[float]
     clipped: NotRequired[float]
     blur_px: NotRequired[float | None]
-    fault: NotRequired[str]
+    fault: NotRequired[MessageDocument]

@@ -13,6 +13,7 @@ from rig.errors import InputError
 from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.geometry import RigidTransform
 from rig.image import ImageRgb
+from rig.messages.message import compose
 from rig.rig import Rig
 
 WIDTH_MOST = 1600
@@ -44,7 +45,7 @@ def rig_of(capture: Path) -> Rig:
     """The rig of a capture's files. Raises InputError."""
     found = find_rig_file(capture)
     if found is None:
-        raise InputError("capture", ["holds no cameras.json"])
+        raise InputError("capture", [compose("no-cameras-json")])
     return read_rig_file(found)
 
 

@@ -16,6 +16,7 @@ from nicegui import app as pages
 
 from rig.errors import EigenheadError, InputError
 from rig.formats.images import open_picture, read_image, write_image
+from rig.messages.message import compose
 from server.console import comparison
 from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
@@ -144,7 +145,7 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
     """A number a vertex (float32) of head.ply or bust.ply: posterior standard deviation (mm), or part."""
     path = result_folder(who[0], job_id) / f"{surface}.ply"
     if not path.is_file():
-        raise NotFound("surface of the result", surface)
+        raise NotFound(compose("thing-surface"), surface)
     return _floats(comparison.ply_property(path, name))
 
 
@@ -197,7 +198,7 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
     if other == "truth":
         theirs = service.store.folder("captures", job.capture_id or "") / "truth" / "head.ply"
         if not theirs.is_file():
-            raise NotFound("truth of the capture", job.capture_id or "")
+            raise NotFound(compose("thing-truth"), job.capture_id or "")
         return _floats(comparison.to_surface(mine, theirs))
     other_job = service.jobs.get(other)
     same = other_job.capture_id == job.capture_id
@@ -242,7 +243,7 @@ def _image_name(record: CaptureRecord, camera: str) -> str:
     for name in record.inputs:
         if Path(name).parent.name == "images" and Path(name).stem == camera:
             return name
-    raise NotFound("camera", camera)
+    raise NotFound(compose("thing-camera"), camera)
 
 
 def _capture_files(service: Service, job_id: str) -> tuple[Path, CaptureRecord]:

@@ -17,11 +17,13 @@ from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
+from rig.messages.message import Message, MessageDocument, compose
 from server.console.head_pictures import draw_first_view, warm_up
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.removal import removals
 from server.console.theme import Frame, page_frame
 from server.errors import Gone
+from server.problem_types import type_of_failure
 from server.services.bulk import each
 from server.services.health import readiness
 from server.services.keys import Caller
@@ -54,7 +56,7 @@ class Action:
     """
 
     scope: str
-    function: Callable[[Any, Any], str | None]
+    function: Callable[[Any, Any], Message | None]
 
 
 @dataclass
@@ -118,7 +120,7 @@ class Page(Element):
         self.choice = initial
         self.props["state"] = {"loading": True}
         self._in_turn = anyio.Lock()
-        self._told = ""
+        self._told: Message | None = None
         self._started: tuple[list[str], bool] = ([], False)
         self._followed: list[str] = []
         self.on("act", self._act)
@@ -144,14 +146,15 @@ class Page(Element):
     async def refresh(self) -> None:
         try:
             state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
-            told = ""
+            told = None
         except Exception as error:  # the page stays, says so once, and looks again
             problem = problem_from(error)
             state, told = self.props["state"], problem.detail
             if told != self._told:
                 self.frame.say("fault", told, problem.errors)
         self._told = told
-        self.frame.show(removed=[{"id": i, "title": removal.title} for i, removal in removals.waiting().items()])
+        waiting = removals.waiting().items()
+        self.frame.show(removed=[{"id": i, "title": removal.title.document()} for i, removal in waiting])
         if state != self.props["state"]:
             self.props["state"] = state
             self.update()
@@ -211,7 +214,7 @@ class Page(Element):
         await self.refresh()
         self.run_method("acted", name, done)  # a form that was refused keeps what was typed
 
-    def _run(self, action: Action, event: Mapping[str, object]) -> str | None:
+    def _run(self, action: Action, event: Mapping[str, object]) -> Message | None:
         current = caller_of(self.service, {"key_id": self.caller.key})
         permit(current, action.scope)
         return action.function(self, event)
@@ -223,33 +226,33 @@ class Chosen(TypedDict):
     id: str
 
 
-def undo(page: Page, event: Chosen) -> str:
+def undo(page: Page, event: Chosen) -> Message:
     """Takes back what waits to be removed, from whichever page."""
     removal = removals.waiting().get(event["id"])
     if removal is not None:
         permit(page.caller, removal.scope)
     if removal is None or not removals.undo(event["id"]):
-        raise Gone("too-late", "It is removed already.")
+        raise Gone("too-late", compose("removed-already"))
     shared.clear()
-    return f"It is back: {removal.title}."
+    return compose("taken-back", thing=removal.title)
 
 
 UNDO = Action("read", undo)
 
 
-def remove_later(identity: str, remove: Callable[[], None], title: str, scope: str) -> None:
+def remove_later(identity: str, remove: Callable[[], None], title: Message, scope: str) -> None:
     """Out of sight of all pages at once; ``remove`` runs when nobody took it back."""
     removals.add(identity, remove, title, scope)
     shared.clear()
 
 
-def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: str, scope: str) -> None:
+def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: Message, scope: str) -> None:
     """Many things at once, taken back at once."""
 
     def remove_each() -> None:
         done = each(ids, remove)
         for one in done.refused:
-            log.warning("not removed", id=one.id, error=one.detail)
+            log.warning("not removed", id=one.id, error=one.detail.text)
 
     removals.add(f"{ids[0]} and all", remove_each, title, scope, also=ids)
     shared.clear()
@@ -257,11 +260,12 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: s
 
 def as_problem(error: Exception) -> Problem:
     if isinstance(error, WorkFailed) and error.kind != "bug":
-        return Problem(500, error.kind, error.message, error.faults)
+        return Problem(500, type_of_failure(error.kind), error.message, error.faults)
     problem = problem_from(error)
     if isinstance(error, InputError):  # who reads a page sends no document again
-        told = error.faults[0] if len(error.faults) == 1 else f"{error.subject}: {len(error.faults)} things to mend."
-        return Problem(problem.status, problem.kind, told, error.faults)
+        count = len(error.faults)
+        mend = error.faults[0] if count == 1 else compose("things-to-mend", subject=error.subject, count=count)
+        return Problem(problem.status, problem.kind, mend, error.faults)
     return problem
 
 
@@ -312,9 +316,9 @@ class Status(TypedDict):
     yet; ``empty``: nobody took or uploaded a capture."""
 
     starting: list[str]
-    faults: dict[str, str]
+    faults: dict[str, MessageDocument]
     jobs: int
-    disk: str
+    disk: MessageDocument
     empty: bool
     local: bool
 
@@ -326,15 +330,14 @@ def status_of(service: Service, caller: Caller) -> Status | None:
 
     def make() -> Status:
         checks = readiness(service)
-        wrong = {name: check.detail for name, check in checks.items() if not check.ok and not check.starting}
+        wrong = {name: check.detail.document() for name, check in checks.items() if not check.ok and not check.starting}
         starting = [name for name, check in checks.items() if check.starting]
         counts = service.jobs.counts()
-        free = checks["disk"].detail.partition(" free")[0]
         return {
             "faults": wrong,
             "starting": starting,
             "jobs": counts["queued"] + counts["running"],
-            "disk": f"{free} free",
+            "disk": compose("gigabytes-free", gb=service.store.free_bytes() / 1e9).document(),
             "empty": service.captures.newest() is None,
             "local": False,
         }

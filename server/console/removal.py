@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 
 import structlog
 
+from rig.messages.message import Message
+
 UNDO_S = 10.0
 
 log = structlog.get_logger()
@@ -18,7 +20,7 @@ log = structlog.get_logger()
 class Removal:
     """``scope`` is what a key needs that takes it back; ``ids``: all that goes."""
 
-    title: str
+    title: Message
     scope: str
     timer: threading.Timer
     ids: frozenset[str]
@@ -35,7 +37,9 @@ class Removals:
     def __contains__(self, identity: object) -> bool:
         return any(identity in removal.ids for removal in [*self._waiting.values()])
 
-    def add(self, identity: str, remove: Callable[[], None], title: str, scope: str, also: Iterable[str] = ()) -> None:
+    def add(
+        self, identity: str, remove: Callable[[], None], title: Message, scope: str, also: Iterable[str] = ()
+    ) -> None:
         """``also``: further ids that go, and are taken back, with it."""
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True

@@ -1,11 +1,13 @@
 """The one look of all pages: colours and sizes are in ``static/theme.css``, and every page starts in ``page_frame``."""
 
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from nicegui import ui
 from nicegui.element import Element
+
+from rig.messages.message import Message, documents_of
 
 ACCENT = "#6cb2ff"
 PAGES = (
@@ -40,9 +42,9 @@ class Frame(Element, component="static/frame.js"):
             self.props.update(changed)
             self.update()
 
-    def say(self, kind: str, text: str, faults: list[str] | None = None) -> None:
+    def say(self, kind: str, message: Message, faults: Iterable[Message] = ()) -> None:
         """A message in the corner: ``kind`` is done, warning or fault; ``faults`` are all listed."""
-        self.run_method("announce", kind, text, faults or [])
+        self.run_method("announce", kind, message.document(), documents_of(faults))
 
 
 def install() -> None:

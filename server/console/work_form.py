@@ -2,6 +2,7 @@
 
 from typing import NotRequired, TypedDict, cast
 
+from rig.messages.message import MessageDocument
 from server.console.page import Chosen
 from server.services.presets import PRESETS, settings_of
 from server.services.templates import templates_at_hand
@@ -10,8 +11,8 @@ from server.services.work import Work
 
 class PresetLine(TypedDict):
     id: str
-    title: str
-    explanation: str
+    title: MessageDocument
+    explanation: MessageDocument
 
 
 class TemplateLine(TypedDict):
@@ -30,7 +31,7 @@ class WorkForm(Chosen):
 
 
 def preset_lines() -> list[PresetLine]:
-    return [{"id": p.id, "title": p.title, "explanation": p.explanation} for p in PRESETS]
+    return [{"id": p.id, "title": p.title.document(), "explanation": p.explanation.document()} for p in PRESETS]
 
 
 def template_lines() -> list[TemplateLine]:

@@ -8,6 +8,7 @@ from fastapi import Depends, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
+from rig.messages.message import compose
 from server.address import is_loopback
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.service import Service
@@ -32,7 +33,7 @@ def require(scope: str) -> Callable[..., Caller]:
     ) -> Caller:
         caller = _caller(request, credentials)
         if not caller.may(scope):
-            raise Problem(403, "scope-missing", f"This key may not do that: it lacks the scope {scope!r}.")
+            raise Problem(403, "scope-missing", compose("key-lacks-scope", scope=f"{scope!r}"))
         return caller
 
     return authenticate
@@ -49,12 +50,12 @@ def _caller(request: Request, credentials: HTTPAuthorizationCredentials | None) 
         caller = service.keys.caller(credentials.credentials)
         if caller is not None:
             return caller
-        detail = "Nobody here has this API key: it is misspelt, was removed, or is of another data folder."
+        detail = compose("key-unknown")
         raise Problem(401, "key-invalid", detail, headers={"WWW-Authenticate": 'Bearer error="invalid_token"'})
     if service.settings.is_private and not service.keys.any():
         _check_origin(request)
         return Caller(LOCAL, frozenset(SCOPES))
-    detail = "An API key is needed: send 'Authorization: Bearer eh_...'."
+    detail = compose("key-wanted")
     raise Problem(401, "key-missing", detail, headers={"WWW-Authenticate": "Bearer"})
 
 
@@ -65,5 +66,5 @@ def _check_origin(request: Request) -> None:
     if origin is not None:
         names.append(origin.partition("://")[2].rpartition(":")[0] or origin.partition("://")[2])
     if not all(is_loopback(name) for name in names):
-        detail = "Without API keys the service answers only to its own machine; make a key with `eigenhead keys add`."
+        detail = compose("foreign-origin")
         raise Problem(403, "foreign-origin", detail)

@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
+from server.http.message_schemas import MessageOut, Texts
 from server.http.schemas import EXAMPLE_ID, Answer, Id, JobError, Moment, Received, State, Text
 from server.storage.records import JsonObject
 
@@ -62,10 +63,12 @@ class CalibrationOut(Answer):
     eta_s: float | None = None
     error: JobError | None
     verdict: Literal["good", "usable", "poor"] | None = Field(None, description="null: not judged")
-    missing: list[str] = Field([], description="what would make the verdict better, most urgent first")
+    missing: Texts = Field([], description="what would make the verdict better, most urgent first")
+    missing_messages: list[MessageOut] = Field([], validation_alias="missing")
     figures: JsonObject
     checks: list[JsonObject]
-    warnings: list[str]
+    warnings: Texts
+    warning_messages: list[MessageOut] = Field(validation_alias="warnings")
     front: str | None
     in_use: bool
 

@@ -11,6 +11,7 @@ from fastapi.routing import APIRoute
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from rig.messages.message import compose
 from server.http.auth import check_caller
 from server.wire.problems import Problem, problem_from
 
@@ -50,7 +51,7 @@ class JsonBodies:
         """The messages of the body, to its end or to where the client went away. Raises a 413 problem, and 415 for a
         form, which is an archive at the wrong address."""
         if request.headers.get("content-type", "").casefold().startswith("multipart/"):
-            detail = "Send application/json here; an archive goes to POST /v1/captures/uploads."
+            detail = compose("json-wanted-here")
             raise Problem(415, "unsupported-media-type", detail)
         announced = request.headers.get("content-length", "")
         self._check(int(announced) if announced.isascii() and announced.isdigit() else 0)
@@ -65,4 +66,4 @@ class JsonBodies:
 
     def _check(self, length: int) -> None:
         if length > self._most:
-            raise Problem(413, "body-too-large", f"A JSON body may have {self._most:,} bytes.")
+            raise Problem(413, "body-too-large", compose("json-body-too-large", bytes=self._most))

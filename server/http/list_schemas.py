@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from fastapi import Query
 from pydantic import ConfigDict, Field
 
+from server.http.message_schemas import MessageOut, TextOf
 from server.http.schemas import (
     EXAMPLE_ID,
     Answer,
@@ -74,7 +75,8 @@ class JobBatch(Answer):
 class RefusedOne(Answer):
     id: str
     type: str = Field(description="as of a problem document")
-    detail: str
+    detail: TextOf
+    detail_message: MessageOut = Field(validation_alias="detail")
 
 
 class BulkOut(Answer):

@@ -1,7 +1,10 @@
 """Documents on the wire of what the rig's pictures are worth."""
 
-from pydantic import ConfigDict, Field
+from typing import Annotated
 
+from pydantic import BeforeValidator, ConfigDict, Field
+
+from server.http.message_schemas import MessageOut, Texts
 from server.http.schemas import Answer, Moment, Received
 
 
@@ -43,7 +46,8 @@ class PlatesOut(Answer):
     id: str
     taken: Moment
     cameras: list[str]
-    refused: list[str] = Field(description="why they were not put to use")
+    refused: Texts = Field(description="why they were not put to use")
+    refused_messages: list[MessageOut] = Field(validation_alias="refused")
     in_use: bool
 
 
@@ -60,4 +64,5 @@ class UsePlates(Received):
 class BackgroundOut(Answer):
     cameras: list[str]
     plates: int
-    note: str
+    note: Annotated[str, BeforeValidator(lambda note: "" if note is None else str(note))]
+    note_message: MessageOut | None = Field(None, validation_alias="note")

@@ -8,8 +8,8 @@ from fastapi import Header
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
+from server.http.message_schemas import MessageOut, TextOf, Texts, WarningOut
 from server.http.openapi import SETTINGS
-from server.services.service import Check
 from server.services.tags import TAG_MOST, TAGS_MOST
 from server.services.texts import PLAIN, TEXT_MOST
 from server.storage.records import JsonObject
@@ -178,15 +178,9 @@ class FaultOut(Answer):
 
     code: str = Field(description="as in docs/rig.md, among them moved, overexposed, blurred, setting, plates, cut-off")
     camera: str | None = Field(description="null: the rig as a whole")
-    detail: str
-    remedy: str
-
-
-class WarningOut(Answer):
-    """As in report.json."""
-
-    code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")
-    message: str
+    detail: TextOf
+    remedy: TextOf
+    detail_message: MessageOut = Field(validation_alias="detail")
 
 
 class CaptureOut(Answer):
@@ -223,8 +217,10 @@ class SessionOut(Answer):
 
 class JobError(Answer):
     type: str
-    detail: str
-    errors: list[str]
+    detail: TextOf
+    errors: Texts
+    detail_message: MessageOut = Field(validation_alias="detail")
+    error_messages: list[MessageOut] = Field(validation_alias="errors")
 
 
 class FileOut(Answer):
@@ -251,7 +247,8 @@ class JobOut(Answer):
     progress: float = Field(ge=0, le=1)
     eta_s: float | None
     error: JobError | None
-    notice: str | None = Field(None, description="why a queued job cannot begin or a result is gone; what to do")
+    notice: TextOf | None = Field(None, description="why a queued job cannot begin or a result is gone; what to do")
+    notice_message: MessageOut | None = Field(None, validation_alias="notice")
     capture_id: str | None
     session: str | None
     model: str | None
@@ -323,9 +320,19 @@ class InfoOut(Answer):
     settings: JobSettings = Field(description="what a job has where it gives none; its schema says what it may give")
 
 
+class CheckOut(Answer):
+    """One finding about the service: whether it is well, and what to do where it is not; ``starting``: it is not well
+    yet, and nothing is to be done."""
+
+    ok: bool
+    detail: TextOf
+    starting: bool
+    detail_message: MessageOut = Field(validation_alias="detail")
+
+
 class Ready(Answer):
     ready: bool
-    checks: dict[str, Check]
+    checks: dict[str, CheckOut]
 
 
 class CameraOut(Answer):
@@ -339,7 +346,8 @@ class RigOut(Answer):
     kind: Literal["simulated", "real"]
     ready: bool
     cameras: list[CameraOut]
-    faults: list[str]
+    faults: Texts
+    fault_messages: list[MessageOut] = Field(validation_alias="faults")
     calibration: str | None
 
 
@@ -357,7 +365,8 @@ class CameraSettingsOut(Answer):
     exposure_ms: float | None
     gain_db: float | None
     white_balance_k: int | None
-    unmet: list[str] = Field(description="what the camera did not take, and why")
+    unmet: Texts = Field(description="what the camera did not take, and why")
+    unmet_messages: list[MessageOut] = Field(validation_alias="unmet")
 
 
 class Lights(Received):

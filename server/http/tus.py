@@ -8,6 +8,7 @@ from typing import Any
 
 import anyio
 
+from rig.messages.message import compose
 from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.storage.records import UploadRecord
@@ -34,7 +35,7 @@ async def append(
         async for chunk in patiently(stream, silent_s):
             size += len(chunk)
             if size > record.length:
-                raise Problem(413, "upload-too-large", f"More bytes than the announced {record.length:,}.")
+                raise Problem(413, "upload-too-large", compose("upload-longer-than-announced", bytes=record.length))
             pending += chunk
             if len(pending) >= BLOCK_BYTES:
                 await threads.disk(_write, target, bytes(pending), digest)
@@ -46,14 +47,14 @@ async def append(
             if checksum is not None and not (complete and _matches(digest, checksum)):
                 await threads.disk(os.truncate, path, before)
     if checksum is not None and not _matches(digest, checksum):
-        raise Problem(460, "checksum-mismatch", "The bytes do not have the announced checksum; send them again.")
+        raise Problem(460, "checksum-mismatch", compose("upload-checksum-wrong"))
     return size
 
 
 def _digest(checksum: str | None) -> Any:
     algorithm = "sha256" if checksum is None else checksum.partition(" ")[0]
     if algorithm not in ("sha1", "sha256", "md5"):
-        raise Problem(400, "unknown-checksum", f"Checksum algorithm {algorithm!r:.40}; sha1, sha256 and md5 are known.")
+        raise Problem(400, "unknown-checksum", compose("checksum-unknown", algorithm=f"{algorithm!r:.40}"))
     return hashlib.new(algorithm, usedforsecurity=False)
 
 

@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from rig.errors import EigenheadError, InputError
-from server.errors import URN, Refused, unusable_input
+from rig.messages.message import Message, compose
+from server.errors import Refused, unusable_input
+from server.problem_types import URN
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,7 +15,7 @@ class RefusedOne:
 
     id: str
     type: str
-    detail: str
+    detail: Message
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +34,6 @@ def each(ids: Iterable[str], action: Callable[[str], object]) -> Bulk:
         except EigenheadError as error:
             problem = unusable_input(error) if isinstance(error, InputError) else error
             kind = problem.kind if isinstance(problem, Refused) else "internal-error"
-            detail = "; ".join(error.faults) if isinstance(error, InputError) else str(problem)
+            detail = compose("several", messages=error.faults) if isinstance(error, InputError) else problem.message
             refused.append(RefusedOne(identity, URN + kind, detail))
     return Bulk(tuple(done), tuple(refused))

@@ -9,7 +9,7 @@ A scene has no board.toml, and perhaps scale.json. It may show a subject: its im
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -19,8 +19,10 @@ from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
-from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES, failure
+from server.services.failures import failure
+from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES
 from server.services.records import Calibration
 from server.services.texts import check_texts
 from server.storage.events import EventLog
@@ -101,10 +103,10 @@ class Calibrations:
             state=state,
             progress=1.0,
             verdict=found.get("verdict"),
-            missing=tuple(found.get("missing", ())),
+            missing=_messages(found.get("missing_messages") or found.get("missing", [])),
             figures=found["figures"],
             checks=tuple(found["checks"]),
-            warnings=tuple(found["warnings"]),
+            warnings=_messages(found.get("warning_messages") or found["warnings"]),
             front=found.get("front"),
             in_use=self.in_use() == found["sha256"],
         )
@@ -125,7 +127,7 @@ class Calibrations:
         """A file of a calibration that succeeded. Raises NotFound, Conflict."""
         state = self.get(identity).state
         if state != "succeeded":
-            raise Conflict("no-result", f"The calibration is {state}; it has no result.")
+            raise Conflict("no-result", compose("calibration-without-result", state=state))
         return self._store.folder("calibrations", identity) / "result" / name
 
     def file(self, identity: str, name: str) -> StoredFile:
@@ -135,7 +137,7 @@ class Calibrations:
 
     def remove(self, identity: str) -> None:
         if self.get(identity).state not in FINISHED:
-            raise Conflict("calibration-active", "The calibration is under way; wait for its end.")
+            raise Conflict("calibration-active", compose("calibration-active"))
         self._store.remove(self._store.folder("calibrations", identity))
         self._events.remove([identity])
         self._client.delete_workflow(identity)
@@ -144,10 +146,7 @@ class Calibrations:
         """Raises Conflict for a calibration that is poor, naming what it lacks."""
         found = self.get(identity)
         if found.verdict == "poor":
-            detail = (
-                "This calibration is poor: heads made with it would be wrong. Take the shots that are missing and "
-                "calibrate again, or use it all the same."
-            )
+            detail = compose("calibration-poor")
             raise Conflict("calibration-poor", detail, found.missing)
 
     def in_use(self) -> str | None:
@@ -184,4 +183,9 @@ def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 os.link(files / name, target)
     if not (folder / "images").is_dir():
-        raise InputError("captures", ["have no images/: take them with the rig, or upload the pictures as an archive"])
+        raise InputError("captures", [compose("captures-without-images")])
+
+
+def _messages(kept: Iterable[object]) -> tuple[Message, ...]:
+    """Reads messages; those of earlier versions are texts."""
+    return tuple(read_message(one) for one in kept)

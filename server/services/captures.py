@@ -11,11 +11,12 @@ from typing import cast
 
 from pydantic import TypeAdapter
 
-from rig.acquisition.shot import Fault, ShotDocument
+from rig.acquisition.shot import Fault, ShotDocument, read_fault
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits
+from rig.messages.message import compose
 from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs
@@ -184,7 +185,7 @@ class Captures:
             single = path.parent.name == kind and path.stem == camera
             if single or (kind == "background" and path.parent.name == camera and path.parent.parent.name == kind):
                 return StoredFile(self._store.folder("captures", identity) / "files" / name, digest)
-        raise NotFound("such file of a camera", camera, "the capture's 'inputs' list what there is")
+        raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))
 
     def features(self, identity: str) -> Points:
         """The stored feature points, by point and camera. Raises NotFound, also where their file is gone or damaged."""
@@ -194,7 +195,7 @@ class Captures:
         try:
             return POINTS.validate_python(json.loads(path.read_bytes())["points"])
         except (OSError, ValueError, LookupError, TypeError) as error:
-            raise NotFound("whole file of feature points of the capture", identity, "put them again") from error
+            raise NotFound(compose("thing-feature-points"), identity, compose("hint-put-again")) from error
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
         """Stores feature points. Raises NotFound, and InputError naming every point that the capture cannot have."""
@@ -218,8 +219,8 @@ class Captures:
         """The record of a capture that no job needs. Raises Conflict."""
         record = self._store.capture(identity)
         if active := self._jobs.active(capture=identity):
-            detail = "Jobs that are queued or running need this capture; cancel them first."
-            raise Conflict("capture-in-use", detail, [f"job {job}" for job in active])
+            detail = compose("capture-in-use")
+            raise Conflict("capture-in-use", detail, [compose("job-named", job=job) for job in active])
         return record
 
     def remove(self, identity: str) -> None:
@@ -242,10 +243,7 @@ class Captures:
         """Raises NotFound; Conflict where the service asks for consent and the session has no note of it."""
         consent = "" if session is None else self._store.session(session).consent
         if self._settings.ask_consent and not consent.strip():
-            detail = (
-                "Consent comes before the first picture: begin a session of the subject with a note of who agreed to "
-                "what and when, and take or upload into it."
-            )
+            detail = compose("consent-missing")
             raise Conflict("consent-missing", detail)
 
     def _add(
@@ -295,7 +293,7 @@ def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
     """The faults in a real rig's certificate; the simulated studio's pictures are judged as uploads are."""
     if shot is None or "checks" not in shot:
         return ()
-    return tuple(Fault(f["code"], f["camera"], f["detail"]) for f in cast(ShotDocument, shot)["faults"])
+    return tuple(read_fault(document) for document in cast(ShotDocument, shot)["faults"])
 
 
 def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:

@@ -3,6 +3,8 @@
 from typing import TypedDict
 
 from rig.acquisition.shot import FaultDocument
+from rig.messages.message import MessageDocument, documents_of, texts_of
+from server.services.records import Failure
 
 
 class SizeDocument(TypedDict):
@@ -33,6 +35,8 @@ class ErrorDocument(TypedDict):
     type: str
     detail: str
     errors: list[str]
+    detail_message: MessageDocument
+    error_messages: list[MessageDocument]
 
 
 class FileDocument(TypedDict):
@@ -50,6 +54,7 @@ class JobLine(TypedDict):
     eta_s: float | None
     error: ErrorDocument | None
     notice: str | None
+    notice_message: MessageDocument | None
     capture_id: str | None
     session: str | None
     model: str | None
@@ -67,3 +72,14 @@ class JobDocument(JobLine):
     """A job with the files of its result, by name."""
 
     files: dict[str, FileDocument]
+
+
+def failure_document(failure: Failure) -> ErrorDocument:
+    """Returns a failure as clients get it."""
+    return {
+        "type": failure.type,
+        "detail": failure.detail.text,
+        "errors": texts_of(failure.errors),
+        "detail_message": failure.detail.document(),
+        "error_messages": documents_of(failure.errors),
+    }

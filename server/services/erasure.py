@@ -4,6 +4,7 @@ import time
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from rig.messages.message import compose
 from server.errors import Unavailable
 from server.services.jobs import FINISHED, Jobs
 from server.storage.store import Store, folder_bytes
@@ -50,7 +51,7 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
     for job in of_captures:
         jobs.delete(job)
         if store.folder("jobs", job).exists():
-            raise Unavailable("still-writing", "A worker still writes; ask for the erasure again.")
+            raise Unavailable("still-writing", compose("still-writing"))
     for capture in captures:
         store.remove_capture(capture)
 

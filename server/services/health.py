@@ -9,6 +9,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import Settings, document_from_settings
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
+from rig.messages.message import compose, verbatim
 from server.services.service import Check, Service
 from server.storage.database import alive_workers
 from server.storage.records import JsonObject
@@ -25,7 +26,7 @@ def readiness(service: Service) -> dict[str, Check]:
         "egl": _egl(service),
         "rig": _rig(service),
         "records": _records(service),
-        "results": service.known.get("results") or Check(ok=True, detail="not looked at yet"),
+        "results": service.known.get("results") or Check(ok=True, detail=compose("not-examined")),
     }
 
 
@@ -34,14 +35,14 @@ def _database(service: Service) -> Check:
         with service.engine.connect() as connection:
             connection.execute(sa.select(1))
     except SQLAlchemyError as error:
-        return Check(ok=False, detail=f"does not answer: {str(error)[:200]}")
-    return Check(ok=True, detail=service.engine.dialect.name)
+        return Check(ok=False, detail=compose("silent-because", reason=str(error)[:200]))
+    return Check(ok=True, detail=verbatim(service.engine.dialect.name))
 
 
 def _disk(service: Service) -> Check:
     free, spare = service.store.free_bytes(), service.settings.free_bytes
-    detail = f"{free / 1e9:.1f} GB free; uploads and jobs leave {spare / 1e9:.1f} GB"
-    return Check(ok=free > spare, detail=detail if free > spare else f"{detail}: delete captures or jobs")
+    code = "disk-free" if free > spare else "disk-too-full"
+    return Check(ok=free > spare, detail=compose(code, free_gb=free / 1e9, spare_gb=spare / 1e9))
 
 
 def _workers(service: Service) -> Check:
@@ -50,38 +51,37 @@ def _workers(service: Service) -> Check:
             alive = alive_workers(connection, service.settings.silent_s)
             count = connection.scalar(sa.select(sa.func.count()).where(alive)) or 0
     except SQLAlchemyError:
-        return Check(ok=False, detail="unknown: the database does not answer")
+        return Check(ok=False, detail=compose("worker-unknown"))
     if count:
-        return Check(ok=True, detail=f"{count} alive")
+        return Check(ok=True, detail=compose("workers-alive", count=count))
     if service.jobs.worker_may_start():
-        return Check(ok=False, detail="being started: it loads for some seconds", starting=True)
-    return Check(ok=False, detail="none alive: start one with `eigenhead worker`")
+        return Check(ok=False, detail=compose("worker-loading"), starting=True)
+    return Check(ok=False, detail=compose("no-worker-alive"))
 
 
 def check_egl(service: Service) -> None:
     """Asked once a process, when it starts: it takes a second or more, and what is there stays. Blocks."""
     try:
         with service.children.one() as child:
-            service.known["egl"] = Check(ok=True, detail=child.remote(try_egl)())
+            service.known["egl"] = Check(ok=True, detail=verbatim(child.remote(try_egl)()))
     except WorkFailed as error:
         service.known["egl"] = Check(ok=False, detail=error.message)
 
 
 def _egl(service: Service) -> Check:
-    return service.known.get("egl") or Check(
-        ok=False, detail="being started; ask again in a few seconds", starting=True
-    )
+    return service.known.get("egl") or Check(ok=False, detail=compose("check-starting"), starting=True)
 
 
 def _rig(service: Service) -> Check:
     state = service.rig.describe()
-    faults = "; ".join(state.faults)
-    return Check(ok=state.ready, detail=faults or f"{state.kind}, {len(state.cameras)} cameras")
+    if state.faults:
+        return Check(ok=state.ready, detail=compose("several", messages=state.faults))
+    return Check(ok=state.ready, detail=compose("rig-described", kind=state.kind, count=len(state.cameras)))
 
 
 def _records(service: Service) -> Check:
     names = service.store.set_aside()
-    detail = f"{len(names)} damaged records lie in set-aside: {', '.join(names[:5])}" if names else "none damaged"
+    detail = compose("records-damaged", count=len(names), names=names[:5]) if names else compose("no-record-damaged")
     return Check(ok=True, detail=detail)
 
 

@@ -17,11 +17,14 @@ import sqlalchemy as sa
 import structlog
 from dbos import DBOS, DBOSClient, EnqueueOptions, WorkflowStatus
 
-from rig.errors import EigenheadError, InputError
-from server.errors import URN, Conflict, NotFound, TooMany
+from rig.errors import InputError
+from rig.messages.message import Message, compose
+from server.errors import Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
-from server.services.records import Failure, Found, Job
+from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
+from server.services.failures import failure
+from server.services.records import Found, Job
 from server.services.work import Work, refuse_board
 from server.settings import ServiceSettings
 from server.storage.database import alive_workers, workers
@@ -49,17 +52,6 @@ WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where al
 FINISHED = ("succeeded", "failed", "cancelled")
 
 log = structlog.get_logger()
-
-
-class JobFailed(EigenheadError):
-    """A job that cannot succeed; what the engine stores as the workflow's error."""
-
-    def __init__(self, kind: str, detail: str, errors: tuple[str, ...] = ()) -> None:
-        super().__init__(kind, detail, errors)  # the three arguments are what pickle restores
-        self.kind, self.detail, self.errors = kind, detail, errors
-
-    def __str__(self) -> str:
-        return self.detail
 
 
 def migrate(settings: ServiceSettings) -> None:
@@ -101,7 +93,7 @@ class Jobs:
         capture = self._store.capture(capture_id)
         refuse_board(capture)
         if queue is not None and queue not in self._settings.queues:
-            raise InputError("queue", [f"{queue!r:.40} is no queue; there are: {', '.join(self._settings.queues)}"])
+            raise InputError("queue", [compose("queue-unknown", queue=f"{queue!r:.40}", queues=self._settings.queues)])
         self._store.reserve(0, self._settings.free_bytes)
         request: JobRequest = {
             "capture_id": capture_id,
@@ -147,7 +139,7 @@ class Jobs:
             first = self._status(job_id)
             assert first is not None
         if not self._asks_the_same(_request(first), request):
-            detail = "This Idempotency-Key was used for another request; use a new key for a new job."
+            detail = compose("idempotency-key-reused")
             raise Conflict("idempotency-conflict", detail)
         return self._jobs([first])[0]
 
@@ -235,7 +227,7 @@ class Jobs:
         """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict without a result."""
         job = self.get(job_id)
         if job.state != "succeeded":
-            raise Conflict("no-result", f"The job is {job.state}; it has no result.")
+            raise Conflict("no-result", compose("job-without-result", state=job.state))
         if job.notice is not None:
             raise Conflict("result-missing", job.notice)
         return job.files
@@ -246,7 +238,7 @@ class Jobs:
         try:
             return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
         except FileNotFoundError as error:
-            raise NotFound("log of the job", job_id, "it has not begun") from error
+            raise NotFound(compose("thing-job-log"), job_id, compose("hint-not-begun")) from error
 
     def without_result(self) -> list[str]:
         """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
@@ -261,7 +253,7 @@ class Jobs:
         """A file of a result, found in the job's record. Raises NotFound, Conflict."""
         file = self.files(job_id).get(name)
         if file is None:
-            raise NotFound("file", name, f"GET /v1/jobs/{job_id}/result lists what there is")
+            raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
         return StoredFile(self._result(job_id) / name, file["sha256"])
 
     def restart(self, job_id: str, wanted: Work, *, key: str = "local") -> Job:
@@ -271,7 +263,7 @@ class Jobs:
         row = self._known(job_id)
         request = _request(row)
         if request is None:
-            raise NotFound("request of the job", job_id)
+            raise NotFound(compose("thing-job-request"), job_id)
         request = cast(JobRequest, {**request, "restart_of": job_id})
         if wanted.settings is not None:
             request["settings"] = wanted.settings
@@ -283,7 +275,7 @@ class Jobs:
     def delete(self, job_id: str) -> None:
         """Removes a finished job with its files: the files first, which needs no room in the database."""
         if self.state(job_id) not in FINISHED:
-            raise Conflict("job-active", "The job is queued or running; cancel it first.")
+            raise Conflict("job-active", compose("job-active"))
         self._store.remove(self._store.folder("jobs", job_id))
         self.events.remove([job_id])
         self.client.delete_workflow(job_id)
@@ -301,13 +293,13 @@ class Jobs:
     def _check_count(self, key: str) -> None:
         active = len(self.active(key=key))
         if active >= self._settings.jobs_per_key:
-            detail = f"{active} jobs are queued or running for this key, which is the most; wait for one to end."
+            detail = compose("too-many-jobs", count=active)
             raise TooMany("too-many-jobs", detail, retry_after_s=10)
 
-    def _notice(self, job_id: str, state: str, queue: str | None) -> str | None:
+    def _notice(self, job_id: str, state: str, queue: str | None) -> Message | None:
         """What keeps a queued job from beginning, or that the files of one that succeeded are gone."""
         if state == "succeeded" and not self._result(job_id).is_dir():
-            return "Its result is not in the data folder any more: restore it from a backup, or restart the job."
+            return compose("result-missing")
         if state != "queued":
             return None
         with self._engine.connect() as connection:
@@ -315,8 +307,8 @@ class Jobs:
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
                 return None
         if queue == self._settings.queue and self.worker_may_start():
-            return "The worker is being started."
-        return f"No worker serves the queue {queue!r}: start one with `eigenhead worker --queue {queue}`."
+            return compose("worker-starting")
+        return compose("no-worker", queue=f"{queue!r}", queue_name=str(queue))
 
     def worker_may_start(self) -> bool:
         """Whether the service is so young that its worker may still be loading."""
@@ -329,7 +321,7 @@ class Jobs:
     def _known(self, job_id: str, load: bool = True) -> WorkflowStatus:
         row = self._status(job_id, load) if is_id(job_id) else None
         if row is None:
-            raise NotFound("job", job_id)
+            raise NotFound(compose("thing-job"), job_id)
         return row
 
     def _job(self, row: WorkflowStatus, event: JobEvent | None, places: Mapping[str, int]) -> Job:
@@ -375,17 +367,6 @@ def _by_state(query: JobQuery) -> JobQuery:
 def _request(row: WorkflowStatus) -> JobRequest | None:
     """A copy of what the job was asked for; None where its input cannot be read."""
     return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
-
-
-def failure(row: WorkflowStatus) -> Failure:
-    error = row.error
-    if isinstance(error, JobFailed):
-        return Failure(URN + error.kind, error.detail, tuple(error.errors))
-    if row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
-        detail = "The job took its worker down with it again and again; the worker's log says why."
-        return Failure(URN + "worker-died", detail)
-    log.error("job failed in an unforeseen way", job=row.workflow_id, error=str(error))
-    return Failure(URN + "internal-error", "The job failed in a way that nobody foresaw; the log says more.")
 
 
 def _id_of(key: str, idempotency_key: str) -> str:

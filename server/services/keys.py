@@ -14,6 +14,7 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 from server.errors import NotFound
 from server.settings import ServiceSettings
 from server.storage.database import api_keys, now_sql
@@ -78,7 +79,7 @@ class Keys:
         """Raises NotFound."""
         with self._engine.begin() as connection:
             if not connection.execute(sa.delete(api_keys).where(api_keys.c.id == identity)).rowcount:
-                raise NotFound("key", identity)
+                raise NotFound(compose("thing-key"), identity)
 
     def any(self) -> bool:
         with self._engine.connect() as connection:

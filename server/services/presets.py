@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.settings import settings_from_document
+from rig.messages.message import Message, compose
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,8 +12,8 @@ class Preset:
     """``settings``: the document that it stands for."""
 
     id: str
-    title: str
-    explanation: str
+    title: Message
+    explanation: Message
     settings: Mapping[str, object]
 
     def __post_init__(self) -> None:
@@ -20,24 +21,24 @@ class Preset:
 
 
 PRESETS = (
-    Preset("", "Standard", "Head, hair and clothes as deep as the photographs carry. The right choice for most.", {}),
+    Preset("", compose("preset-standard"), compose("preset-standard-explained"), {}),
     Preset(
         "quick",
-        "Quick look",
-        "The head from its outlines alone, in seconds: to see whether a shot is worth more.",
+        compose("preset-quick"),
+        compose("preset-quick-explained"),
         {"detail": "span", "outputs": {"surface": "head"}},
     ),
-    Preset("head", "Head only", "The head in full detail, without hair and clothes.", {"outputs": {"surface": "head"}}),
+    Preset("head", compose("preset-head"), compose("preset-head-explained"), {"outputs": {"surface": "head"}}),
     Preset(
         "texture",
-        "For renderers",
-        "As Standard, and the textured head as OBJ and USDZ, too: for renderers, games and telephones.",
+        compose("preset-renderers"),
+        compose("preset-renderers-explained"),
         {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}},
     ),
     Preset(
         "simplex",
-        "The paper's method",
-        "The downhill simplex of the paper: minutes, and less exact. For comparison.",
+        compose("preset-paper"),
+        compose("preset-paper-explained"),
         {"method": "simplex"},
     ),
 )

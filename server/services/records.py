@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from rig.messages.message import Message
 from server.storage.records import FileEntry
 
 T = TypeVar("T")
@@ -24,8 +25,8 @@ class Failure:
     """Why a job failed: a stable ``type``, what to do, and every fault."""
 
     type: str
-    detail: str
-    errors: tuple[str, ...] = ()
+    detail: Message
+    errors: tuple[Message, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Job:
     progress: float
     eta_s: float | None
     error: Failure | None
-    notice: str | None
+    notice: Message | None
     capture_id: str | None
     session: str | None
     model: str | None
@@ -102,10 +103,10 @@ class Calibration:
     eta_s: float | None = None
     error: Failure | None = None
     verdict: str | None = None
-    missing: tuple[str, ...] = ()
+    missing: tuple[Message, ...] = ()
     figures: Mapping[str, object] = field(default_factory=dict)
     checks: tuple[Mapping[str, object], ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     front: str | None = None
     in_use: bool = False
 
@@ -125,7 +126,7 @@ class RigState:
     kind: str
     ready: bool
     cameras: tuple[RigCamera, ...]
-    faults: tuple[str, ...]
+    faults: tuple[Message, ...]
     calibration: str | None
 
 
@@ -136,7 +137,7 @@ class CameraSettings:
     exposure_ms: float | None
     gain_db: float | None
     white_balance_k: int | None
-    unmet: tuple[str, ...]
+    unmet: tuple[Message, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +146,7 @@ class CleanPlates:
 
     cameras: tuple[str, ...]
     plates: int
-    note: str
+    note: Message | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 import structlog
 
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 from server.errors import NotFound
 from server.services.jobs import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
@@ -195,7 +196,9 @@ def _deliveries(service: Service) -> int:
 def _find_missing(service: Service) -> None:
     """What readiness says of results that somebody else removed, or that a backup lacks."""
     missing = service.jobs.without_result()
-    detail = f"{len(missing)} jobs have no result folder any more: {', '.join(missing[:3])}" if missing else "all there"
+    detail = (
+        compose("results-missing", count=len(missing), jobs=missing[:3]) if missing else compose("results-complete")
+    )
     service.known["results"] = Check(ok=True, detail=detail)
 
 

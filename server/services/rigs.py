@@ -28,6 +28,7 @@ from rig.formats.capture_folder import write_capture
 from rig.formats.images import write_image
 from rig.formats.rig_toml import RigConfig, adjusted, read_rig_config
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose, message_of
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
@@ -39,7 +40,6 @@ from server.tasks.simulate import SimulatedCertificate, look, simulated
 PREVIEW_WIDTH = 640
 PREVIEW_QUALITY = 80
 SHOT_BYTES = 64 << 20
-LIST = "GET /v1/rig lists them"
 
 
 class RigBackend(Protocol):
@@ -127,13 +127,13 @@ class SimulatedRig:
 
     def preview(self, camera: str) -> bytes:
         if camera not in self._rig():
-            raise NotFound("camera of the rig", camera, LIST)
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
         with self._one_at_a_time:
             return jpeg(self._child.remote(look)(cameras=[camera])[camera])
 
     def camera_settings(self, camera: str) -> CameraSettings:
         if camera not in self._rig():
-            raise NotFound("camera of the rig", camera, LIST)
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
         return CameraSettings(None, None, None, ())
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
@@ -148,13 +148,13 @@ class SimulatedRig:
 
     def take_background(self) -> CleanPlates:
         """The studio takes clean plates with every shot; there is nothing to keep."""
-        return CleanPlates(self._rig().names, 2, "the simulated studio takes them with each shot")
+        return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
 
     def plates(self) -> list[PlatesVersion]:
         return []
 
     def use_plates(self, version: str) -> None:
-        raise NotFound("version of the clean plates", version, "the simulated studio takes them with each shot")
+        raise NotFound(compose("thing-plates-version"), version, compose("hint-studio-plates"))
 
     def use(self, calibration: Path) -> None:
         _check_names(read_rig(calibration), self._rig().names)
@@ -186,33 +186,33 @@ class RealRig:
         with self._lock:
             states = {} if self._session is None else self._session.states()
             error = None if self._session is None else self._session.trigger_error()
-        cameras, faults = [], [] if error is None else [f"trigger: {error}"]
+        cameras, faults = [], [] if error is None else [compose("located", where="trigger", fault=error)]
         for camera in self._config.cameras:
             state = states.get(camera.name)
             known = "closed" if state is None else "open" if state.opened else "missing"
             cameras.append(RigCamera(camera.name, camera.driver, known))
             if state is not None and state.error:
-                faults.append(f"{camera.name}: {state.error}")
+                faults.append(compose("located", where=camera.name, fault=state.error))
         rig = self._calibrated()
         if rig is None:
-            faults.append("no calibration: calibrate the rig and put the calibration to use")
+            faults.append(compose("rig-not-calibrated"))
         return _state(self._config.name, "real", cameras, faults, None if rig is None else "own")
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument:
         if seed is not None:
-            raise InputError("request", ["seed: only the simulated studio takes one"])
+            raise InputError("request", [compose("seed-of-real-rig")])
         if board:
             return self._board_shot(folder)
         rig = self._calibrated()
         if rig is None:
-            detail = "The rig has no calibration: take shots of the board, calibrate from them and use the result."
+            detail = compose("capture-needs-calibration")
             raise Unavailable("not-calibrated", detail)
         with self._lock:
             session = self._opened()
             shot = session.shoot()
             if not shot.complete:
-                faults = [str(fault) for fault in shot.faults if fault.is_error]
-                raise Unavailable("shot-failed", "The shot is no capture: " + "; ".join(faults), faults)
+                faults = [fault.message() for fault in shot.faults if fault.is_error]
+                raise Unavailable("shot-failed", compose("shot-no-capture", faults=faults), faults)
             images = {name: image for name, image in shot.images.items() if name in rig}
             write_capture(folder / "files", Capture(images), rig)
             link_plates(session.plates, folder / "files" / "background")
@@ -223,8 +223,8 @@ class RealRig:
             try:
                 shot = board_shot(self._opened())
             except ShotFailed as error:
-                faults = [str(fault) for fault in error.faults]
-                raise Unavailable("shot-failed", f"No picture of the board: {'; '.join(faults)}", faults) from error
+                faults = [fault.message() for fault in error.faults]
+                raise Unavailable("shot-failed", compose("no-board-picture", faults=faults), faults) from error
         for name, image in shot.images.items():
             write_image(folder / "files" / "images" / f"{name}.png", image)
         return shot.document()
@@ -235,20 +235,20 @@ class RealRig:
 
     def preview(self, camera: str) -> bytes:
         if camera not in self._config.names:
-            raise NotFound("camera of the rig", camera, LIST)
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
         with self._lock:
             image = self._opened().look([camera]).get(camera)
         if image is None:
-            raise Unavailable("camera-missing", f"{camera} delivers no picture; GET /v1/rig says why.", [camera])
+            raise Unavailable("camera-missing", compose("camera-without-picture", camera=camera), [camera])
         return jpeg(image)
 
     def camera_settings(self, camera: str) -> CameraSettings:
         wanted = next((found for found in self._config.cameras if found.name == camera), None)
         if wanted is None:
-            raise NotFound("camera of the rig", camera, LIST)
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
         with self._lock:
             state = None if self._session is None else self._session.states().get(camera)
-        unmet = () if state is None else state.unmet
+        unmet = () if state is None else tuple(message_of(line) for line in state.unmet)
         return CameraSettings(wanted.exposure_ms, wanted.gain_db, wanted.white_balance_k, unmet)
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
@@ -289,16 +289,13 @@ class RealRig:
             try:
                 plates = self._opened().take_plates()
             except PlatesRefused as error:
-                faults = [f"{fault.camera}: {fault.detail}" for fault in error.faults]
-                detail = (
-                    "The new clean plates show somebody, or a changed studio; the old ones stay in use. Take them "
-                    f"again with nobody there, or put them to use all the same: version {error.version}."
-                )
+                faults = [fault.measured() for fault in error.faults]
+                detail = compose("plates-occupied", version=error.version)
                 raise Conflict("plates-occupied", detail, faults) from error
             except ShotFailed as error:
-                faults = [str(fault) for fault in error.faults]
-                raise Unavailable("plates-failed", str(error), faults) from error
-        return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, "")
+                faults = [fault.message() for fault in error.faults]
+                raise Unavailable("plates-failed", error.message, faults) from error
+        return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, None)
 
     def plates(self) -> list[PlatesVersion]:
         return plates_versions(self._config.plates_folder)
@@ -306,7 +303,7 @@ class RealRig:
     def use_plates(self, version: str) -> None:
         with self._lock:
             if all(kept.id != version for kept in self.plates()):
-                raise NotFound("version of the clean plates", version, "GET /v1/rig/background lists them")
+                raise NotFound(compose("thing-plates-version"), version, compose("hint-plates"))
             self._opened().use_plates(version)
 
     def use(self, calibration: Path) -> None:
@@ -332,7 +329,7 @@ class RealRig:
                 session.warm_up()
             except EigenheadError as error:
                 session.close()
-                raise Unavailable("rig-unavailable", str(error), [str(error)]) from error
+                raise Unavailable("rig-unavailable", error.message, [error.message]) from error
             if self._calibration.is_file():
                 session.rig = read_rig(self._calibration)
             self._session = session
@@ -348,7 +345,7 @@ class RealRig:
 
 
 def fixed_studio() -> Conflict:
-    detail = "The simulated studio's cameras and lamps have no settings; serve a rig.toml of real ones."
+    detail = compose("simulated-rig-fixed")
     return Conflict("simulated-rig", detail)
 
 
@@ -377,10 +374,12 @@ def reduced(image: ImageRgb, width: int) -> ImageRgb:
 def _check_names(rig: Rig, names: tuple[str, ...]) -> None:
     if set(rig.names) != set(names):
         differing = sorted(set(rig.names) ^ set(names))
-        detail = "The calibration is of other cameras than the rig has."
-        raise Conflict("other-rig", detail, [f"{name}: only in one of the two" for name in differing])
+        detail = compose("calibration-of-other-rig")
+        raise Conflict("other-rig", detail, [compose("camera-in-one-alone", camera=name) for name in differing])
 
 
-def _state(identity: str, kind: str, cameras: list[RigCamera], faults: list[str], calibration: str | None) -> RigState:
+def _state(
+    identity: str, kind: str, cameras: list[RigCamera], faults: list[Message], calibration: str | None
+) -> RigState:
     ready = not faults and all(camera.state != "missing" for camera in cameras)
     return RigState(identity, kind, ready, tuple(cameras), tuple(faults), calibration)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
+from rig.messages.message import Message
 from server.metrics import Metrics
 from server.services.calibrations import Calibrations
 from server.services.captures import Captures
@@ -31,7 +32,7 @@ class Check:
     yet, and nothing is to be done."""
 
     ok: bool
-    detail: str
+    detail: Message
     starting: bool = False
 
 

@@ -4,6 +4,7 @@ import unicodedata
 from collections.abc import Iterable
 
 from rig.errors import InputError
+from rig.messages.message import compose
 
 TAG_MOST = 50  # characters
 TAGS_MOST = 20  # of one capture
@@ -18,19 +19,18 @@ def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
     faults = []
     for number, tag in enumerate(tags, start=1):
         plain = " ".join(word for word in unicodedata.normalize("NFC", tag).split(" ") if word)
-        shown = f"tag {number}"
         if any(unicodedata.category(character) in UNSEEN for character in plain):
-            faults.append(f"{shown} has control characters or line breaks: type it anew")
+            faults.append(compose("tag-with-control-characters", tag=number))
         elif SEPARATOR in plain:
-            faults.append(f"{shown} has a comma, which stands between tags")
+            faults.append(compose("tag-with-comma", tag=number))
         elif not plain:
-            faults.append(f"{shown} is empty")
+            faults.append(compose("tag-empty", tag=number))
         elif len(plain) > TAG_MOST:
-            faults.append(f"{shown} is longer than {TAG_MOST} characters")
+            faults.append(compose("tag-too-long", tag=number, most=TAG_MOST))
         else:
             found.setdefault(plain.casefold(), plain)
     if len(found) > TAGS_MOST:
-        faults.append(f"{len(found)} tags: a capture has at most {TAGS_MOST}")
+        faults.append(compose("tags-too-many", count=len(found), most=TAGS_MOST))
     if faults:
         raise InputError("tags", faults)
     return tuple(found.values())

@@ -30,7 +30,7 @@ def templates_at_hand() -> list[TemplateAtHand]:
         try:
             header = read_header(path)
         except BadTemplate as error:
-            found.append(TemplateAtHand(name, name, None, None, None, (), None, None, error.why))
+            found.append(TemplateAtHand(name, name, None, None, None, (), None, None, str(error.why)))
             continue
         digests = digests or {
             model: model_sha256(path) for model, path in {"default": model_path("default"), **list_models()}.items()

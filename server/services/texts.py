@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 
 from rig.errors import InputError
+from rig.messages.message import compose
 from rig.text import encodes
 
 TEXT_MOST = 500  # characters
@@ -16,8 +17,8 @@ def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
     faults = []
     for name, text in texts.items():
         if text is not None and len(text) > TEXT_MOST:
-            faults.append(f"{name}: longer than {TEXT_MOST} characters")
+            faults.append(compose("text-too-long", field=name, most=TEXT_MOST))
         elif text is not None and (CONTROL.search(text) or not encodes(text)):
-            faults.append(f"{name}: has control characters or halves of characters: type it anew")
+            faults.append(compose("text-with-control-characters", field=name))
     if faults:
         raise InputError(subject, faults)

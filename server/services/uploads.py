@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from rig.atomic_write import write_atomically
+from rig.messages.message import compose
 from server.errors import Conflict, NotFound, Refused, TooLarge
 from server.settings import ServiceSettings
 from server.storage.records import UPLOAD, UploadRecord
@@ -15,7 +16,7 @@ from server.storage.store import Store, is_id, new_id
 
 
 def too_large(settings: ServiceSettings) -> TooLarge:
-    return TooLarge("upload-too-large", f"An upload may have {settings.body_bytes:,} bytes.")
+    return TooLarge("upload-too-large", compose("upload-too-large", bytes=settings.body_bytes))
 
 
 class ResumableUploads:
@@ -40,13 +41,13 @@ class ResumableUploads:
     def get(self, identity: str) -> UploadRecord:
         """Raises NotFound, also for what expired."""
         if not is_id(identity):
-            raise NotFound("upload", identity)
+            raise NotFound(compose("thing-upload"), identity)
         with suppress(OSError, ValueError):
             path = self._store.folder("uploads", identity) / "upload.json"
             record = UPLOAD.read(json.loads(path.read_bytes()))
             if record.expires > time.time():
                 return record
-        raise NotFound("upload", identity)
+        raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
         """Bytes that are here; all of them once the capture was made and the data let go."""
@@ -63,7 +64,7 @@ class ResumableUploads:
         try:
             write_atomically(path, json.dumps(UPLOAD.document(record)).encode(), parents=False)
         except FileNotFoundError as error:  # given up meanwhile
-            raise NotFound("upload", record.id) from error
+            raise NotFound(compose("thing-upload"), record.id) from error
 
     @contextmanager
     def lock(self, identity: str) -> Iterator[None]:
@@ -73,9 +74,9 @@ class ResumableUploads:
                 stream = stack.enter_context((self._store.folder("uploads", identity) / "upload.json").open("rb"))
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except (FileNotFoundError, NotADirectoryError) as error:  # removed since it was looked at
-                raise NotFound("upload", identity) from error
+                raise NotFound(compose("thing-upload"), identity) from error
             except BlockingIOError as error:
-                detail = "Another request is writing to this upload; ask with HEAD and go on from there."
+                detail = compose("upload-busy")
                 raise Conflict("upload-busy", detail) from error
             yield
 

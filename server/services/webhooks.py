@@ -19,6 +19,7 @@ import httpx
 import sqlalchemy as sa
 from dbos import EnqueueOptions
 
+from rig.messages.message import compose
 from server.errors import NotFound
 from server.origins import parsed, target
 from server.services.jobs import APPLICATION_VERSION, DELIVERY
@@ -56,7 +57,7 @@ class Webhooks:
         """Raises NotFound."""
         with self._engine.begin() as connection:
             if not connection.execute(sa.delete(webhooks).where(webhooks.c.id == identity)).rowcount:
-                raise NotFound("webhook", identity)
+                raise NotFound(compose("thing-webhook"), identity)
 
     def announce(self, job_id: str, state: str, enqueue: Callable[..., Any], own: JobWebhook | None = None) -> None:
         """Queues one delivery a webhook; doing it again for the same job and state changes nothing."""

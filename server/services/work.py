@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from pipeline.settings import TEMPLATE_NAME, settings_from_document
 from rig.errors import EigenheadError, InputError
+from rig.messages.message import Message, compose
 from server.errors import Conflict
 from server.services.texts import check_texts
 from server.storage.records import CaptureRecord, JobWebhook
@@ -26,20 +27,22 @@ class Work:
         check_texts({"name": self.name}, "request")
         model, settings = self._model_faults(), self._settings_faults()
         if model and settings:
-            raise InputError("request", [*(f"model: {f}" for f in model), *(f"settings: {f}" for f in settings)])
+            named = (("model", model), ("settings", settings))
+            faults = [compose("located", where=name, fault=fault) for name, found in named for fault in found]
+            raise InputError("request", faults)
         if model or settings:
             raise InputError("model" if model else "settings", model or settings)
 
-    def _model_faults(self) -> list[str]:
+    def _model_faults(self) -> list[Message]:
         from pipeline.eigenheads.model_names import list_models
 
         known = ["default", *list_models()]
         if self.model is None or self.model in known:
             return []
-        return [f"{self.model!r:.80} is not at hand; there are: {', '.join(known)}"]
+        return [compose("model-not-at-hand", model=f"{self.model!r:.80}", known=known)]
 
-    def _settings_faults(self) -> list[str]:
-        document, faults = self.settings or {}, []
+    def _settings_faults(self) -> list[Message]:
+        document, faults = self.settings or {}, list[Message]()
         try:
             settings_from_document(document)
         except InputError as error:
@@ -51,7 +54,7 @@ class Work:
         return faults
 
 
-def _template_faults(name: str, model: str) -> list[str]:
+def _template_faults(name: str, model: str) -> list[Message]:
     from pipeline.eigenheads.model_names import UnknownModel
     from pipeline.templates.header import check_template
     from pipeline.templates.names import template_path
@@ -62,11 +65,11 @@ def _template_faults(name: str, model: str) -> list[str]:
     except UnknownModel:
         return []  # told beside it
     except EigenheadError as error:
-        return [f"outputs.template: {error}"]
+        return [compose("located", where="outputs.template", fault=error.message)]
     return []
 
 
 def refuse_board(record: CaptureRecord) -> None:
     """Raises Conflict for pictures of the calibration board, which show no head."""
     if record.board:
-        raise Conflict("board-shot", "The capture is of the calibration board; it can only be calibrated from.")
+        raise Conflict("board-shot", compose("board-shot"))

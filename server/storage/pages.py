@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 
 from rig.errors import InputError
+from rig.messages.message import compose
 
 WORDS_MOST = 10  # of a search: each is one comparison with every row
 ID_LEAST = 6  # digits of an id's end that name it
@@ -86,7 +87,7 @@ def _is_whole(part: object) -> bool:
 
 
 def no_cursor() -> InputError:
-    return InputError("cursor", ["is not what 'next' of this list in this order said: begin without one"])
+    return InputError("cursor", [compose("cursor-of-other-list")])
 
 
 def page_of(

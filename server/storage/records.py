@@ -5,17 +5,41 @@ job engine keeps the requests and results of jobs as they are, across upgrades o
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Generic, NotRequired, TypedDict, TypeVar
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Generic, NotRequired, TypedDict, TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
-from pipeline.diagnostics import ReportWarning
-from rig.acquisition.shot import Fault
+from rig.acquisition.shot import Fault, read_fault
 from rig.acquisition.verdict import ViewDocument
+from rig.messages.message import Message, MessageDocument, read_message
 
 JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its own
 T = TypeVar("T")
+
+
+def _read_stored_message(value: object) -> Message:
+    return value if isinstance(value, Message) else read_message(value)
+
+
+def _read_fault(value: object) -> Fault:
+    """Reads a fault; the detail of earlier versions is a text."""
+    if isinstance(value, Fault):
+        return value
+    if not isinstance(value, Mapping) or not isinstance(value.get("code"), str):
+        raise ValueError(f"no fault: {value!r:.80}")
+    return read_fault(value)
+
+
+def _write_fault(fault: Fault) -> dict[str, object]:
+    document = fault.document()
+    return {name: document[name] for name in ("code", "camera", "detail", "detail_message")}
+
+
+StoredMessage = Annotated[
+    Message, PlainValidator(_read_stored_message), PlainSerializer(Message.document, return_type=dict[str, Any])
+]
+StoredFault = Annotated[Fault, PlainValidator(_read_fault), PlainSerializer(_write_fault, return_type=dict[str, Any])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +62,9 @@ class CaptureContent:
     inputs: dict[str, str]
     bytes: int
     board: bool = False
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[StoredFault, ...] = ()
     checks: Mapping[str, ViewDocument] = field(default_factory=dict)
-    warnings: tuple[ReportWarning, ...] = ()
+    warnings: tuple[StoredMessage, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +87,8 @@ class CaptureRecord:
     shot: Mapping[str, object] | None = None
     board: bool = False
     verdict: str | None = None
-    faults: tuple[Fault, ...] = ()
-    warnings: tuple[ReportWarning, ...] = ()
+    faults: tuple[StoredFault, ...] = ()
+    warnings: tuple[StoredMessage, ...] = ()
     tags: tuple[str, ...] = ()
 
 
@@ -115,7 +139,7 @@ class RecordFormat(Generic[T]):
         self._adapter, self.name = TypeAdapter(kind), name
 
     def document(self, record: T) -> dict[str, object]:
-        return {"format": self.name, **asdict(record)}  # pyright: ignore[reportArgumentType]
+        return {"format": self.name, **self._adapter.dump_python(record, mode="json")}
 
     def read(self, document: object) -> T:
         """Raises ValueError for what is no such record."""
@@ -190,9 +214,11 @@ class CalibrationOutcome(TypedDict):
 
     verdict: NotRequired[str]
     missing: NotRequired[list[str]]
+    missing_messages: NotRequired[list[MessageDocument]]
     figures: Mapping[str, object]
     checks: list[Mapping[str, object]]
     warnings: list[str]
+    warning_messages: NotRequired[list[MessageDocument]]
     front: str | None
     sha256: str
 

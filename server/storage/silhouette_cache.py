@@ -27,6 +27,7 @@ from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.segment import segment
 from rig.atomic_write import write_atomically
 from rig.capture import Capture
+from rig.messages.message import documents_of, read_message
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -79,7 +80,10 @@ def _encoded(silhouettes: dict[str, Silhouette]) -> bytes:
     arrays: dict[str, np.ndarray] = {}
     documents = []
     for number, (name, silhouette) in enumerate(silhouettes.items()):
-        documents.append({"name": name, **dataclasses.asdict(silhouette.quality)})
+        quality = silhouette.quality
+        told = {"warnings": documents_of(quality.warnings), "doubts": documents_of(quality.doubts)}
+        plain = dataclasses.asdict(dataclasses.replace(quality, warnings=(), doubts=()))
+        documents.append({"name": name, **plain, **told})
         arrays[f"shape{number}"] = np.array(silhouette.mask.shape)
         arrays[f"mask{number}"] = _bytes(zlib.compress(np.packbits(silhouette.mask).tobytes(), QUICK))
         arrays[f"distance{number}"] = _bytes(zlib.compress(_steps(silhouette.distance), QUICK))
@@ -98,7 +102,8 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
             mask = np.unpackbits(packed, count=height * width).reshape(height, width).view(bool)
             distance = _from_steps(zlib.decompress(arrays[f"distance{number}"].tobytes()), height, width)
             name = view.pop("name")
-            listed = {field: tuple(view[field]) for field in ("cut_off", "warnings", "doubts")}
+            told = {field: tuple(map(read_message, view[field])) for field in ("warnings", "doubts")}
+            listed = {"cut_off": tuple(view["cut_off"]), **told}
             found[name] = Silhouette(mask, distance, ViewQuality(**view | listed))
     return found
 

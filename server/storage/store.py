@@ -31,6 +31,7 @@ import structlog
 
 from rig.acquisition.verdict import ViewDocument
 from rig.atomic_write import unfinished, write_atomically
+from rig.messages.message import Message, compose
 from server.errors import DiskFull, NotFound
 from server.storage.records import (
     CALIBRATION,
@@ -76,6 +77,15 @@ class RecordIndex(Protocol):
     def drop_session(self, identity: str) -> None: ...
 
 
+_THINGS = {
+    "captures": compose("thing-capture"),
+    "jobs": compose("thing-job"),
+    "calibrations": compose("thing-calibration"),
+    "sessions": compose("thing-session"),
+    "uploads": compose("thing-upload"),
+}
+
+
 class Store:
     """The data folder. Every id that comes from a request passes ``is_id`` before it becomes part of a path."""
 
@@ -89,7 +99,7 @@ class Store:
     def folder(self, kind: str, identity: str) -> Path:
         """Where a capture, job, ... lies or would lie. Raises NotFound for what is no id."""
         if not is_id(identity):
-            raise NotFound(kind.removesuffix("s"), identity)
+            raise NotFound(_THINGS.get(kind) or compose("thing-file"), identity)
         return self.data / kind / identity
 
     def ids(self, kind: str) -> list[str]:
@@ -155,7 +165,7 @@ class Store:
         path = self.folder("captures", identity) / "record.json"
         record = self._read(path, CAPTURE, path.parent)
         if record is None:
-            raise NotFound("capture", identity)
+            raise NotFound(compose("thing-capture"), identity)
         return record
 
     def calibration(self, identity: str) -> CalibrationRecord:
@@ -163,7 +173,7 @@ class Store:
         path = self.folder("calibrations", identity) / "record.json"
         record = self._read(path, CALIBRATION, path.parent)
         if record is None:
-            raise NotFound("calibration", identity)
+            raise NotFound(compose("thing-calibration"), identity)
         return record
 
     def put_checks(self, folder: Path, checks: Mapping[str, ViewDocument]) -> None:
@@ -189,7 +199,7 @@ class Store:
     def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
         """Puts what ``change`` makes of a capture's record, and perhaps writes beside it, in its place and returns it.
         Raises NotFound."""
-        with self._change("capture", identity):
+        with self._change(compose("thing-capture"), identity):
             record = change(self.capture(identity))
             path = self.folder("captures", identity) / "record.json"
             write_atomically(path, _encoded(CAPTURE.document(record)), parents=False)
@@ -197,7 +207,7 @@ class Store:
         return record
 
     @contextmanager
-    def _change(self, what: str, identity: str) -> Iterator[None]:
+    def _change(self, what: Message, identity: str) -> Iterator[None]:
         """One change or removal at a time, so that none is lost and nothing comes back that was removed. Raises
         NotFound, also for what another process removed meanwhile."""
         with self._changing:
@@ -208,7 +218,7 @@ class Store:
 
     def remove_capture(self, identity: str) -> None:
         """Removes a capture with what was kept of it: that shows a face too."""
-        with self._change("capture", identity):
+        with self._change(compose("thing-capture"), identity):
             self.remove(self.folder("captures", identity))
             self.remove(self.cache_of(identity))
             if self._index is not None:
@@ -226,14 +236,14 @@ class Store:
 
     def change_session(self, identity: str, change: Callable[[SessionRecord], SessionRecord]) -> SessionRecord:
         """Puts what ``change`` makes of a session's record in its place and returns it. Raises NotFound."""
-        with self._change("session", identity):
+        with self._change(compose("thing-session"), identity):
             record = change(self.session(identity))
             self.add_session(record)
         return record
 
     def remove_session(self, identity: str) -> None:
         """Removes a session's record, and what a kill left of writing it; its captures are not its own."""
-        with self._change("session", identity):
+        with self._change(compose("thing-session"), identity):
             path = self.folder("sessions", identity).with_suffix(".json")
             for part in [*unfinished(path.parent, path.name)]:
                 self.remove(part)
@@ -246,7 +256,7 @@ class Store:
         path = self.folder("sessions", identity).with_suffix(".json")
         record = self._read(path, SESSION, path)
         if record is None:
-            raise NotFound("session", identity)
+            raise NotFound(compose("thing-session"), identity)
         return record
 
     def sessions(self) -> Iterator[SessionRecord]:

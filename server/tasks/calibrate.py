@@ -10,6 +10,7 @@ from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
 from rig.formats.capture_folder import capture_root
+from rig.messages.message import compose, documents_of, texts_of
 from rig.progress import Progress
 from server.storage.records import CalibrationOutcome
 from server.tasks.child import Bench
@@ -84,7 +85,7 @@ def ingest_board_pictures(bench: Bench, report: Progress, *, archive: str, folde
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
     if not (root / BOARD).is_file():
-        raise InputError("archive", ["holds no board.toml beside IMAGES/"])
+        raise InputError("archive", [compose("no-board-toml")])
     read_board(root / BOARD)
     pictures = next((root / name for name in ("IMAGES", "images") if (root / name).is_dir()), root)
     for camera, shots in list_pictures(pictures).items():
@@ -127,9 +128,11 @@ def calibrate_folder(
     return {
         "verdict": document["verdict"],
         "missing": document["missing"],
+        "missing_messages": document["missing_messages"],
         "figures": document["figures"],
         "checks": [*document["checks"]],
         "warnings": document["warnings"],
+        "warning_messages": document["warning_messages"],
         "front": document["front"],
         "sha256": digest,
     }
@@ -150,14 +153,17 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     verdict = judge_scene(found)
     write_scene_report(found, result / "report.html")
     write_rig(found.rig, result / "cameras.json")
-    judged = {"verdict": verdict.word, "missing": [*verdict.missing], **found.document()}
+    told = {"missing": texts_of(verdict.missing), "missing_messages": documents_of(verdict.missing)}
+    judged = {"verdict": verdict.word, **told, **found.document()}
     write_atomically(result / "calibration.json", json.dumps(judged, indent=1).encode())
     return {
         "verdict": verdict.word,
-        "missing": [*verdict.missing],
+        "missing": texts_of(verdict.missing),
+        "missing_messages": documents_of(verdict.missing),
         "figures": found.figures(),
         "checks": [],
-        "warnings": [*found.warnings],
+        "warnings": texts_of(found.warnings),
+        "warning_messages": documents_of(found.warnings),
         "front": found.front,
         "sha256": hashlib.sha256((result / "cameras.json").read_bytes()).hexdigest(),
     }

@@ -19,12 +19,13 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from rig.errors import Cancelled, EigenheadError, InputError
+from rig.messages.message import Message, compose, message_of, verbatim
 from rig.progress import Progress
 from server.processes import SERVER, python_command, python_environment
 
@@ -42,9 +43,12 @@ class WorkFailed(EigenheadError):
     """The work raised. ``kind`` tells a known failure (an error of this project, a full disk, no memory) from a bug,
     whose ``trace`` is for the log."""
 
-    def __init__(self, kind: str, message: str, faults: tuple[str, ...] = (), trace: str = "") -> None:
+    def __init__(
+        self, kind: str, message: Message | str, faults: Iterable[Message | str] = (), trace: str = ""
+    ) -> None:
         super().__init__(message)
-        self.kind, self.message, self.faults, self.trace = kind, message, faults, trace
+        self.kind, self.trace = kind, trace
+        self.faults = tuple(message_of(fault) for fault in faults)
 
 
 class Bench:
@@ -96,8 +100,8 @@ class Child:
             return self._await(connection, report, cancelled)
         except (EOFError, OSError) as error:
             code = self._kill()
-            how = f"signal {-code}" if code < 0 else f"status {code}"
-            raise WorkFailed("crash", f"The process that did the work died ({how}).") from error
+            how = compose("ended-by-signal", number=-code) if code < 0 else compose("ended-with-status", status=code)
+            raise WorkFailed("crash", compose("work-crashed", how=how)) from error
         except BaseException:
             if self._connection is not None and not self._idle:
                 self._kill()
@@ -176,23 +180,25 @@ class Children:
             child.close()
 
 
-def _error(kind: str, message: str, subject: str, faults: tuple[str, ...], trace: str) -> EigenheadError:
+def _error(kind: str, message: Message, subject: str, faults: tuple[Message, ...], trace: str) -> EigenheadError:
     if kind == "Cancelled":
         return Cancelled()
     return InputError(subject, faults) if kind == "InputError" else WorkFailed(kind, message, faults, trace)
 
 
-def _described(error: BaseException) -> tuple[str, str, str, str, tuple[str, ...], str]:
+def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Message, ...], str]:
     if isinstance(error, InputError):
-        return "failed", "InputError", str(error), error.subject, error.faults, ""
+        return "failed", "InputError", error.message, error.subject, error.faults, ""
     if isinstance(error, EigenheadError):
-        return "failed", type(error).__name__, str(error), "", tuple(getattr(error, "faults", ())), ""
+        faults = getattr(error, "faults", ())
+        told = tuple(fault if isinstance(fault, Message) else verbatim(str(fault)) for fault in faults)
+        return "failed", type(error).__name__, error.message, "", told, ""
     if isinstance(error, OSError) and error.errno in DISK_FULL:
-        return "failed", "disk-full", "The disk is full. Delete captures or jobs, then restart the job.", "", (), ""
+        return "failed", "disk-full", compose("disk-full"), "", (), ""
     if isinstance(error, MemoryError):
-        return "failed", "out-of-memory", "The work needed more memory than there is.", "", (), ""
+        return "failed", "out-of-memory", compose("out-of-memory"), "", (), ""
     trace = "".join(traceback.format_exception(error))
-    return "failed", "bug", f"{type(error).__name__}: {error}"[:500], "", (), trace
+    return "failed", "bug", verbatim(f"{type(error).__name__}: {error}"[:500]), "", (), trace
 
 
 def serve(connection: Connection) -> None:

@@ -35,6 +35,7 @@ from rig.formats.reading import say_once
 from rig.formats.rig_toml import ShotConfig
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
+from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
@@ -80,7 +81,7 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
     except InputError as error:
         raise InputError("capture", [NO_RIG, *error.faults]) from error
     except CalibrationRefused as refusal:
-        told = f"{NO_RIG}, and its photographs alone do not tell the cameras"
+        told = compose("photographs-do-not-tell", no_rig=NO_RIG)
         raise InputError("capture", [told, *refusal.reasons]) from refusal
     _leave_out(root, read_rig(root / CAMERAS))
     return told
@@ -178,7 +179,9 @@ def check_capture(
     read = read_rig_of(rig_file)
     rig = read.rig
     check_folders(root, rig)
-    faults = [f"{rig_file.name}: {fault}" for fault in rig_faults(rig, any_unit=has_known_length(root))]
+    faults: list[Message | str] = [
+        f"{rig_file.name}: {fault}" for fault in rig_faults(rig, any_unit=has_known_length(root))
+    ]
     files = find_files(root, rig, read.left_out)
     faults += files.faults
     faults += [stray_sentence(files.strays, rig)] if files.strays and not strays_pass else []
@@ -187,18 +190,19 @@ def check_capture(
     views: dict[str, ViewCheck] = {}
     for number, camera in enumerate(rig):
         report("check", number / len(rig))
-        of_camera = _size_faults(root, files, camera, image_pixels)
-        if not of_camera:
-            shot = read_shot(root, rig.subset([camera.name]), of_camera, files)
+        of_sizes, of_files = _size_faults(root, files, camera, image_pixels), list[str]()
+        if not of_sizes:
+            shot = read_shot(root, rig.subset([camera.name]), of_files, files)
             digests |= shot.digests
             empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
             views |= _view_of(shot, camera.name, measured)
-        faults += [fault for fault in of_camera if not fault.startswith("features.json")]  # judged below, for all
+        faults += [*of_sizes, *(fault for fault in of_files if not fault.startswith("features.json"))]  # judged below
     if (root / "features.json").is_file():
-        features = features_from_bytes((root / "features.json").read_bytes(), rig, faults)
-        faults += feature_faults(features, rig)
+        of_file: list[str] = []
+        features = features_from_bytes((root / "features.json").read_bytes(), rig, of_file)
+        faults += [*of_file, *feature_faults(features, rig)]
     if len(empty) == len(rig):
-        faults.append("every picture is its own clean plate: nobody was there, or the plates were copied; shoot again")
+        faults.append(compose("every-picture-its-plate"))
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     for path in rig_file_parts(rig_file):
@@ -237,18 +241,18 @@ def check_features(bench: Bench, report: Progress, *, folder: str, points: Point
     rig_file = find_rig_file(Path(folder))
     if rig_file is None:
         raise InputError("capture", [NO_RIG])
-    faults: list[str] = []
     data = json.dumps({"format": FEATURES_FORMAT, "points": points}, indent=1).encode()
     # Points come one after the other: whether they suffice is asked when the job starts.
-    faults += unknown_landmarks(features_from_bytes(data, read_cameras(rig_file).rig, faults))
-    if faults:
-        raise InputError("features.json", faults)
+    of_file: list[str] = []
+    unknown = unknown_landmarks(features_from_bytes(data, read_cameras(rig_file).rig, of_file))
+    if of_file or unknown:
+        raise InputError("features.json", [*of_file, *unknown])
     return data
 
 
-def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[str]:
+def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[Message | str]:
     """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
-    faults = []
+    faults: list[Message | str] = []
     wanted = (camera.intrinsics.width, camera.intrinsics.height)
     for _, path in files.of_camera(camera.name):
         name = path.relative_to(root).as_posix()
@@ -258,7 +262,7 @@ def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int
             faults += [f"{name} {fault}" for fault in error.faults]
             continue
         if width * height > image_pixels:
-            faults.append(f"{name} is {width} x {height} pixels; at most {image_pixels:,} pixels are accepted")
+            faults.append(compose("picture-too-large", file=name, width=width, height=height, most=image_pixels))
         elif (width, height) != wanted:
             faults.append(size_fault(name, (width, height), camera.intrinsics))
     return faults

@@ -38,6 +38,7 @@ from rig.formats.reading import say_once
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import find_files, picture_folder
 from rig.formats.work_size import WORK_PIXELS, work_rig
+from rig.messages.message import compose, documents_of, read_message
 from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
@@ -81,7 +82,7 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
     capture = read_shot(root, rig, faults, files, pixels_most=WORK_PIXELS)
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
-    warnings += tuple(ReportWarning(remark.code, remark.message) for remark in unread_pictures(root, files, rig))
+    warnings += tuple(unread_pictures(root, files, rig))
     digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
     return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
 
@@ -113,20 +114,19 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
 
     scale = root / SCALE
     found = calibrate_scene(root, scale=scale if scale.is_file() else None, front=front, report=report)
-    told = [ReportWarning("view-left-out", why) for why in found.left_out.values()]
+    told = [compose("view-left-out", remark=absence) for absence in found.absences()]
     if found.scale.assumed:
-        told.append(ReportWarning("scale-assumed", f"the scale is {found.scale.told}"))
+        told.append(compose("scale-assumed", scale=found.scale.told))
     rig = found.rig
     if len(rig) > CAMERAS_MOST:
         rig = rig.subset(spread_views(rig, CAMERAS_MOST))
-        message = f"{len(found.rig)} views joined, of which {CAMERAS_MOST} that stand well apart are used"
-        told.append(ReportWarning("views-many", message))
+        told.append(compose("views-many", joined=len(found.rig), most=CAMERAS_MOST))
     write_rig(rig, kept / CAMERAS)
     write_scene_report(found, kept / PAGE)
     document = {
         "made_of": made_of,
         "cameras_sha256": _sha256(kept / CAMERAS),
-        "told": [{"code": one.code, "message": one.message} for one in told],
+        "told": documents_of(told),
         **found.document(),
     }
     write_atomically(kept / FIGURES, json.dumps(document, indent=1).encode())
@@ -140,7 +140,7 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
         document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
         same = made_of is None or document["made_of"] == made_of
         if same and document["cameras_sha256"] == _sha256(kept / CAMERAS):
-            return tuple(ReportWarning(told["code"], told["message"]) for told in document["told"])
+            return tuple(map(read_message, document["told"]))
     return None
 
 

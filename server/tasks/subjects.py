@@ -12,6 +12,7 @@ from pipeline.eigenheads.model import HeadModel, load_model
 from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from rig.studio.devices.folder import simulate_to_folder
 from rig.studio.scene.layout import default_layout
@@ -49,7 +50,7 @@ def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression
     if text == "mean":
         return model_subject(model, np.zeros(0), f"mean of {model.name}", weights)
     if weights:
-        raise InputError("expression", ["only heads of the model make faces: leave out --subject FILE"])
+        raise InputError("expression", [compose("expression-of-file")])
     path = Path(text)
     marks = landmark_file(path)
     return Subject(read_mesh(path), {} if marks is None else read_landmarks(marks), name=path.name)

@@ -6,6 +6,7 @@ from pathlib import Path
 import anyio
 import httpx
 
+from rig.messages.message import Message, compose
 from server.errors import Unusable
 from server.origins import target
 from server.services.service import Service
@@ -29,9 +30,9 @@ async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
             async with httpx.AsyncClient(trust_env=False, timeout=patience) as client:  # a proxy would judge nothing
                 return await _follow(service, client, url, folder / "upload")
     except TimeoutError as error:
-        raise _failed(f"did not give the archive within {service.settings.import_s:g} s") from error
+        raise _failed(compose("import-too-slow", seconds=service.settings.import_s)) from error
     except (httpx.HTTPError, UnicodeError) as error:  # UnicodeError: redirected to a host that IDNA refuses
-        raise _failed(f"broke off ({type(error).__name__}: {error})") from error
+        raise _failed(compose("import-broke-off", kind=type(error).__name__, reason=str(error))) from error
 
 
 async def _follow(service: Service, client: httpx.AsyncClient, url: str, path: Path) -> Path:
@@ -43,10 +44,10 @@ async def _follow(service: Service, client: httpx.AsyncClient, url: str, path: P
                 url = str(httpx.URL(url).join(answer.headers["location"]))
                 continue
             if answer.status_code != 200:
-                raise _failed(f"answered {answer.status_code} {answer.reason_phrase}")
+                raise _failed(compose("import-answered", status=answer.status_code, phrase=answer.reason_phrase))
             await _receive(service, answer, path)
             return path
-    raise _failed(f"redirected more than {REDIRECTS_MOST} times")
+    raise _failed(compose("import-redirected", count=REDIRECTS_MOST))
 
 
 async def _receive(service: Service, answer: httpx.Response, path: Path) -> None:
@@ -69,8 +70,8 @@ async def _receive(service: Service, answer: httpx.Response, path: Path) -> None
     finally:
         await disk(stream.close)
     if length and received != length:
-        raise _failed(f"broke off after {received:,} of {length:,} bytes")
+        raise _failed(compose("import-cut-off", received=received, length=length))
 
 
-def _failed(why: str) -> Unusable:
-    return Unusable("import-failed", f"The server at that address {why}. Try again, or upload the archive.", [why])
+def _failed(why: Message) -> Unusable:
+    return Unusable("import-failed", compose("import-failed", why=why), [why])

@@ -13,6 +13,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from rig.errors import InputError
+from rig.messages.message import compose
 from rig.text import suggest
 from server.services.captures import About
 from server.services.records import Calibration
@@ -62,12 +63,12 @@ async def receive_multipart(
     kind, options = parse_options_header(request.headers.get("content-type"))
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
-        raise Problem(415, "unsupported-media-type", "Send multipart/form-data with the archive as the part 'file'.")
+        raise Problem(415, "unsupported-media-type", compose("multipart-wanted"))
     form = _Form()
     try:
         parser = MultipartParser(boundary, form.callbacks())
     except FormParserError as error:
-        raise Problem(400, "malformed-body", f"The multipart boundary is no good ({error}).") from error
+        raise Problem(400, "malformed-body", compose("multipart-boundary-wrong", reason=str(error))) from error
     path = folder / "upload"
     received = 0
     target: Any = await threads.disk(path.open, "xb")
@@ -84,16 +85,16 @@ async def receive_multipart(
             try:
                 parser.write(chunk)
             except FormParserError as error:
-                raise Problem(400, "malformed-body", f"The body is no multipart/form-data ({error}).") from error
+                raise Problem(400, "malformed-body", compose("multipart-malformed", reason=str(error))) from error
             if len(form.pending) >= BLOCK_BYTES:
                 await threads.disk(write, form.take())
         await threads.disk(write, form.take())
     finally:
         await threads.disk(target.close)
     if not form.ended:
-        raise Problem(400, "malformed-body", "The multipart body breaks off before its end; send it again.")
+        raise Problem(400, "malformed-body", compose("multipart-cut-off"))
     if not form.files:
-        raise Problem(422, "file-missing", "The form has no part 'file' that holds the archive.", ["file: missing"])
+        raise Problem(422, "file-missing", compose("file-missing"), [compose("field-file-missing")])
     return path, form.fields
 
 
@@ -126,7 +127,7 @@ class _Form:
     def _part_begin(self) -> None:
         self._parts += 1
         if self._parts > FIELDS_MOST:
-            raise Problem(413, "fields-too-many", f"The form has more than {FIELDS_MOST} parts; send one archive.")
+            raise Problem(413, "fields-too-many", compose("form-fields-too-many", most=FIELDS_MOST))
         self._name, self._data = "", bytearray()
 
     def _add_header(self, data: bytes) -> None:
@@ -145,12 +146,10 @@ class _Form:
         if self._name == "file" and self.files == 1:
             self.pending += data[start:end]
         elif self._name == "file":
-            raise Problem(
-                422, "file-repeated", "The form has several parts 'file'; send one archive.", ["file: repeated"]
-            )
+            raise Problem(422, "file-repeated", compose("file-repeated"), [compose("field-file-repeated")])
         elif len(self._data) + end - start > FIELD_BYTES:
-            told = f"The form field {self._name!r:.80} is longer than {FIELD_BYTES:,} bytes"
-            raise Problem(413, "field-too-large", f"{told}; the archive is the part 'file'.")
+            told = compose("form-field-too-long", field=f"{self._name!r:.80}", bytes=FIELD_BYTES)
+            raise Problem(413, "field-too-large", told)
         else:
             self._data += data[start:end]
 
@@ -169,8 +168,12 @@ def check_fields(names: Iterable[str], known: Collection[str]) -> None:
     for name in names:
         if name not in known:
             near = suggest(name, known)
-            told = f"did you mean {near[0]!r}?" if near else f"there are file, {', '.join(known)}"
-            faults.append(f"unknown field {name!r:.80}; {told}")
+            field = f"{name!r:.80}"
+            faults.append(
+                compose("form-field-unknown-near", field=field, near=f"{near[0]!r}")
+                if near
+                else compose("form-field-unknown", field=field, known=known)
+            )
     if faults:
         raise InputError("form", faults)
 
@@ -199,5 +202,10 @@ async def receive_calibration_pictures(service: Service, request: Request) -> Ca
         accept = {"board": service.accept_board_pictures, "scene": service.accept_photographs}
         source = fields.get("from") or "board"
         if source not in accept:
-            raise Problem(422, "invalid-request", "from is neither 'board' nor 'scene'.", [f"from: {source!r:.80}"])
+            raise Problem(
+                422,
+                "invalid-request",
+                compose("calibration-source-unknown"),
+                [compose("field-from-unknown", value=f"{source!r:.80}")],
+            )
         return await service.threads.check(accept[source], archive, folder, label)

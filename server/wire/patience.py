@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator
 
 import anyio
 
+from rig.messages.message import compose
 from server.wire.problems import Problem
 
 SILENT_S = 30.0  # between two pieces: above the pauses of a network that changes, below what who sends again waits for
@@ -22,7 +23,5 @@ async def _next(stream: AsyncIterator[bytes], silent_s: float) -> bytes | None:
         with anyio.fail_after(silent_s):
             return await anext(stream, None)
     except TimeoutError as error:
-        detail = (
-            f"Nothing more came for {silent_s:g} s; send the rest again, by a resumable upload only what is missing."
-        )
+        detail = compose("body-silent", seconds=silent_s)
         raise Problem(408, "body-silent", detail, headers={"Connection": "close"}) from error

@@ -14,9 +14,9 @@ from sqlalchemy.exc import DataError, DBAPIError
 from starlette.exceptions import HTTPException
 
 from rig.errors import EigenheadError, InputError
+from rig.messages.message import Message, MessageDocument, compose, documents_of, message_of
 from rig.text import printable
 from server.errors import (
-    URN,
     Conflict,
     DiskFull,
     Forbidden,
@@ -30,11 +30,22 @@ from server.errors import (
     Unusable,
     unusable_input,
 )
+from server.problem_types import PROBLEM_TYPES, URN, type_of_status
 
 MEDIA_TYPE = "application/problem+json"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 log = structlog.get_logger()
+
+MESSAGE_SCHEMA = {
+    "type": "object",
+    "required": ["code", "message", "parameters"],
+    "properties": {
+        "code": {"type": "string", "description": "stable; decides what parameters there are"},
+        "message": {"type": "string", "description": "in English"},
+        "parameters": {"type": "object", "description": "what stands in the message, by name"},
+    },
+}
 
 PROBLEM_SCHEMA = {
     "type": "object",
@@ -45,6 +56,8 @@ PROBLEM_SCHEMA = {
         "status": {"type": "integer"},
         "detail": {"type": "string", "description": "what is wrong and what to do"},
         "errors": {"type": "array", "items": {"type": "string"}, "description": "every fault found"},
+        "detail_message": {**MESSAGE_SCHEMA, "description": "the detail as data"},
+        "error_messages": {"type": "array", "items": MESSAGE_SCHEMA, "description": "the faults as data"},
     },
 }
 
@@ -58,6 +71,8 @@ class ProblemDocument(TypedDict):
     status: int
     detail: str
     errors: list[str]
+    detail_message: MessageDocument
+    error_messages: list[MessageDocument]
 
 
 STATUS_OF: dict[type[Refused], int] = {
@@ -88,23 +103,23 @@ class Problem(EigenheadError):
         self,
         status: int,
         kind: str,
-        detail: str,
-        errors: Iterable[str] = (),
+        detail: Message | str,
+        errors: Iterable[Message | str] = (),
         headers: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(detail)
-        self.status, self.kind, self.detail = status, kind, detail
-        self.errors, self.headers = list(errors), dict(headers or {})
+        self.status, self.kind, self.detail = status, kind, self.message
+        self.errors, self.headers = tuple(message_of(error) for error in errors), dict(headers or {})
 
     def document(self) -> ProblemDocument:
-        title = self.kind.replace("-", " ").capitalize()
-        errors = [printable(error) for error in self.errors]
         return {
             "type": URN + self.kind,
-            "title": title,
+            "title": PROBLEM_TYPES.get(self.kind, self.kind),
             "status": self.status,
-            "detail": printable(self.detail),
-            "errors": errors,
+            "detail": printable(self.detail.text),
+            "errors": [printable(error.text) for error in self.errors],
+            "detail_message": self.detail.document(),
+            "error_messages": documents_of(self.errors),
         }
 
     def response(self) -> JSONResponse:
@@ -121,31 +136,27 @@ def problem_from(error: Exception) -> Problem:
         again = {} if error.retry_after_s is None else {"Retry-After": str(error.retry_after_s)}
         return Problem(status_of(type(error)), error.kind, error.detail, error.errors, again)
     if isinstance(error, RequestValidationError):
-        faults = [f"{'.'.join(str(part) for part in e['loc'])}: {_told(e)}" for e in error.errors()]
-        return Problem(
-            422, "invalid-request", "The request does not fit the call; see 'errors' and /openapi.json.", faults
-        )
+        faults = [compose("located", where=".".join(map(str, e["loc"])), fault=_fault_of(e)) for e in error.errors()]
+        return Problem(422, "invalid-request", compose("request-unfit"), faults)
     if isinstance(error, HTTPException):
         phrase = HTTPStatus(error.status_code).phrase
-        kind = "".join(c if c.isalnum() else "-" for c in phrase.lower())
-        detail = error.detail if error.detail != phrase else f"{phrase}; /openapi.json lists what there is."
-        return Problem(error.status_code, kind, str(detail), headers=error.headers)
+        detail = str(error.detail) if error.detail != phrase else compose("http-refused", phrase=phrase)
+        return Problem(error.status_code, type_of_status(error.status_code), detail, headers=error.headers)
     if (isinstance(error, OSError) and error.errno in DISK_FULL) or "database or disk is full" in str(error):
         return problem_from(DiskFull())
     if isinstance(error, DataError):
-        detail = "The request has a text or a number that the database cannot keep; leave out control characters."
-        return Problem(422, "invalid-request", detail)
+        return Problem(422, "invalid-request", compose("database-value-refused"))
     if isinstance(error, DBAPIError):
         log.error("database failed", error=str(error)[:500])
-        return Problem(503, "database-unavailable", "The job database does not answer; try again in a moment.")
+        return Problem(503, "database-unavailable", compose("database-silent"))
     log.error("unforeseen error", exc_info=error)
-    return Problem(500, "internal-error", "The service failed in a way that nobody foresaw; its log says more.")
+    return Problem(500, "internal-error", compose("service-failed"))
 
 
-def _told(error: Mapping[str, Any]) -> str:
+def _fault_of(error: Mapping[str, Any]) -> Message | str:
     """A fault that pydantic found; of a body that is no JSON, a form perhaps, it says nothing to act on."""
     whole_body = error["loc"] == ("body",) and error["type"] == "model_attributes_type"
-    return "is no JSON object; send one, as application/json" if whole_body else error["msg"]
+    return compose("no-json-object") if whole_body else error["msg"]
 
 
 def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
@@ -154,8 +165,11 @@ def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
     async def answer(request: Request, error: Exception) -> JSONResponse:
         problem = problem_from(error)
         if problem.status == 405:
-            problem.headers["Allow"] = allowed = ", ".join(_methods_of(routes, request.url.path))
-            problem.detail = f"{request.url.path} takes {allowed}, and not {request.method}; /openapi.json says more."
+            allowed = _methods_of(routes, request.url.path)
+            problem.headers["Allow"] = ", ".join(allowed)
+            problem.detail = compose(
+                "method-not-allowed", path=request.url.path, allowed=allowed, method=request.method
+            )
         return problem.response()
 
     for kind in (Exception, EigenheadError, HTTPException, RequestValidationError, OSError, DBAPIError):

@@ -12,6 +12,7 @@ from typing import Any
 from fastapi import Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
+from rig.messages.message import compose
 from server.storage.records import FileEntry
 from server.storage.store import StoredFile
 from server.wire.problems import Problem
@@ -33,7 +34,7 @@ def send_file(request: Request, file: StoredFile) -> Response:
     """200, 206, 304 or a 416 problem. What is no single byte range is ignored, as RFC 9110 allows."""
     path, etag = file.path, f'"{file.sha256}"'
     if not path.is_file():
-        raise Problem(404, "not-found", "The file is not there any more.")
+        raise Problem(404, "not-found", compose("file-gone"))
     headers = {"ETag": etag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
     if (
         etag in re.split(r"\s*,\s*", request.headers.get("if-none-match", ""))
@@ -102,5 +103,8 @@ def _check_range(request: Request, size: int) -> None:
         request.scope["headers"] = [(name, value) for name, value in request.scope["headers"] if name != b"range"]
     elif (first is not None and int(first) >= size) or (first is None and int(last or 0) == 0):
         raise Problem(
-            416, "range-not-satisfiable", f"The file has {size} bytes.", headers={"Content-Range": f"bytes */{size}"}
+            416,
+            "range-not-satisfiable",
+            compose("range-outside", bytes=size),
+            headers={"Content-Range": f"bytes */{size}"},
         )

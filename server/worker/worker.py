@@ -33,9 +33,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
+from rig.messages.message import MessageDocument, compose
 from server.errors import Refused, unusable_input
+from server.problem_types import type_of_failure
 from server.services import calibrations
-from server.services.jobs import DELIVERY, WORKFLOW, JobFailed
+from server.services.failures import JobFailed
+from server.services.jobs import DELIVERY, WORKFLOW
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
@@ -126,7 +129,7 @@ class Worker:
                     ingest(job_id, request)
                     files = publish(job_id, fit(job_id, request))
                 except JobFailed as error:
-                    log.warning("job failed", kind=error.kind, detail=error.detail)
+                    log.warning("job failed", kind=error.kind, detail=error.detail.text)
                     worker.settle(job_id, "failed", request.get("webhook"))
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
@@ -265,14 +268,11 @@ class Worker:
             problem = unusable_input(error)
             return JobFailed(problem.kind, problem.detail, error.faults)
         if isinstance(error, OSError) and error.errno in DISK_FULL:
-            return JobFailed("disk-full", "The disk is full. Delete captures or jobs, then restart the job.")
+            return JobFailed("disk-full", compose("disk-full"))
         if isinstance(error, WorkFailed):
             if error.trace:
                 log.error("work raised", trace=error.trace)
-            kind = "".join(f"-{c.lower()}" if c.isupper() else c for c in error.kind).lstrip("-")
-            return JobFailed(
-                {"bug": "internal-error", "crash": "work-crashed"}.get(kind, kind), error.message, error.faults
-            )
+            return JobFailed(type_of_failure(error.kind), error.message, error.faults)
         return error
 
     def _keep_alive(self) -> None:
@@ -318,8 +318,8 @@ class Worker:
         return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
 
 
-def warnings_of(report: Path) -> list[dict[str, str]]:
-    """The warnings of a result's report.json: ``code`` and ``message``."""
+def warnings_of(report: Path) -> list[MessageDocument]:
+    """The warnings of a result's report.json."""
     try:
         return json.loads(report.read_bytes())["warnings"]
     except (OSError, ValueError, KeyError):  # no result, or another kind of work

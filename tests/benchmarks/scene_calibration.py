@@ -93,7 +93,7 @@ def _print_studio(captures: int, views: int, *, masks: bool) -> None:
         try:
             found, truth = studio(seed, views, masks=masks)
         except CalibrationRefused as refusal:
-            _say(f"seed {seed}: refused: {'; '.join(refusal.reasons)}")
+            _say(f"seed {seed}: refused: {'; '.join(map(str, refusal.reasons))}")
             continue
         true = truth.subset(found.rig.names)
         away = image_distance(found.rig, true, scale=True)

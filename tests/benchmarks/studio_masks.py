@@ -54,7 +54,7 @@ def main() -> None:
             for name, silhouette in silhouettes.items():
                 off = rms(silhouette, coverage(taken, name, RESOLUTION_PX))
                 overlap = iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5)
-                said = "; ".join((*silhouette.quality.warnings, *silhouette.quality.doubts))
+                said = "; ".join(map(str, (*silhouette.quality.warnings, *silhouette.quality.doubts)))
                 rows.append((off, overlap, f"{seed}{kind} {name}", said))
     off, overlap = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     bad = (off > WORST_PX) | (overlap < LEAST_IOU)

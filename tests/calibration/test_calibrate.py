@@ -134,7 +134,7 @@ def test_a_fault_that_spoils_everything_is_refused(fault: str, good: Session) ->
 def test_a_fault_in_some_shots_is_named_and_left_out(fault: str, good: Session) -> None:
     plant, shot, said = NAMED[fault]
     calibration = calibrate_detections(plant(good))
-    assert any(drop.shot == shot and said in drop.reason for drop in calibration.dropped), calibration.dropped
+    assert any(drop.shot == shot and said in drop.reason.text for drop in calibration.dropped), calibration.dropped
     # The rest is as good as without the fault: 0.1 px is three times what these shots give.
     assert image_distance(calibration.rig, good.rig).max() < 0.15
 
@@ -215,8 +215,8 @@ def test_enough_shots_are_good_and_few_say_what_is_missing(calibrated: Calibrati
     assert failed(few.checks) == []  # every check passes, and it says too little all the same
     verdict = few.verdict()
     assert verdict.word == "poor"
-    assert "fewer than 3 views of the board" in verdict.missing[0]
-    assert any("take 15 in all" in missing for missing in verdict.missing)
+    assert "fewer than 3 views of the board" in verdict.missing[0].text
+    assert any("take 15 in all" in missing.text for missing in verdict.missing)
 
 
 def test_the_world_frame_is_the_projects(calibrated: Calibration, good: Session) -> None:

@@ -12,6 +12,7 @@ import pytest
 from calibration.calibrate import calibrate_detections
 from calibration.report import MAGNIFIED, report_page, write_report
 from calibration.result import Calibration
+from rig.messages.message import verbatim
 from tests.support.board_sessions import session
 
 
@@ -41,7 +42,7 @@ def test_vectors_are_the_residuals_magnified(calibration: Calibration) -> None:
 
 
 def test_hostile_names_do_not_become_markup(calibration: Calibration) -> None:
-    page = report_page(replace(calibration, warnings=("<script>alert(1)</script>",)))
+    page = report_page(replace(calibration, warnings=(verbatim("<script>alert(1)</script>"),)))
     assert "<script>" not in page
 
 

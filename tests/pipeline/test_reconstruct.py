@@ -9,8 +9,8 @@ from pipeline.evidence.plausibility import ImplausibleResult
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
-from rig.capture import Remark
 from rig.errors import Cancelled
+from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from rig.studio.scene.simulate import SimulatedCapture
 
@@ -62,7 +62,7 @@ def test_a_warning_that_the_settings_name_refuses_the_result(
     half_size_shot: SimulatedCapture, renderer: Renderer
 ) -> None:
     context = context_of(half_size_shot, renderer)
-    capture = replace(context.capture, remarks=(Remark("file-unread", "notes.txt is not read"),))
+    capture = replace(context.capture, remarks=(compose("file-unread", remark="notes.txt is not read"),))
     noticed = replace(context, capture=capture)
     assert "file-unread" in [warning.code for warning in reconstruct(noticed).warnings]
     with pytest.raises(ImplausibleResult, match=r"file-unread: notes\.txt"):

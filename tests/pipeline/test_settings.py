@@ -34,8 +34,8 @@ def test_what_cannot_be_is_named_in_text_that_can_be_sent(document: dict[str, An
     with pytest.raises(InputError) as error:
         settings_from_document(document)
     (told,) = error.value.faults
-    assert fault in told
-    told.encode()
+    assert fault in told.text
+    told.text.encode()
 
 
 def test_a_whole_number_is_a_length() -> None:

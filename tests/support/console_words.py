@@ -1,6 +1,5 @@
 """The words of the operator's pages, read from their source: what their components and the service's modules say."""
 
-import ast
 import json
 import re
 from collections.abc import Iterator
@@ -113,37 +112,10 @@ def is_words(text: str) -> bool:
 
 
 @cache
-def german() -> dict[str, str]:
-    """The table. Its lines are those of JSON, but for comments and the comma after the last."""
-    lines = (CONSOLE / "static" / "de.js").read_text().splitlines()
+def german(table: str = "de.js") -> dict[str, str]:
+    """A table. Its lines are those of JSON, but for comments and the comma after the last."""
+    lines = (CONSOLE / "static" / table).read_text().splitlines()
     pairs = [json.loads(f"{{{line.strip().rstrip(',')}}}") for line in lines if line.lstrip().startswith('"')]
     found = {key: value for pair in pairs for key, value in pair.items()}
     assert len(found) == len(pairs), "an English text stands in the table twice"
     return found
-
-
-def sentences(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and text of every string of a Python module but documents; a formatted value is written ``{}``."""
-    tree = ast.parse(path.read_text())
-    within = set[int]()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr):
-            within |= {id(value) for value in node.values}
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            within.add(id(node.value))
-    for node in ast.walk(tree):
-        if id(node) not in within and (text := _text(node)) is not None:
-            yield getattr(node, "lineno", 0), text
-
-
-def _text(node: ast.AST) -> str | None:
-    if isinstance(node, ast.Constant):
-        return node.value if isinstance(node.value, str) else None
-    if isinstance(node, ast.JoinedStr):
-        return "".join(str(value.value) if isinstance(value, ast.Constant) else "{}" for value in node.values)
-    return None
-
-
-def opened(text: str) -> str:
-    """``{1} of {2}`` as the source has it: ``{} of {}``."""
-    return re.sub(r"\{#?\d\}", "{}", text)

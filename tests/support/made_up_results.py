@@ -28,6 +28,7 @@ from pipeline.texture.vertex_colours import Texture
 from rig.capture import Capture
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from rig.messages.message import verbatim
 
 PLACE = Similarity(1.0, rotation_from_vector(np.array([0.1, -0.3, 0.05])), np.array([12.0, -7.0, 30.0]))
 Masks = Mapping[str, Bool[np.ndarray, "h w"]]
@@ -55,7 +56,7 @@ def made_up_result(
     seconds: Mapping[str, float] | None = None,
 ) -> Reconstruction:
     """Returns a reconstruction that delivers ``mesh_world`` (mm); what is left out is grey, sure of 1 mm, or empty."""
-    count, capture, detail = len(mesh_world.vertices), Capture({}), Detail("span", "it is made up")
+    count, capture, detail = len(mesh_world.vertices), Capture({}), Detail("span", verbatim("it is made up"))
     colours = np.full((count, 3), 120, np.uint8) if colours is None else colours
     views = np.ones(count, np.uint8) if views is None else views
     deviation_mm = np.ones(count) if deviation_mm is None else deviation_mm

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.results.report_types import FORMAT, Report
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "schemas" / "report.schema.json"
-PLAIN = {str: "string", bool: "boolean", int: "integer", float: "number", type(None): "null", object: None}
+PLAIN = {str: "string", bool: "boolean", int: "integer", float: "number", type(None): "null", object: None, Any: None}
 
 
 def report_schema() -> dict[str, Any]:

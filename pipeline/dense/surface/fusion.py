@@ -30,6 +30,7 @@ from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import BustSettings
 from rig.mesh import Mesh, face_normals
+from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -85,10 +86,7 @@ def fuse(
     """
     maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
     if len(maps) < VIEWS_LEAST:
-        raise NoSurface(
-            f"{len(maps)} of the photographs say how far the surface is, {VIEWS_LEAST} are needed: take more views "
-            "that overlap, or sharper ones"
-        )
+        raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=VIEWS_LEAST))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
     level = solve(maps, views, head_world, settings.spacing_mm)
@@ -113,11 +111,7 @@ def fuse(
 def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -> Iterator[ReportWarning]:
     for name, share in zip(names, contradicted, strict=True):
         if share > CONTRADICTED_WARNED:
-            yield ReportWarning(
-                "mask-contradicted",
-                f"{name}: other views see the subject where its silhouette leaves it out ({share:.1%} of the picture): "
-                "look at its clean plate or mask",
-            )
+            yield compose("mask-contradicted", camera=name, share=share)
 
 
 def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:

@@ -27,6 +27,7 @@ from pipeline.dense.surface.vote_kernels import vote
 from pipeline.parallel_for import in_threads
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 Field = Float32[np.ndarray, " n"]
 Points = Float[np.ndarray, "m 3"]
@@ -129,9 +130,7 @@ def _finer(
         if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
             return level
         wanted = grid_kernels.grown(wanted)
-    raise NoSurface(
-        "the photographs contradict each other about where the surface is: check cameras.json, and that nothing moved"
-    )
+    raise NoSurface(compose("depth-contradictory"))
 
 
 def _box(

@@ -30,6 +30,7 @@ from pipeline.fitting.surface_term import surface_residual
 from pipeline.kept_arrays import kept_arrays
 from pipeline.settings import PhotoSettings
 from rig.mesh import vertex_normals
+from rig.messages.message import compose
 
 ROUNDS = (Round(3.0, 0.8, 4.0, 17), Round(2.5, 0.55, 2.0, 13), Round(2.0, 0.45, 1.0, 9))
 RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
@@ -64,7 +65,9 @@ def refine_with_photographs(
     photographs = load_photographs(images, problem.views)
     speaking = int(np.count_nonzero(photographs.speaks))
     if speaking < VIEWS_LEAST:
-        why = f"{speaking} of {len(problem.views.names)} views have a photograph with texture, {VIEWS_LEAST} are needed"
+        why = compose(
+            "level-views-without-texture", speaking=speaking, all=len(problem.views.names), needed=VIEWS_LEAST
+        )
         return solved, Detail("kernel", why)
     model, patches, basis = finer(problem.model, settings)
     problem = widened(problem, model, (LEVEL,))
@@ -80,7 +83,7 @@ def refine_with_photographs(
         surface, lost = observe(problem, state, photographs, patches, visibility, hidden, basis, each, settings)
         share = np.count_nonzero(~surface.bound) / max(len(patches.centre), 1)
         if share < settings.least_share:
-            why = f"only {share:.0%} of the face look alike in two views, {settings.least_share:.0%} are needed"
+            why = compose("level-alike-too-little", share=share, needed=settings.least_share)
             return solved, Detail("kernel", why)
         outline = {LEVEL: near_hair(model, patches.centre[hidden])}
         evidence = StageEvidence(solved.evidence.noise, PhotoEvidence(surface, outline))
@@ -88,7 +91,7 @@ def refine_with_photographs(
         evaluations += used
     assert surface is not None
     misfit = unfollowed(model, surface, state, lost)
-    why = f"{share:.0%} of the face look alike in two or more of {speaking} photographs"
+    why = compose("level-alike", share=share, photographs=speaking)
     return Solved(problem, evidence, state, stage, evaluations, reason, misfit), Detail("photo", why)
 
 

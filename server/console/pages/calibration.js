@@ -1,6 +1,7 @@
 // History at the left; at the right the shots that are being taken, or the report of the chosen calibration.
 import { liveView } from "/console/static/live.js";
 import { say, spoken } from "/console/static/language.js";
+import { told, toldFaults } from "/console/static/messages.js";
 import { clock, fixed, keepAddress, keepDraft, kept, send, span, stageWords } from "/console/static/words.js";
 
 export default spoken({
@@ -46,7 +47,7 @@ export default spoken({
         </div>
         <div v-if="current" class="panel pad scroll stack" tabindex="0" role="region" aria-label="Report">
           <div class="line wrap"><h2>{{ current.label || clock(current.created) }}</h2><span class="tag" :class="{ accent: current.in_use, fault: current.state === 'failed' }">{{ say(current.in_use ? 'in use' : current.state) }}</span></div>
-          <template v-if="current.error"><p class="fault">{{ say(current.error.detail) }}</p><ul class="faults small"><li v-for="(e, i) in current.error.errors" :key="i">{{ say(e) }}</li></ul></template>
+          <template v-if="current.error"><p class="fault">{{ say(current.error.detail_message) }}</p><ul class="faults small"><li v-for="(e, i) in current.error.error_messages" :key="i">{{ say(e) }}</li></ul></template>
           <ul v-if="current.warnings.length" class="faults small"><li v-for="(w, i) in current.warnings" :key="i" class="warn">{{ say(w) }}</li></ul>
           <div v-if="['queued', 'running'].includes(current.state)" class="stack" role="status"><div class="line"><strong class="grow">{{ current.state === 'queued' ? say('Waiting for the worker') : stageWords(current.stage || (current.kind === 'scene' ? 'features' : 'detection')) }}</strong><span class="num">{{ Math.round(100 * current.progress) }} %</span><span v-if="current.eta_s !== null && current.state === 'running'" class="num muted">{{ say('about {time} left', { time: span(current.eta_s) }) }}</span></div>
             <div class="bar" role="progressbar" aria-label="Progress of the calibration" :aria-valuenow="Math.round(100 * current.progress)" aria-valuemin="0" aria-valuemax="100"><i :style="{ width: 100 * current.progress + '%' }"></i></div></div>
@@ -56,7 +57,7 @@ export default spoken({
           <template v-if="current.state === 'succeeded'">
             <div class="line wrap" style="gap: 2rem"><div><div class="small muted">Residual</div><div class="mono" style="font-size: 1.4rem">{{ fixed(current.figures.rms_px, 2) }} px</div></div><div><div class="small muted">{{ say(current.kind === 'scene' ? 'Matched points used' : 'Corners used') }}</div><div class="mono" style="font-size: 1.4rem">{{ fixed(100 * current.figures.used_share, 1) }} %</div></div><div><div class="small muted">Front camera</div><div class="mono" style="font-size: 1.4rem">{{ current.front }}</div></div></div>
             <div class="columns" style="grid-template-columns: minmax(0, 2fr) minmax(0, 1fr); flex: none">
-              <div v-if="current.checks.length" class="stack"><h3>Checks</h3><table class="small"><tbody><tr v-for="c in current.checks" :key="c.name"><td><i role="img" :aria-label="say(c.passed === null ? 'not checked' : c.passed ? 'passed' : 'failed')" :class="['dot', c.passed === null ? '' : c.passed ? 'good' : 'fault']"></i></td><td style="white-space: nowrap">{{ say(c.name) }}</td><td>{{ say(c.detail) }}<div v-if="c.passed === false && c.advice" class="warn">{{ say(c.advice) }}</div></td></tr></tbody></table></div>
+              <div v-if="current.checks.length" class="stack"><h3>Checks</h3><table class="small"><tbody><tr v-for="c in current.checks" :key="c.name"><td><i role="img" :aria-label="say(c.passed === null ? 'not checked' : c.passed ? 'passed' : 'failed')" :class="['dot', c.passed === null ? '' : c.passed ? 'good' : 'fault']"></i></td><td style="white-space: nowrap">{{ say(c.name) }}</td><td>{{ say(c.detail_message ?? c.detail) }}<div v-if="c.passed === false && c.advice" class="warn">{{ say(c.advice_message ?? c.advice) }}</div></td></tr></tbody></table></div>
               <div class="stack"><h3>Residual by camera</h3><table class="small"><tbody><tr v-for="[name, f] in cameras" :key="name"><td>{{ name }}</td><td class="num">{{ fixed(f.rms_px, 2) }} px</td><td class="num muted">{{ say('{count} picture | {count} pictures', { count: current.pictures[name] }) }}</td></tr></tbody></table></div>
             </div></template>
         </div>
@@ -95,7 +96,7 @@ export default spoken({
       const mine = this.upload;
       const { status, document } = await send("/console/calibrations", file, { from: this.source, label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => (mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking"));
       if (status === 202) { this.upload = null; this.chosen = document.id; window.eigenheadSay("done", "The calibration is queued."); }
-      else { mine.state = "refused"; mine.detail = document.detail; mine.errors = document.errors || []; }
+      else { mine.state = "refused"; mine.detail = told(document); mine.errors = toldFaults(document); }
     },
   },
 });

@@ -2,16 +2,18 @@
 
 import threading
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import NotRequired, TypedDict
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
+from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.console.coverage import Corners, Coverage, advice, detect_shot, summary
 from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.removal import removals
+from server.console.shown_messages import shown_failure
 from server.errors import Conflict, Unusable
 from server.services.captures import About
 from server.services.records import Calibration
@@ -19,7 +21,7 @@ from server.services.service import Service
 
 LABEL = "calibration board"
 SHOTS_LEAST = 3
-NO_BOARD = "The simulated studio shows a person and no board: drop an archive of board pictures at the left."
+NO_BOARD = compose("studio-without-board")
 
 
 class Shots:
@@ -38,7 +40,7 @@ class Shots:
         """Raises Conflict where the shots so far are of another board."""
         with self._lock:
             if self.taken and board != self.board:
-                detail = f"The {len(self.taken)} shots so far are of another board. Calibrate or start over first."
+                detail = compose("shots-of-other-board", count=len(self.taken))
                 raise Conflict("other-board", detail)
 
     def drop_last(self) -> None:
@@ -68,7 +70,7 @@ class CalibrationState(TypedDict):
     board: Mapping[str, object]
     shots: int
     coverage: list[Coverage]
-    advice: str
+    advice: MessageDocument
 
 
 class BoardForm(TypedDict):
@@ -100,7 +102,7 @@ def calibration_state(service: Service) -> CalibrationState:
     names = [camera.name for camera in rig.cameras]
     lines = summary(names, [found for _, found in shots.taken])
     return {
-        "calibrations": [asdict(found) for found in known_calibrations(service, 1.0) if found.id not in removals],
+        "calibrations": [calibration_line(c) for c in known_calibrations(service, 1.0) if c.id not in removals],
         "rig": {
             "kind": rig.kind,
             "calibration": rig.calibration,
@@ -109,7 +111,17 @@ def calibration_state(service: Service) -> CalibrationState:
         "board": shots.board,
         "shots": len(shots.taken),
         "coverage": lines,
-        "advice": NO_BOARD if rig.kind == "simulated" and not shots.taken else advice(lines),
+        "advice": (NO_BOARD if rig.kind == "simulated" and not shots.taken else advice(lines)).document(),
+    }
+
+
+def calibration_line(found: Calibration) -> Mapping[str, object]:
+    """A calibration, whose ``missing`` and ``warnings`` are messages."""
+    messages = {"missing": documents_of(found.missing), "warnings": documents_of(found.warnings)}
+    return {
+        **asdict(replace(found, missing=(), warnings=(), error=None)),
+        **messages,
+        "error": shown_failure(found.error),
     }
 
 
@@ -119,12 +131,12 @@ def board_of(event: BoardForm) -> Mapping[str, object]:
     needed = ("kind", "columns", "rows", "square_mm")
     other = ("measured_width_mm", "inverted") + (("marker_ratio", "dictionary") * (form.get("kind") == "charuco"))
     board = {key: form[key] for key in needed + other if form.get(key) not in (None, "", False)}
-    if missing := [f"{key} is missing" for key in needed if key not in board]:
+    if missing := [compose("board-key-missing", key=key) for key in needed if key not in board]:
         raise InputError("board", missing)
     return board
 
 
-def shoot(page: Page, event: BoardForm) -> str:
+def shoot(page: Page, event: BoardForm) -> Message:
     from calibration.board.board import board_from_document
 
     board, service = board_of(event), page.service
@@ -137,11 +149,11 @@ def shoot(page: Page, event: BoardForm) -> str:
     seen = sum(bool(corners) for corners in found.values())
     if not seen:
         service.store.remove_capture(identity)
-        detail = "No camera saw the board; the shot was not kept. Check columns, rows and kind, and hold it in view."
+        detail = compose("board-not-seen")
         raise Unusable("no-board", detail)
     shots.add(board, identity, found)
     shared.forget("calibration page")
-    return f"Shot {len(shots.taken)}: {seen} of {len(found)} cameras see the board."
+    return compose("board-shot-taken", number=len(shots.taken), seen=seen, all=len(found))
 
 
 def take_back(page: Page, event: object) -> None:
@@ -154,27 +166,27 @@ def start_over(page: Page, event: object) -> None:
     shared.forget("calibration page")
 
 
-def calibrate(page: Page, event: CalibrateForm) -> str:
+def calibrate(page: Page, event: CalibrateForm) -> Message:
     if len(shots.taken) < SHOTS_LEAST:
-        detail = f"{len(shots.taken)} shots; at least {SHOTS_LEAST} are needed, 15 are good."
+        detail = compose("board-shots-too-few", count=len(shots.taken), needed=SHOTS_LEAST)
         raise Unusable("too-few-shots", detail)
     captures = [capture for capture, _ in shots.taken]
     page.service.calibrations.add_shots(shots.board, captures, str(event.get("label") or "")[:500])
     shots.clear()
     _forget()
-    return "The calibration is queued."
+    return compose("calibration-queued")
 
 
-def use(page: Page, event: UseForm) -> str:
+def use(page: Page, event: UseForm) -> Message:
     page.service.use_calibration(event["id"], poor=event.get("poor", False))
     _forget()
-    return "Every capture from now on gets this calibration."
+    return compose("calibration-taken-into-use")
 
 
 def remove(page: Page, event: Chosen) -> None:
     service, identity = page.service, event["id"]
     found = service.calibrations.get(identity)
-    title = f"calibration {found.label or identity[-6:]}"
+    title = compose("calibration-named", name=found.label or identity[-6:])
     remove_later(identity, lambda: service.calibrations.remove(identity), title, "capture")
 
 

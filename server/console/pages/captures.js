@@ -1,6 +1,7 @@
 // Sessions and captures at the left, the pictures of the chosen one at the right.
 import { Pager, paged } from "/console/static/list.js";
 import { say, spoken } from "/console/static/language.js";
+import { english, told, toldFaults } from "/console/static/messages.js";
 import { Outline, Verdict, checksOf, faultsOf, verdictTag } from "/console/static/verdict.js";
 import { clock, keepDraft, keepSession, kept, openSession, send, sessionName, size, typing } from "/console/static/words.js";
 
@@ -188,7 +189,7 @@ export default spoken({
         });
         mine.done = true;
         if (status === 201) { this.choose(document.id); this.uploads = this.uploads.filter((u) => u.id !== mine.id); window.eigenheadSay("done", say("{name} is here.", { name: file.name })); }
-        else { mine.state = "refused"; mine.detail = document.detail; mine.errors = (document.errors || []).filter((fault) => fault !== document.detail); }
+        else { mine.state = "refused"; mine.detail = told(document); mine.errors = toldFaults(document).filter((fault) => english(fault) !== document.detail); }
       }
     },
   },

@@ -10,6 +10,7 @@ from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model_names import list_models
 from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
+from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.console.identity import permit
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
@@ -23,14 +24,6 @@ from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
-SAID = {
-    "reconstruct": "queued",
-    "move": "moved",
-    "tag": "tagged",
-    "untag": "without these tags",
-    "erase": "erased for good",
-    "remove": "removed",
-}
 SHOWN = 50  # captures of a page
 ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
 SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
@@ -47,7 +40,7 @@ class JobOfCapture(TypedDict):
 class SyncLine(TypedDict):
     """What the rig's certificate says, for people."""
 
-    text: str
+    message: MessageDocument
     good: bool
 
 
@@ -70,7 +63,7 @@ class CaptureLine(TypedDict):
     sizes: dict[str, tuple[int, int]]
     verdict: str | None
     faults: list[FaultDocument]
-    warnings: list[dict[str, str]]
+    warnings: list[MessageDocument]
     sync: SyncLine | None
     tags: list[str]
 
@@ -190,7 +183,7 @@ def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine
         "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
         "verdict": record.verdict,
         "faults": [fault.document() for fault in record.faults],
-        "warnings": [asdict(warning) for warning in record.warnings],
+        "warnings": documents_of(record.warnings),
         "sync": None if record.shot is None else sync_line(record.shot),
         "tags": [*record.tags],
     }
@@ -201,10 +194,14 @@ def sync_line(shot: Mapping[str, object]) -> SyncLine:
     lines = sync_of(shot)
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:
-        return {"text": f"not in sync: {', '.join(late)}", "good": False}
+        return {"message": compose("not-in-sync", cameras=late).document(), "good": False}
     spread_ms = cast(SyncDocument, shot["sync"])["spread_ms"] if "sync" in shot else None
-    within = "" if spread_ms is None else f", within {spread_ms:.1f} ms"
-    return {"text": f"{len(lines)} cameras in sync{within}", "good": True}
+    if spread_ms is None:
+        return {"message": compose("cameras-in-sync", count=len(lines)).document(), "good": True}
+    return {
+        "message": compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms).document(),
+        "good": True,
+    }
 
 
 def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
@@ -236,25 +233,25 @@ def session_line(session: Session) -> SessionLine:
     }
 
 
-def reconstruct(page: Page, event: WorkForm) -> str:
+def reconstruct(page: Page, event: WorkForm) -> Message:
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.started(job.id, opens=True)
-    return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
+    return compose("job-queued-watch", job=job.id[-6:])
 
 
-def reconstruct_session(page: Page, event: WorkForm) -> str:
+def reconstruct_session(page: Page, event: WorkForm) -> Message:
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
     page.started(*(job.id for job in jobs))
-    return f"Queued {len(jobs)} {'job' if len(jobs) == 1 else 'jobs'}. Watch them on the page Jobs."
+    return compose("jobs-queued", count=len(jobs))
 
 
-def sample(page: Page, event: object) -> str:
+def sample(page: Page, event: object) -> Message:
     """A capture of the simulated studio, for who has no pictures yet."""
     record = page.service.captures.sample()
     page.choice["capture"] = record.id
     forget_captures()
-    return "A sample capture of the simulated studio is here: press Reconstruct."
+    return compose("sample-taken")
 
 
 def edit(page: Page, event: EditForm) -> None:
@@ -264,10 +261,10 @@ def edit(page: Page, event: EditForm) -> None:
     forget_captures()
 
 
-def new_session(page: Page, event: SessionForm) -> str:
+def new_session(page: Page, event: SessionForm) -> Message:
     made = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
-    return f"Session {made.label or made.id[-6:]}: what is taken or uploaded now belongs to it."
+    return compose("session-begun", name=made.label or made.id[-6:])
 
 
 def edit_consent(page: Page, event: SessionEditForm) -> None:
@@ -276,28 +273,29 @@ def edit_consent(page: Page, event: SessionEditForm) -> None:
     forget_captures()
 
 
-def erase(page: Page, event: Chosen) -> str:
+def erase(page: Page, event: Chosen) -> Message:
     page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
-    return "Erased: images, heads, jobs and all that was kept of them."
+    return compose("session-erased")
 
 
-def erase_capture(page: Page, event: Chosen) -> str:
+def erase_capture(page: Page, event: Chosen) -> Message:
     page.service.captures.erase(event["id"])
     shared.clear()
-    return "Erased for good: the capture, its heads, jobs and all that was kept of them."
+    return compose("capture-erased")
 
 
 def discard(page: Page, event: Chosen) -> None:
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
     heads = len(service.captures.holdings(identity).heads)
-    stays = f"; {heads} {'head' if heads == 1 else 'heads'} with overlay photographs stay" if heads else ""
-    title = f"the {len(record.cameras)} pictures of capture {record.label or identity[-6:]}{stays}"
+    title = compose("capture-pictures", pictures=len(record.cameras), name=record.label or identity[-6:])
+    if heads:
+        title = compose("heads-stay", thing=title, count=heads)
     remove_later(identity, lambda: service.captures.remove(identity), title, "capture")
 
 
-def bulk(page: Page, event: BulkForm) -> str | None:
+def bulk(page: Page, event: BulkForm) -> Message | None:
     """One action on the captures that are ticked; what is refused to some is told with its reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
@@ -318,17 +316,29 @@ def bulk(page: Page, event: BulkForm) -> str | None:
     else:
         done = each(ids, service.captures.check_unused)
         heads = sum(len(service.captures.holdings(capture).heads) for capture in done.done)
-        title = f"the pictures of {len(done.done)} captures" + (
-            f"; {heads} heads with overlay photographs stay" if heads else ""
-        )
+        title = compose("captures-pictures", count=len(done.done))
+        if heads:
+            title = compose("heads-stay", thing=title, count=heads)
         if done.done:
             remove_all_later(done.done, service.captures.remove, title, "capture")
     forget_captures()
-    said = SAID[action]
+    said = said_of(action, len(done.done))
     if done.refused:
-        told = [f"{one.id[-6:]}: {one.detail}" for one in done.refused]
-        raise Unusable("some-refused", f"{len(done.done)} {said}, {len(told)} refused.", told)
-    return f"{len(done.done)} {'capture' if len(done.done) == 1 else 'captures'} {said}."
+        told = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
+        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(told)), told)
+    return said
+
+
+def said_of(action: str, count: int) -> Message:
+    """What was done to so many captures."""
+    said = {
+        "reconstruct": compose("captures-queued", count=count),
+        "move": compose("captures-moved", count=count),
+        "tag": compose("captures-tagged", count=count),
+        "untag": compose("captures-untagged", count=count),
+        "erase": compose("captures-erased", count=count),
+    }
+    return said.get(action) or compose("captures-removed", count=count)
 
 
 def forget_captures() -> None:

@@ -14,6 +14,7 @@ from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS
 from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.messages.message import Message, MessageDocument, compose
 from rig.rig import Rig
 from server.console.guides import Guides, Helps, mean_landmarks, nearest_views
 from server.console.page import Action, Page, shared, show
@@ -150,7 +151,7 @@ class FeaturesPage(Page, component="features.js"):
     def of_capture(self) -> Picked:
         """What is being picked. Raises Conflict before the page has shown a capture."""
         if self.picked is None:
-            raise Conflict("no-capture", "No capture is shown: choose one first.")
+            raise Conflict("no-capture", compose("no-capture-shown"))
         return self.picked
 
 
@@ -208,7 +209,7 @@ def place(page: FeaturesPage, event: Place) -> None:
     drafts.keep(page.caller.key, picked)
 
 
-def save(page: FeaturesPage, event: Sure) -> str | None:
+def save(page: FeaturesPage, event: Sure) -> Message | None:
     """Stores the points. Where views contradict each other the page asks first, once, and ``sure`` is the answer."""
     picked = page.of_capture()
     points = picked.points
@@ -218,22 +219,22 @@ def save(page: FeaturesPage, event: Sure) -> str | None:
     page.service.captures.put_features(picked.capture, points)
     picked.saved, picked.asked = points, None
     drafts.keep(page.caller.key, picked)
-    return "Saved. Jobs from now on use these points."
+    return compose("features-saved")
 
 
-def contradictions(page: FeaturesPage) -> Mapping[str, str]:
+def contradictions(page: FeaturesPage) -> Mapping[str, MessageDocument]:
     picked = page.of_capture()
     pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in picked.points.items()}
     return picked.guides.helps(pixels, {}, [])["contradictions"]
 
 
-def reconstruct(page: FeaturesPage, event: Sure) -> str | None:
+def reconstruct(page: FeaturesPage, event: Sure) -> Message | None:
     picked = page.of_capture()
     if picked.points != picked.saved and save(page, event) is None:
         return None
     job = page.service.jobs.submit(picked.capture, Work(), key=page.caller.key)
     page.started(job.id, opens=True)
-    return f"Queued job {job.id[-6:]}. Watch it on the page Jobs."
+    return compose("job-queued-watch", job=job.id[-6:])
 
 
 FeaturesPage.actions = {

@@ -25,7 +25,7 @@ export default spoken({
     job() { return this.state.job || null; },
     active() { return this.job && ["queued", "running"].includes(this.job.state); },
     waiting() {
-      if (this.job.notice) return say(this.job.notice);
+      if (this.job.notice_message) return say(this.job.notice_message);
       const before = this.job.ahead || 0;
       return before ? say("Waiting, {count} job before it | Waiting, {count} jobs before it", { count: before }) : say("Waiting for the worker");
     },
@@ -76,8 +76,8 @@ export default spoken({
               <label class="field">Further settings, JSON<textarea v-model="form.more" rows="3" spellcheck="false"></textarea></label>
               <div class="line"><button class="b main-action" :disabled="!!busy">Queue the new job</button><button type="button" class="b quiet" @click="form = null">Keep it as it is</button></div>
             </form>
-            <div v-if="job.error" class="stack" role="alert"><p class="fault">{{ say(job.error.detail) }}</p><ul class="faults small"><li v-for="(e, i) in job.error.errors" :key="i">{{ say(e) }}</li></ul></div>
-            <ul v-if="state.detail.warnings.length" class="faults small"><li v-for="(w, i) in state.detail.warnings" :key="i" class="warn">{{ say(w.message) }}</li></ul>
+            <div v-if="job.error" class="stack" role="alert"><p class="fault">{{ say(job.error.detail_message) }}</p><ul class="faults small"><li v-for="(e, i) in job.error.error_messages" :key="i">{{ say(e) }}</li></ul></div>
+            <ul v-if="state.detail.warnings.length" class="faults small"><li v-for="(w, i) in state.detail.warnings" :key="i" class="warn">{{ say(w) }}</li></ul>
             <div class="columns" style="grid-template-columns: minmax(0, 1fr) 15rem; flex: none">
               <div v-if="state.detail.cameras.length" class="scroll" tabindex="0" role="region" aria-label="Residuals by camera"><table>
                 <thead><tr><th>Camera</th><th class="num" title="Overlap of silhouette and fitted head in the face region">IoU</th><th class="num" title="From the fitted rim to the silhouette, hair and clothes among it">contour, px</th><th class="num" title="Share of the rim farther than 3 px from the silhouette: hair, clothes or misfit">excluded</th><th class="num" title="Silhouette difference of the starting head">XOR before</th><th class="num" title="The same of the fitted head">XOR after</th><th>Use</th></tr></thead>
@@ -101,7 +101,7 @@ export default spoken({
     </section>`,
   created() { Object.assign(this, { clock, fixed, span, stageWords, poor: POOR_PX, mostly: MOSTLY }); },
   methods: {
-    captureOf(j) { return j.captured ? j.capture || clock(j.captured) : say(j.capture); },
+    captureOf(j) { return j.captured ? j.capture || clock(j.captured) : say("removed capture"); },
     kind(j) { return j.state === "failed" ? "fault" : j.state === "running" || j.state === "succeeded" ? "accent" : ""; },
     took(j) { return j.started && j.finished ? span((new Date(j.finished) - new Date(j.started)) / 1000) : ""; },
     overlay(name) { return `/console/jobs/${this.job.id}/overlays/${name}.png`; },

@@ -2,19 +2,21 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import NotRequired, TypedDict, cast, get_args
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.eigenheads.model_names import list_models
-from pipeline.results.report_types import CameraReport, WarningReport
+from pipeline.results.report_types import CameraReport
 from rig.errors import InputError
+from rig.messages.message import Message, MessageDocument, compose
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.pages.rig import read_report
 from server.console.removal import removals
-from server.errors import SEND_AGAIN, Conflict, Unusable
+from server.console.shown_messages import shown_failure
+from server.errors import Conflict, Unusable
 from server.services.bulk import each
 from server.services.documents import JobLine
 from server.services.jobs import FINISHED, STATUSES
@@ -58,7 +60,7 @@ class JobDetail(TypedDict):
     id: str
     log: list[LogLine]
     cameras: list[CameraLine]
-    warnings: list[WarningReport]
+    warnings: list[MessageDocument]
     seconds: dict[str, float]
     stopped_because: str | None
     evaluations: int | None
@@ -167,17 +169,19 @@ def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
     for job in jobs:
         capture = next(iter(service.captures.of([job.capture_id or ""])), None)
         if capture is None:
-            found.append(ListedJob(job, "removed capture", None, job.session))
+            found.append(ListedJob(job, "", None, job.session))
         else:
             found.append(ListedJob(job, capture.label, capture.created, capture.session))
     return found
 
 
 def job_line(listed: ListedJob) -> ShownJob:
-    job = {key: value for key, value in asdict(listed.job).items() if key != "files"}
-    if listed.job.error is not None:  # who reads a page sends no document again
-        job["error"] |= {"detail": listed.job.error.detail.removesuffix(SEND_AGAIN).strip()}
-    return cast(ShownJob, {**job, "capture": listed.capture, "captured": listed.captured})
+    job, notice = listed.job, listed.job.notice
+    line = asdict(replace(job, error=None, notice=None, files={}))
+    line |= {"error": shown_failure(job.error), "notice": None if notice is None else notice.text}
+    line |= {"notice_message": None if notice is None else notice.document()}
+    del line["files"]
+    return cast(ShownJob, {**line, "capture": listed.capture, "captured": listed.captured})
 
 
 def job_detail(service: Service, job_id: str) -> JobDetail:
@@ -225,12 +229,12 @@ def log_lines(events: list[JobEvent]) -> list[LogLine]:
     return lines
 
 
-def restart(page: Page, event: RestartForm) -> str:
+def restart(page: Page, event: RestartForm) -> Message:
     wanted = Work(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
     page.started(job.id, opens=True)
-    return f"Queued job {job.id[-6:]}."
+    return compose("job-queued", job=job.id[-6:])
 
 
 def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
@@ -238,9 +242,9 @@ def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
     try:
         settings = json.loads(event.get("more") or "{}")
     except ValueError as error:
-        raise InputError("settings", [f"the further settings are no JSON ({error})"]) from error
+        raise InputError("settings", [compose("further-settings-no-json", reason=str(error))]) from error
     if not isinstance(settings, dict):
-        raise InputError("settings", ['the further settings are no JSON object, such as {"fitting": {"modes": 80}}'])
+        raise InputError("settings", [compose("further-settings-no-object")])
     return settings | {key: event.get(key) for key in ("method", "detail", "front") if event.get(key)}
 
 
@@ -251,18 +255,18 @@ def cancel(page: Page, event: Chosen) -> None:
 def delete(page: Page, event: Chosen) -> None:
     service, identity = page.service, event["id"]
     service.jobs.get(identity)
-    remove_later(identity, lambda: service.jobs.delete(identity), f"job {identity[-6:]}", "submit")
+    remove_later(identity, lambda: service.jobs.delete(identity), compose("job-named", job=identity[-6:]), "submit")
 
 
-def bulk(page: Page, event: BulkForm) -> str:
+def bulk(page: Page, event: BulkForm) -> Message:
     """One action on the jobs that are ticked; what is refused to some is told with its reasons."""
     service, action = page.service, event["action"]
     if action == "remove":
         ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]
         if not ended:
-            raise Conflict("job-active", "These jobs are queued or running; cancel them first.")
-        remove_all_later(ended, service.jobs.delete, f"{len(ended)} jobs with their heads", "submit")
-        return f"{len(ended)} removed."
+            raise Conflict("job-active", compose("jobs-active"))
+        remove_all_later(ended, service.jobs.delete, compose("jobs-with-heads", count=len(ended)), "submit")
+        return compose("jobs-removed-count", count=len(ended))
     restarted, begun = Work(), list[str]()
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
@@ -271,11 +275,12 @@ def bulk(page: Page, event: BulkForm) -> str:
     done = each(event["ids"], actions[action])
     page.started(*begun)
     shared.forget("jobs")
-    said = {"cancel": "cancelled", "restart": "queued again"}[action]
+    count = len(done.done)
+    said = compose("jobs-cancelled", count=count) if action == "cancel" else compose("jobs-queued-again", count=count)
     if done.refused:
-        told = [f"{one.id[-6:]}: {one.detail}" for one in done.refused]
-        raise Unusable("some-refused", f"{len(done.done)} {said}, {len(told)} refused.", told)
-    return f"{len(done.done)} {said}."
+        told = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
+        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(told)), told)
+    return said
 
 
 JobsPage.actions = {

@@ -3,6 +3,7 @@ import { GLTFLoader, OrbitControls, THREE } from "nicegui-scene";
 import { besideIt } from "/console/static/beside.js";
 import { exports3d } from "/console/static/exports.js";
 import { say, spoken } from "/console/static/language.js";
+import { told } from "/console/static/messages.js";
 import { fitted, lookThrough } from "/console/static/look_through.js";
 import { views3d } from "/console/static/views.js";
 import { clock, fixed, keepAddress, size, span, typing } from "/console/static/words.js";
@@ -88,7 +89,7 @@ export default spoken({
         </div>
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="About the head">
           <template v-if="job">
-            <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ say(w.message) }}</li></ul>
+            <ul v-if="job.warnings.length" class="faults small"><li v-for="(w, i) in job.warnings" :key="i" class="warn">{{ say(w) }}</li></ul>
             <div class="stack" style="gap: .35rem"><label class="field">Compare with<select v-model="other"><option value="">nothing</option><option v-if="job.truth" value="truth">the truth (simulated)</option><option v-for="r in others" :key="r.id" :value="r.id">{{ same(r) ? headName(r) : say('ANOTHER PERSON? {head}', { head: headName(r) }) }}</option></select></label>
               <label v-if="other && other !== 'truth'" class="check small"><input type="checkbox" v-model="beside" id="beside">side by side, turned together</label>
               <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">{{ say('offer {count} head of other subjects, too | offer {count} heads of other subjects, too', { count: elsewhere }) }}</label>
@@ -162,7 +163,7 @@ export default spoken({
     same(r) { return r.capture_id === this.job?.capture_id || (!!r.session && r.session === this.job?.session) || (!!r.subject && r.subject === this.job?.subject); },
     headName(r) {
       const how = [say(r.settings.method || "contour"), say(r.settings.detail), r.model && r.model !== "default" && r.model].filter(Boolean).join(", ");
-      return [r.subject, r.captured ? r.capture || say("capture {time}", { time: clock(r.captured) }) : say(r.capture), how, say("made {time}", { time: clock(r.finished) })].filter(Boolean).join(" · ");
+      return [r.subject, r.captured ? r.capture || say("capture {time}", { time: clock(r.captured) }) : say("removed capture"), how, say("made {time}", { time: clock(r.finished) })].filter(Boolean).join(" · ");
     },
     draw() {
       if (!this.renderer || this.waiting) return;
@@ -178,7 +179,7 @@ export default spoken({
     },
     async numbers(name, id = this.job.id) {
       const answer = await fetch(`/console/jobs/${id}/${name}`);
-      if (!answer.ok) throw new Error((await answer.json()).detail);
+      if (!answer.ok) throw new Error(say(told(await answer.json())));
       return new Float32Array(await answer.arrayBuffer());
     },
     async load(id) {

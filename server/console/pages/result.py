@@ -9,7 +9,8 @@ from nicegui import ui
 from nicegui.elements import scene
 from starlette.responses import RedirectResponse
 
-from pipeline.results.report_types import Measured, Report, WarningReport
+from pipeline.results.report_types import Measured, Report
+from rig.messages.message import MessageDocument
 from server.console.page import Page, shared, show
 from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report
@@ -47,7 +48,7 @@ class Head(ResultLine):
 
     measurements: dict[str, Measured]
     quality: dict[str, float | None]
-    warnings: list[WarningReport]
+    warnings: list[MessageDocument]
     seconds: float | None
     clear_views: int
     contour_px: float | None

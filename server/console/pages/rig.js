@@ -73,7 +73,7 @@ export default spoken({
       </header>
       <div v-if="refused" class="panel pad stack small" role="alertdialog" aria-label="Clean plates refused" id="refused-plates" style="border-color: var(--warn)">
         <p><strong class="warn">Somebody seems to be in the new clean plates.</strong> {{ say('The old ones of {time} stay in use. Send everybody out and press B again; where the studio itself has changed, use the new ones.', { time: clock(state.plates.taken) }) }}</p>
-        <details><summary>{{ say('{count} camera differs | {count} cameras differ', { count: refused.faults.length }) }}</summary><ul class="faults"><li v-for="fault in refused.faults" :key="fault">{{ say(fault) }}</li></ul></details>
+        <details><summary>{{ say('{count} camera differs | {count} cameras differ', { count: refused.faults.length }) }}</summary><ul class="faults"><li v-for="fault in refused.faults" :key="fault.message">{{ say(fault) }}</li></ul></details>
         <div class="line wrap"><button class="b main-action" @click="dismissed = refused.id">Keep the old ones</button><button class="b" id="use-refused" :disabled="!!busy" @click="usePlates(refused.id)">Use the new ones all the same</button></div></div>
       <div v-if="shot" class="panel pad scroll stack grow" tabindex="0" role="region" aria-label="The shot" :data-shot="shot.id">
         <div class="line wrap" style="align-items: start"><verdict :capture="shot" class="grow"></verdict>

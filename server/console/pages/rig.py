@@ -11,6 +11,7 @@ from starlette.responses import RedirectResponse
 from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import CameraSyncDocument
+from rig.messages.message import Message, MessageDocument, compose, documents_of
 from server.console.media import live_view
 from server.console.page import Action, Chosen, Page, shared, show
 from server.console.pages.captures import (
@@ -26,8 +27,9 @@ from server.console.pages.captures import (
     sync_of,
 )
 from server.console.removal import removals
+from server.console.shown_messages import shown_detail
 from server.console.work_form import WorkForm, chosen_work
-from server.errors import SEND_AGAIN, Conflict, NotFound
+from server.errors import Conflict, NotFound
 from server.services.captures import About
 from server.services.records import Calibration
 from server.services.service import Service
@@ -61,7 +63,7 @@ class LastCapture(TypedDict):
 class PlatesLine(TypedDict):
     id: str
     taken: str
-    faults: list[str]
+    faults: list[MessageDocument]
 
 
 class PlatesShown(TypedDict):
@@ -76,7 +78,7 @@ class RigShown(TypedDict):
     kind: str
     ready: bool
     cameras: list[Tile]
-    faults: list[str]
+    faults: list[MessageDocument]
     calibration: str | None
     in_use: InUse | None
     sessions: list[SessionLine]
@@ -93,7 +95,7 @@ class JobStrip(TypedDict):
     stage: str
     progress: float
     eta_s: float | None
-    detail: str | None
+    detail: MessageDocument | None
 
 
 class RigPageShown(RigShown):
@@ -116,14 +118,14 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
     if not found:
         return None
     job = found[0]
-    told = job.error.detail.removesuffix(SEND_AGAIN).strip() if job.error is not None else job.notice
+    told = shown_detail(job.error.detail) if job.error is not None else job.notice
     return {
         "id": job.id,
         "state": job.state,
         "stage": job.stage,
         "progress": job.progress,
         "eta_s": job.eta_s,
-        "detail": told,
+        "detail": None if told is None else told.document(),
     }
 
 
@@ -156,7 +158,7 @@ def rig_state(service: Service) -> RigShown:
         "kind": rig.kind,
         "ready": rig.ready,
         "cameras": cameras,
-        "faults": [*rig.faults, *(fault for fault in [live_view(service).fault] if fault)],
+        "faults": documents_of([*rig.faults, *(fault for fault in [live_view(service).fault] if fault)]),
         "calibration": rig.calibration,
         "in_use": calibration_in_use(service),
         "sessions": sessions_list(service),
@@ -177,7 +179,9 @@ def plates_shown(kept: list[PlatesVersion]) -> PlatesShown | None:
 
 
 def _plates_line(version: PlatesVersion | None) -> PlatesLine | None:
-    return None if version is None else {"id": version.id, "taken": version.taken, "faults": [*version.refused]}
+    return (
+        None if version is None else {"id": version.id, "taken": version.taken, "faults": documents_of(version.refused)}
+    )
 
 
 def calibration_in_use(service: Service) -> InUse | None:
@@ -217,12 +221,14 @@ def read_report(service: Service, job_id: str) -> Report | None:
     return shared.get(("report", job_id), 3600.0, read)
 
 
-def capture(page: Page, event: Mapping[str, str | None]) -> str:
+def capture(page: Page, event: Mapping[str, str | None]) -> Message:
     record = page.service.captures.take(About.of(event))
     page.choice["shot"] = record.id
     shared.forget("rig")
-    worth = "" if record.verdict is None else f" Verdict: {record.verdict}."
-    return f"Captured {len(record.cameras)} pictures.{worth}"
+    pictures = len(record.cameras)
+    if record.verdict is None:
+        return compose("captured", pictures=pictures)
+    return compose("captured-verdict", pictures=pictures, verdict=record.verdict)
 
 
 def keep(page: Page, event: object) -> None:
@@ -235,14 +241,14 @@ def retake(page: Page, event: Chosen) -> None:
     page.choice["shot"] = None
 
 
-def reconstruct_shot(page: Page, event: WorkForm) -> str:
+def reconstruct_shot(page: Page, event: WorkForm) -> Message:
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.choice |= {"shot": None, "job": job.id}
     page.started(job.id, opens=True)
-    return f"Queued job {job.id[-6:]}."
+    return compose("job-queued", job=job.id[-6:])
 
 
-def plates(page: Page, event: object) -> str | None:
+def plates(page: Page, event: object) -> Message | None:
     page.service.store.reserve(0, page.service.settings.free_bytes)
     try:
         taken = page.service.rig.take_background()
@@ -250,17 +256,18 @@ def plates(page: Page, event: object) -> str | None:
         return None
     finally:
         shared.forget("rig")
-    note = f" Note: {taken.note}." if taken.note else ""
-    return f"{taken.plates} clean plates of {len(taken.cameras)} cameras.{note}"
+    if taken.note is None:
+        return compose("plates-taken", plates=taken.plates, cameras=len(taken.cameras))
+    return compose("plates-taken-note", plates=taken.plates, cameras=len(taken.cameras), note=taken.note)
 
 
-def use_plates(page: Page, event: Chosen) -> str:
+def use_plates(page: Page, event: Chosen) -> Message:
     page.service.rig.use_plates(event["id"])
     shared.forget("rig")
-    return "These clean plates are in use now. The ones before are kept."
+    return compose("plates-taken-into-use")
 
 
-def begin_session(page: Page, event: SessionForm) -> str:
+def begin_session(page: Page, event: SessionForm) -> Message:
     told = new_session(page, event)
     shared.forget("rig")
     return told

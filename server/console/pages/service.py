@@ -10,6 +10,7 @@ from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
+from rig.messages.message import Message, MessageDocument, compose
 from server.console.identity import KEY_ID
 from server.console.page import Action, Chosen, Page, remove_all_later, shared, show
 from server.errors import Conflict
@@ -23,6 +24,15 @@ from server.storage.job_index import JobQuery
 NAME_MOST = 200
 REMOVED_AT_ONCE = 1000
 GB = 1e9
+MEANINGS = {
+    "keep_captures_days": compose("means-keep-captures-days"),
+    "keep_results_days": compose("means-keep-results-days"),
+    "keep_jobs": compose("means-keep-jobs"),
+    "make_room": compose("means-make-room"),
+    "free_bytes": compose("means-free-bytes"),
+    "cache_bytes": compose("means-cache-bytes"),
+    "upload_hours": compose("means-upload-hours"),
+}
 
 
 class KeyLine(TypedDict):
@@ -38,8 +48,8 @@ class SettingLine(TypedDict):
 
     name: str
     variable: str
-    value: str
-    means: str
+    value: MessageDocument
+    means: MessageDocument
 
 
 class ServiceShown(TypedDict):
@@ -100,77 +110,76 @@ def setting_lines(s: ServiceSettings) -> list[SettingLine]:
     told = {
         "keep_captures_days": _days(s.keep_captures_days),
         "keep_results_days": _days(s.keep_results_days),
-        "keep_jobs": "all of them" if s.keep_jobs is None else f"the newest {s.keep_jobs}",
-        "make_room": "yes" if s.make_room else "no",
-        "free_bytes": f"{s.free_bytes / GB:.1f} GB",
-        "cache_bytes": f"{s.cache_bytes / GB:.1f} GB",
-        "upload_hours": f"{s.upload_hours:g} hours",
+        "keep_jobs": compose("keep-all") if s.keep_jobs is None else compose("keep-newest", count=s.keep_jobs),
+        "make_room": compose("yes") if s.make_room else compose("no"),
+        "free_bytes": compose("gigabytes", gb=s.free_bytes / GB),
+        "cache_bytes": compose("gigabytes", gb=s.cache_bytes / GB),
+        "upload_hours": compose("hours", hours=s.upload_hours),
     }
-    described = ServiceSettings.model_fields
     return [
         {
             "name": name,
             "variable": PREFIX + name.upper(),
-            "value": value,
-            "means": (described[name].description or "").partition(";")[0],
+            "value": value.document(),
+            "means": MEANINGS[name].document(),
         }
         for name, value in told.items()
     ]
 
 
-def _days(days: float | None) -> str:
-    return "for ever" if days is None else f"{days:g} days"
+def _days(days: float | None) -> Message:
+    return compose("for-ever") if days is None else compose("days", days=days)
 
 
-def add_key(page: ServicePage, event: KeyForm) -> str:
+def add_key(page: ServicePage, event: KeyForm) -> Message:
     """The first key closes an open service, and so must be able to make others; this page goes on with it."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
     if not name or len(name) > NAME_MOST:
-        faults.append(f"a key has a name of 1 to {NAME_MOST} characters")
+        faults.append(compose("key-name-wanted", most=NAME_MOST))
     if not name.isprintable():
-        faults.append("the name has control characters")
+        faults.append(compose("key-name-with-control-characters"))
     if not scopes:
-        faults.append("choose what the key may do")
+        faults.append(compose("key-scopes-wanted"))
     if page.caller.key == LOCAL and "admin" not in scopes:
-        faults.append("from the first key on, all others need one: give it the scope admin")
+        faults.append(compose("first-key-needs-admin"))
     if faults:
         raise InputError("key", faults)
     page.secret = page.service.keys.add(name, tuple(scopes))
     if page.caller.key == LOCAL:
         page.caller = Caller(page.secret.split("_")[1], frozenset(scopes))
-        return f"Key {name!r} is made. Everybody needs a key from now on; this browser is signed in with it."
-    return f"Key {name!r} is made."
+        return compose("first-key-made", name=f"{name!r}")
+    return compose("key-made", name=f"{name!r}")
 
 
-def revoke(page: ServicePage, event: Chosen) -> str:
+def revoke(page: ServicePage, event: Chosen) -> Message:
     if event["id"] == page.caller.key:
-        raise Conflict("own-key", "A key cannot remove itself; use another, or `eigenhead keys remove`.")
+        raise Conflict("own-key", compose("own-key"))
     page.service.keys.remove(event["id"])
-    return "Revoked: its pages end within two seconds, its requests now."
+    return compose("key-revoked")
 
 
-def clear(page: ServicePage, event: object) -> str:
+def clear(page: ServicePage, event: object) -> Message:
     gone = clear_caches(page.service)
     forget_storage(page.service)
-    return f"Cleared what was kept of {gone} {'capture' if gone == 1 else 'captures'}; what is asked for is made anew."
+    return compose("caches-cleared", count=gone)
 
 
-def remove_failed(page: ServicePage, event: object) -> str:
+def remove_failed(page: ServicePage, event: object) -> Message:
     jobs = page.service.jobs
     ids = [job.id for job in jobs.page(JobQuery("", FAILED), REMOVED_AT_ONCE).items]
     if not ids:
-        raise Conflict("none-failed", "No job failed or was cancelled.")
-    remove_all_later(ids, jobs.delete, f"{len(ids)} jobs that failed or were cancelled", "admin")
+        raise Conflict("none-failed", compose("no-job-failed"))
+    remove_all_later(ids, jobs.delete, compose("failed-jobs", count=len(ids)), "admin")
     forget_storage(page.service)
-    return f"{len(ids)} removed."
+    return compose("jobs-removed-count", count=len(ids))
 
 
-def sweep_now(page: ServicePage, event: object) -> str:
+def sweep_now(page: ServicePage, event: object) -> Message:
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
-    told = ", ".join(f"{count} {kind}" for kind, count in gone.items()) or "nothing was due"
-    return f"Swept: {told}."
+    told = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]
+    return compose("swept", gone=told or compose("nothing-due"))
 
 
 def count_again(page: ServicePage, event: object) -> None:

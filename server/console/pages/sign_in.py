@@ -8,6 +8,7 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
+from rig.messages.message import compose
 from server.console.identity import KEY_ID, service_of_pages, sign_in
 from server.console.page import signed_in
 
@@ -23,7 +24,7 @@ class SignIn(Element, component="sign_in.js"):
         caller = await anyio.to_thread.run_sync(sign_in, service_of_pages(), str(event.args)[:200])
         if caller is None:
             await asyncio.sleep(WRONG_PAUSE_S)
-            self.run_method("refuse", "No such key. Make one with: eigenhead keys add NAME")
+            self.run_method("refuse", compose("no-such-key").document())
         else:
             pages.storage.user[KEY_ID] = caller.key
             ui.navigate.to("/")

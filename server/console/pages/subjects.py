@@ -7,6 +7,7 @@ from typing import TypedDict, cast, get_args
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
+from rig.messages.message import Message
 from server.console.page import Action, Page, shared, show
 from server.console.pages.captures import SessionForm, new_session
 from server.services.service import Service
@@ -42,7 +43,7 @@ def subjects_state(service: Service, asked: Mapping[str, str | None]) -> Subject
     }
 
 
-def begin(page: Page, event: SessionForm) -> str:
+def begin(page: Page, event: SessionForm) -> Message:
     told = new_session(page, event)
     shared.forget("subjects")
     return told

@@ -1,5 +1,6 @@
 // Navigation, the service's state, messages in the corner, and the keys that work on every page.
 import { LANGUAGES, language, say, speak, spoken } from "/console/static/language.js";
+import { english } from "/console/static/messages.js";
 import { started } from "/console/static/started.js";
 import { Tour } from "/console/static/tour.js";
 import { typing } from "/console/static/words.js";
@@ -64,7 +65,7 @@ export default spoken({
   unmounted() { window.removeEventListener("keydown", this.key); document.removeEventListener("scroll", this.scrolled, true); clearInterval(this.scrolling); },
   methods: {
     announce(kind, text, faults, link) {
-      const id = this.next++, further = faults.filter((fault) => !text.includes(fault)).map((fault) => say(fault));
+      const id = this.next++, further = faults.filter((fault) => !english(text).includes(english(fault))).map((fault) => say(fault));
       this.messages = [...this.messages, { id, kind, text: say(text), link, faults: further }].slice(-MESSAGES_MOST);
       if (kind === "done" && !link) setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
     },

@@ -15,9 +15,9 @@ export function verdictTag(capture) {
 function faultLines(faults) {
   const lines = new Map();
   for (const fault of faults || []) {
-    const line = lines.get(fault.code) || { code: fault.code, title: say(CODES[fault.code] || fault.code), cameras: [], details: [], remedy: say(fault.remedy) };
+    const line = lines.get(fault.code) || { code: fault.code, title: say(CODES[fault.code] || fault.code), cameras: [], details: [], remedy: say({ code: `remedy-${fault.code}`, message: fault.remedy }) };
     line.cameras.push(fault.camera || say("all cameras"));
-    line.details.push(say(fault.detail));
+    line.details.push(say(fault.detail_message ?? fault.detail));
     lines.set(fault.code, line);
   }
   return [...lines.values()].map((line) => ({ ...line, details: [...new Set(line.details)] }));
@@ -43,9 +43,9 @@ export const Verdict = spoken({
   },
   template: `
     <div class="stack verdict" role="region" aria-label="Verdict" :data-verdict="capture.verdict || 'none'" style="gap: .35rem">
-      <div class="line wrap"><span class="tag" :class="tag.kind">{{ tag.text }}</span><span>{{ sentence }}</span><span v-if="capture.sync" class="muted small push" :class="{ warn: !capture.sync.good }">{{ say(capture.sync.text) }}</span></div>
+      <div class="line wrap"><span class="tag" :class="tag.kind">{{ tag.text }}</span><span>{{ sentence }}</span><span v-if="capture.sync" class="muted small push" :class="{ warn: !capture.sync.good }">{{ say(capture.sync.message) }}</span></div>
       <ul v-if="lines.length" class="faults small"><li v-for="line in lines" :key="line.code" :data-fault="line.code"><strong class="warn">{{ line.cameras.join(', ') }}: {{ line.title }}.</strong> {{ line.details.slice(0, 3).join('; ') }}{{ line.details.length > 3 ? ' ...' : '' }}. <span>{{ say('To do: {remedy}.', { remedy: line.remedy }) }}</span></li></ul>
-      <ul v-if="capture.warnings?.length" class="faults small" aria-label="Warnings"><li v-for="told in capture.warnings" :key="told.message" :data-warning="told.code" class="warn">{{ say(told.message) }}</li></ul>
+      <ul v-if="capture.warnings?.length" class="faults small" aria-label="Warnings"><li v-for="told in capture.warnings" :key="told.message" :data-warning="told.code" class="warn">{{ say(told) }}</li></ul>
     </div>`,
 });
 

@@ -8,6 +8,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse
 from pydantic import ValidationError
 
+from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
 from server.http.calibration_schemas import CalibrationList, CalibrationOut, NewCalibration
 from server.services.keys import Caller
@@ -95,7 +96,7 @@ async def _small_body(request: Request) -> bytes:
     async for chunk in patiently(request.stream(), SILENT_S):
         body += chunk
         if len(body) > JSON_BYTES:
-            raise Problem(413, "body-too-large", f"A JSON body may have {JSON_BYTES:,} bytes.")
+            raise Problem(413, "body-too-large", compose("json-body-too-large", bytes=JSON_BYTES))
     return bytes(body)
 
 
@@ -105,4 +106,4 @@ def _parsed(body: bytes) -> NewCalibration:
     except ValidationError as error:
         raise RequestValidationError(error.errors()) from error
     except (ValueError, RecursionError) as error:
-        raise Problem(422, "invalid-request", "The body is no JSON.", [str(error)[:200]]) from error
+        raise Problem(422, "invalid-request", compose("body-no-json"), [str(error)[:200]]) from error

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from rig.errors import InputError
+from rig.messages.message import compose
 from server.errors import Forbidden
 from server.http.auth import ServiceOf, require
 from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, Key, Limit, Sought, WithTag
@@ -62,7 +63,7 @@ async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, r
     """Takes a capture folder as an archive that lies elsewhere, at a server that the operator allowed
     (``EIGENHEAD_IMPORT_ORIGINS``; 403 where there is none); 422 names every fault in it."""
     if not service.settings.import_origins:
-        detail = "This service imports from nowhere: its operator names servers in EIGENHEAD_IMPORT_ORIGINS. Upload it."
+        detail = compose("imports-not-allowed")
         raise Forbidden("imports-off", detail)
     about = About(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     with service.store.incoming() as folder:
@@ -99,7 +100,7 @@ def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> B
     """One action on many captures; what cannot be done to one is said and holds no other up. ``reconstruct`` needs the
     scope ``submit``."""
     if wanted.action == "reconstruct" and not caller.may("submit"):
-        raise Forbidden("scope-missing", "Your key may not do that: it lacks the scope 'submit'.")
+        raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope="'submit'"))
     work = Work(wanted.model, wanted.settings)
     work.check()
     actions: dict[str, Callable[[str], object]] = {
@@ -227,9 +228,9 @@ def _settings_of(text: str | None) -> dict[str, object] | None:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError("settings", [f"is no JSON ({error})"]) from error
+        raise InputError("settings", [compose("no-json-because", reason=str(error))]) from error
     if not isinstance(document, dict):
-        raise InputError("settings", ["is no JSON object"])
+        raise InputError("settings", [compose("settings-no-json-object")])
     return document
 
 

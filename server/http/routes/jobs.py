@@ -1,7 +1,6 @@
 """Jobs: submitted, watched, cancelled, restarted; and the files that they made."""
 
 from collections.abc import AsyncIterator, Callable
-from dataclasses import asdict
 from typing import Annotated
 from urllib.parse import quote
 
@@ -117,7 +116,7 @@ async def job_events(
             yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
         if state in FINISHED:
             ended = await service.threads.disk(service.jobs.get, job)
-            yield ServerSentEvent(event="end", id=str(seq), data=asdict(ended))
+            yield ServerSentEvent(event="end", id=str(seq), data=JobOut.model_validate(ended))
             return
         await anyio.sleep(service.settings.poll_s)
 

@@ -7,8 +7,10 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 from fastapi.responses import FileResponse
 
+from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
 from server.http.schemas import (
+    CheckOut,
     Health,
     InfoOut,
     KeyList,
@@ -53,7 +55,7 @@ def readyz(service: ServiceOf, response: Response) -> Ready:
     checks = readiness(service)
     ready = all(check.ok for check in checks.values())
     response.status_code = 200 if ready else 503
-    return Ready(ready=ready, checks=checks)
+    return Ready(ready=ready, checks={name: CheckOut.model_validate(check) for name, check in checks.items()})
 
 
 @router.get(
@@ -110,7 +112,7 @@ def list_keys(service: ServiceOf, caller: Admin) -> KeyList:
 def remove_key(service: ServiceOf, caller: Admin, key_id: str) -> None:
     """A key cannot remove itself, so that the last one does not go by accident and leave the service keyless."""
     if key_id == caller.key:
-        raise Problem(409, "own-key", "A key cannot remove itself; use another, or `eigenhead keys remove`.")
+        raise Problem(409, "own-key", compose("own-key"))
     service.keys.remove(key_id)
 
 

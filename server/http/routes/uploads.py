@@ -13,6 +13,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Request, Response
 
 from rig.errors import InputError
+from rig.messages.message import compose
 from server.errors import DiskFull, NotFound, Refused, Unavailable
 from server.http.auth import ServiceOf, require
 from server.http.tus import append
@@ -54,7 +55,7 @@ def tus_create(
     tags, with commas between."""
     _check_version(tus_resumable)
     if not upload_length or not (upload_length.isascii() and upload_length.isdigit()) or len(upload_length) > 18:
-        raise Problem(400, "upload-length", "Upload-Length must say how many bytes the archive has.")
+        raise Problem(400, "upload-length", compose("upload-length-missing"))
     fields = _metadata(upload_metadata)
     about = About.of(fields)
     if about.session is not None:
@@ -94,7 +95,7 @@ async def tus_patch(
     """Appends bytes at ``Upload-Offset``."""
     _check_version(tus_resumable)
     if request.headers.get("content-type") != "application/offset+octet-stream":
-        raise Problem(415, "unsupported-media-type", "Send application/offset+octet-stream.")
+        raise Problem(415, "unsupported-media-type", compose("offset-stream-wanted"))
     record = await service.threads.disk(_own, service, caller, upload_id)
     with service.uploads.lock(record.id):
         # read again: the request that held the lock before may have made the capture
@@ -107,7 +108,7 @@ async def _append(
 ) -> Response:
     here = await service.threads.disk(service.uploads.offset, record)
     if offset != str(here):
-        raise Problem(409, "wrong-offset", f"The upload stands at byte {here}; ask with HEAD and go on from there.")
+        raise Problem(409, "wrong-offset", compose("upload-offset-wrong", offset=here))
     if record.capture is None:
         here = await append(service.uploads, record, stream, checksum, service.threads)
     if here == record.length and record.capture is None:
@@ -146,13 +147,15 @@ def _finish(service: Service, record: UploadRecord) -> UploadRecord:
 def _own(service: Service, caller: Caller, upload_id: str) -> UploadRecord:
     record = service.uploads.get(upload_id)
     if record.key != caller.key and not caller.may("admin"):
-        raise NotFound("upload", upload_id)
+        raise NotFound(compose("thing-upload"), upload_id)
     return record
 
 
 def _check_version(version: str | None) -> None:
     if version != VERSION:
-        raise Problem(412, "tus-version", f"Send 'Tus-Resumable: {VERSION}'.", headers={"Tus-Version": VERSION})
+        raise Problem(
+            412, "tus-version", compose("tus-version-wanted", version=VERSION), headers={"Tus-Version": VERSION}
+        )
 
 
 def _metadata(text: str | None) -> dict[str, str]:
@@ -165,7 +168,7 @@ def _metadata(text: str | None) -> dict[str, str]:
         try:
             decoded = base64.b64decode(value, validate=True).decode()
         except (binascii.Error, ValueError) as error:
-            raise Problem(400, "upload-metadata", f"Upload-Metadata {key!r:.80} is not base64 of UTF-8.") from error
+            raise Problem(400, "upload-metadata", compose("upload-metadata-unreadable", key=f"{key!r:.80}")) from error
         if key in FIELDS:
             fields[key] = decoded
     return fields

@@ -89,7 +89,7 @@ def test_every_fault_of_a_board_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         read_board(path)
     for key in ("kind", "columns", "rows", "square_mm", "colour"):
-        assert any(key in fault for fault in error.value.faults), key
+        assert any(key in fault.text for fault in error.value.faults), key
 
 
 def test_a_dictionary_with_too_few_markers_is_refused(tmp_path: Path) -> None:

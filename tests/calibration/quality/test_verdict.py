@@ -6,9 +6,10 @@ import pytest
 
 from calibration.quality.checks import Check
 from calibration.quality.verdict import CameraEvidence, judge
+from rig.messages.message import verbatim
 
 SOUND = CameraEvidence(views=12, focal_share=0.004, pose_sigma_px=0.1, covered=0.6)
-HELD_OUT = Check("held-out shots", True, "")
+HELD_OUT = Check("held-out shots", True, verbatim(""))
 
 
 @pytest.mark.parametrize(
@@ -28,10 +29,10 @@ def test_the_weakest_camera_decides(weak: dict[str, float], word: str, told: str
     cameras = {f"cam{i:02}": SOUND for i in range(4)} | {"cam02": replace(SOUND, **weak)}
     verdict = judge(cameras, [HELD_OUT])
     assert verdict.word == word
-    assert [missing.startswith(told or "") for missing in verdict.missing] == [True] * (told is not None)
+    assert [missing.text.startswith(told or "") for missing in verdict.missing] == [True] * (told is not None)
 
 
 def test_shots_that_none_could_be_held_out_of_are_usable_at_most() -> None:
-    verdict = judge({"cam00": SOUND, "cam01": SOUND}, [Check("held-out shots", None, "too few")])
+    verdict = judge({"cam00": SOUND, "cam01": SOUND}, [Check("held-out shots", None, verbatim("too few"))])
     assert verdict.word == "usable"
-    assert "take 15 in all" in verdict.missing[0]
+    assert "take 15 in all" in verdict.missing[0].text

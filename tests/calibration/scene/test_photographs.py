@@ -65,7 +65,7 @@ def test_a_mask_of_another_size_is_a_fault(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         find_masks(folder, find_photographs(folder / "images"), rig)
     (fault,) = refused.value.faults
-    assert fault.startswith("masks/cam01.png is 12 x 12 pixels, but its camera is 24 x 24")
+    assert fault.text.startswith("masks/cam01.png is 12 x 12 pixels, but its camera is 24 x 24")
 
 
 def test_masks_in_colmap_s_names_are_found(tmp_path: Path) -> None:

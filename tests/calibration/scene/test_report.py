@@ -4,11 +4,12 @@ from dataclasses import replace
 
 from calibration.scene.report import scene_page
 from calibration.scene.scale import scale_from_head
+from rig.messages.message import verbatim
 from tests.support.textured_wedge import solved
 
 
 def test_it_names_views_that_did_not_join_and_escapes_them() -> None:
-    page = scene_page(replace(solved(), left_out={"<cam9>": "<cam9>: dark"}))
+    page = scene_page(replace(solved(), left_out={"<cam9>": verbatim("dark")}))
     assert "6 of 7 views joined" in page
     assert "&lt;cam9&gt;: dark" in page
     assert "<cam9>" not in page

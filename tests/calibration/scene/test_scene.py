@@ -48,8 +48,8 @@ def test_views_that_do_not_join_are_named(tmp_path: Path) -> None:
     write_image(photos / "dark.png", np.full((HEIGHT, WIDTH), 20, np.uint8))
     found = calibrate_scene(photos)
     assert list(found.left_out) == ["dark"]
-    assert "only 0 distinct points" in found.left_out["dark"]
-    assert any(warning.startswith("left out: dark") for warning in found.warnings)
+    assert "only 0 distinct points" in found.left_out["dark"].text
+    assert any(warning.text.startswith("left out: dark") for warning in found.warnings)
     with pytest.raises(CalibrationRefused, match="the front camera dark: only 0"):
         calibrate_scene(photos, front="dark")
 

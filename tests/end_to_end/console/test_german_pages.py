@@ -7,13 +7,15 @@ from pathlib import Path
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, expect
 
+from rig.messages.message import compose, documents_of, verbatim
 from tests.support.browser import Visit, violations, visit
 from tests.support.services import RunningService, await_state, packed_capture, running_service, uploaded_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
+STATIC = Path(__file__).parents[3] / "server" / "console" / "static"
 PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service")
 
 # A table in which every text is its own translation, in brackets: what stands outside of brackets was never said.
@@ -21,6 +23,15 @@ BRACKETS = """export default new Proxy({}, {
   get: (_, text) => typeof text === "string" ? text.split(" | ").map((form) => `⟦${form}⟧`).join(" | ") : undefined,
   ownKeys: () => [],
 });"""
+# What the service tells: German in brackets, by its code.
+TOLD = (
+    (STATIC / "messages_de.js").read_text(encoding="utf-8").replace("export default", "const german =")
+    + """
+const brackets = (text) => text.split(" | ").map((form) => `⟦${form}⟧`).join(" | ");
+export default Object.fromEntries(Object.entries(german).map(([code, text]) => [code, brackets(text)]));
+"""
+)
+SCRIPT = "text/javascript"
 SHOWN = """() => {
   const seen = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
   const silent = "script, style, kbd, .mono, #esm-fallback, button[lang]";
@@ -149,21 +160,20 @@ def test_what_the_service_tells_is_german_too(browser: Browser, service: Running
     expect(page.get_by_text("ist eingereiht. Zu verfolgen auf der Seite Aufträge.")).to_be_visible(timeout=30_000)
     expect(page.get_by_text("GB frei")).to_be_visible(timeout=20_000)
     understood = {
-        "Captured 11 pictures. Verdict: good.": "11 Bilder aufgenommen. Urteil: gut.",
-        "Queued 3 jobs. Watch them on the page Jobs.": "3 Aufträge eingereiht. Zu verfolgen auf der Seite Aufträge.",
-        "The job is failed; it has no result.": "Der Auftrag hat kein Ergebnis (Status: gescheitert).",
-        "cam03, cam04: the board was never near the rim of the picture: bring it there": (
+        compose("captured-verdict", pictures=11, verdict="good"): "11 Bilder aufgenommen. Urteil: gut.",
+        compose("jobs-queued", count=3): "3 Aufträge eingereiht. Zu verfolgen auf der Seite Aufträge.",
+        compose("job-without-result", state="failed"): "Der Auftrag hat kein Ergebnis (Status: gescheitert).",
+        compose("rim-uncovered", cameras=["cam03", "cam04"]): (
             "cam03, cam04: die Tafel war nie nahe am Bildrand: sie dorthin halten"
         ),
-        "0.31 px in 4 held-out shots, 0.29 px in all": "0,31 px in 4 zurückgehaltenen Aufnahmen, 0,29 px in allen",
-        "squares are 1.0003 +- 0.0002 times as high as wide; enter measured_width_mm in board.toml to check the scale "
-        "itself": "Felder sind 1,0003 +- 0,0002 mal so hoch wie breit; measured_width_mm in board.toml eintragen, um "
-        "den Maßstab selbst zu prüfen",
-        "2 captures erased for good.": "2 Aufnahmen endgültig gelöscht.",
-        "nobody translates what a camera's maker says": "nobody translates what a camera's maker says",
+        compose("held-out", outside_px=0.31, shots=4, inside_px=0.29): (
+            "0,31 px in 4 zurückgehaltenen Aufnahmen, 0,29 px in allen"
+        ),
+        compose("captures-erased", count=2): "2 Aufnahmen endgültig gelöscht.",
+        verbatim("nobody translates what a camera's maker says"): "nobody translates what a camera's maker says",
     }
-    say = "(texts) => import('/console/static/language.js').then(({ say }) => texts.map((text) => say(text)))"
-    assert dict(zip(understood, page.evaluate(say, [*understood]), strict=True)) == understood
+    say = "(told) => import('/console/static/language.js').then(({ say }) => told.map((message) => say(message)))"
+    assert page.evaluate(say, documents_of(understood)) == [*understood.values()]
     shots = "[0, 1, 2].map((count) => say('{count} shot | {count} shots', { count }))"
     counted = page.evaluate(f"import('/console/static/language.js').then(({{ say }}) => {shots})")
     assert counted == ["0 Aufnahmen", "1 Aufnahme", "2 Aufnahmen"]
@@ -172,7 +182,8 @@ def test_what_the_service_tells_is_german_too(browser: Browser, service: Running
 
 def test_no_word_of_a_page_escapes_the_table(browser: Browser, service: RunningService, tmp_path: Path) -> None:
     v, escaped, said = german(browser, service), [], 0
-    v.page.route("**/console/static/de.js", lambda route: _brackets(route))
+    v.page.route("**/console/static/de.js", lambda route: route.fulfill(body=BRACKETS, content_type=SCRIPT))
+    v.page.route("**/console/static/messages_de.js", lambda route: route.fulfill(body=TOLD, content_type=SCRIPT))
     for state in ("empty", "filled"):
         for path in PATHS:
             page = v.go(path)
@@ -185,10 +196,6 @@ def test_no_word_of_a_page_escapes_the_table(browser: Browser, service: RunningS
             fill(service, tmp_path)
     assert sorted(set(escaped)) == []
     assert said > 1000  # of sixteen pages
-
-
-def _brackets(route: Route) -> None:
-    route.fulfill(body=BRACKETS, content_type="text/javascript")
 
 
 def unsaid(page: Page, texts: list[str]) -> list[str]:

@@ -100,7 +100,7 @@ def test_weights_are_read_in_either_manner_and_every_fault_is_named() -> None:
     with pytest.raises(InputError) as fault:
         weights_from_text(["jawOpens=0.2", "jawOpen=2", "jawOpen"], names)
     assert len(fault.value.faults) == 3
-    assert "near are jawOpen" in fault.value.faults[0]
+    assert "near are jawOpen" in fault.value.faults[0].text
 
 
 def test_what_moves_no_skin_is_no_expression() -> None:

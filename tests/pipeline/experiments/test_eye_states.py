@@ -18,6 +18,7 @@ from pipeline.experiments.eye_states import (
     told_sides,
 )
 from rig.errors import EigenheadError
+from rig.messages.message import Message
 
 if TYPE_CHECKING:
     from pipeline.results.reconstruction import Reconstruction
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def told(text: str, code: str = "eyes-closed") -> ReportWarning:
-    return ReportWarning(code, text)
+    return Message(code, {}, text)
 
 
 def test_the_eyes_are_those_that_the_warning_names() -> None:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.experiments.openmvs import PROGRAMS, PeerFailed, programs_in, surface_by_openmvs, write_input
 from rig.errors import InputError
 from rig.mesh import Mesh
+from rig.messages.message import texts_of
 from tests.support.ellipsoid_depths import Ellipsoid, Scene, scene
 from tests.support.scenes import ellipsoid, fan
 
@@ -93,4 +94,4 @@ def test_every_missing_program_is_named(tmp_path: Path) -> None:
     program(tmp_path, "RefineMesh", "true")
     with pytest.raises(InputError) as refused:
         programs_in(tmp_path)
-    assert refused.value.faults == tuple(f"holds no {name}" for name in PROGRAMS[:3])
+    assert texts_of(refused.value.faults) == [f"holds no {name}" for name in PROGRAMS[:3]]

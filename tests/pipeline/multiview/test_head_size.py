@@ -56,7 +56,7 @@ def test_what_is_between_is_warned_of(heads):
     rig, of = heads
     (warning,) = judge_head_size(of["over ears"], times(rig, 1.5))
     assert warning.code == "scale-implausible"
-    assert "times as large as a head" in warning.message
+    assert "times as large as a head" in warning.text
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])

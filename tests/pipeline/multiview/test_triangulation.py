@@ -109,7 +109,7 @@ def test_a_view_that_contradicts_the_others_is_left_out() -> None:
     np.testing.assert_allclose(located.points["pronasale"].position_world, truth, atol=1e-5)
     assert "right" not in located.points["pronasale"].residuals_px
     assert len(located.remarks) == 1
-    assert "pronasale in right" in located.remarks[0]
+    assert "pronasale in right" in located.remarks[0].text
 
 
 def test_two_views_that_contradict_each_other_lose_the_point() -> None:
@@ -117,7 +117,7 @@ def test_two_views_that_contradict_each_other_lose_the_point() -> None:
     pixels["front"] = pixels["front"] + (0.0, 60.0)  # off the epipolar line
     located = locate_features({"pronasale": pixels, "gnathion": {"left": pixels["left"]}}, RIG, noise_px=1.5)
     assert not located.points
-    assert [remark.split()[1] for remark in located.remarks] == ["pronasale", "gnathion"]
+    assert [remark.text.split()[1] for remark in located.remarks] == ["pronasale", "gnathion"]
 
 
 def many(count: int, noise_px: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

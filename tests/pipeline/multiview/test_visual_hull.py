@@ -91,8 +91,8 @@ def test_good_views_agree_and_planted_faults_are_told(rig: Rig, traced: dict[str
     judged = judge_agreement(
         silhouettes | {"cam02": silhouette_from_mask(more), "cam06": silhouette_from_mask(less)}, rig, settings
     )
-    assert "other cameras see nothing" in judged["cam02"].quality.warnings[0]
-    assert "lacks" in judged["cam06"].quality.warnings[0]
+    assert "other cameras see nothing" in judged["cam02"].quality.warnings[0].text
+    assert "lacks" in judged["cam06"].quality.warnings[0].text
     assert not judged["cam06"].quality.usable
     fine = [judged[name] for name in rig.names if name not in ("cam02", "cam06")]
     assert all(silhouette.quality.usable for silhouette in fine)

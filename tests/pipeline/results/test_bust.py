@@ -27,6 +27,7 @@ from rig.colour_space import srgb_from_linear
 from rig.errors import InputError
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from rig.messages.message import verbatim
 from rig.render.renderer import Renderer
 from tests.support.ellipsoid_depths import Ellipsoid, look, pinhole_fan, scene
 from tests.support.made_up_results import made_up_result
@@ -55,7 +56,7 @@ def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     nothing = SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
     bias = WindowBias()
     depth = Depth(made.maps, images, None, nothing, points_on_face(nothing, head, np.zeros(0, bool)), bias)
-    refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", "planted"))
+    refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
     bust = fuse_bust(context, Views(capture, made.silhouettes, {}), depth, refined, capture).product
     assert bust is not None
     return bust, capture, made.silhouettes

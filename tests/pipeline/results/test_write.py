@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.diagnostics import ReportWarning
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.measurements import Landmark, Measurement
 from pipeline.fitting.fit import Fit
@@ -23,6 +22,7 @@ from rig.formats.images import read_image
 from rig.formats.mesh_file import read_mesh
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from tests.support.made_up_results import made_up_result
 from tests.support.scenes import ellipsoid, fan, pattern
 from tests.support.shared_data import shared
@@ -63,7 +63,7 @@ def scene() -> tuple[Reconstruction, Capture]:
         front="cam03",
         settings=Settings(outputs=OutputSettings(obj=True)),
         seconds={"segmentation": 0.5, "fitting": 1.5},
-        warnings=(ReportWarning("view_left_out", "cam03 is left out"),),
+        warnings=(compose("view-left-out", remark="cam03: left out"),),
     )
     return result, Capture({name: image[:, :, :3].copy() for name, image in images.items()})
 
@@ -159,7 +159,13 @@ def test_report_has_every_key_of_the_contract_and_only_json_numbers(folder: Path
     assert report["cameras"]["cam03"]["view"]["contrast"] is None
     assert report["seconds"] == {"total": 2.0, "segmentation": 0.5, "fitting": 1.5}
     assert report["texture"]["filled"] == 5
-    assert report["warnings"] == [{"code": "view_left_out", "message": "cam03 is left out"}]
+    assert report["warnings"] == [
+        {
+            "code": "view-left-out",
+            "message": "cam03: left out",
+            "parameters": {"remark": "cam03: left out"},
+        }
+    ]
     assert report["landmarks"]["pronasale"] == {"position": [1.0, 2.0, 3.0], "std": [0.1, 0.2, 0.3]}
     assert report["measurements"]["nose_length"] == {"value": 52.0, "std": None}
 

@@ -58,7 +58,7 @@ def test_an_exchange_is_named_and_filed_back(half_size_shot, planted, code):
     for landmark, views in half_size_shot.capture.features.items():
         assert found.capture.features[landmark].keys() == views.keys()
     assert [warning.code for warning in found.warnings] == [code]
-    assert "cam04 and cam06 hold each other's" in found.warnings[0].message
+    assert "cam04 and cam06 hold each other's" in found.warnings[0].text
 
 
 def test_an_exchange_is_refused_where_the_settings_say_so(half_size_shot):
@@ -78,7 +78,7 @@ def test_a_duplicated_picture_is_left_to_its_own_camera(half_size_shot):
     found = judged(half_size_shot, copied)
     (warning,) = found.warnings
     assert warning.code == "picture-duplicated"
-    assert warning.message.startswith("cam08 holds the same picture as cam07")
+    assert warning.text.startswith("cam08 holds the same picture as cam07")
     assert [name for name, s in found.silhouettes.items() if not s.quality.usable] == ["cam08"]
 
 

@@ -20,6 +20,7 @@ from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.capture_folder import read_capture
 from rig.formats.images import read_image
+from rig.messages.message import texts_of
 from rig.rig import Rig
 from tests.support.composites import Scene, compose
 from tests.support.noisy_captures import noisier
@@ -117,7 +118,7 @@ def test_nobody_there_is_reported() -> None:
     plates, later = (compose(Scene(seed=seed))[1] for seed in (0, 5))
     silhouette = segment_view(later[0], plates, SETTINGS)
     assert not silhouette.quality.usable
-    assert "no subject" in silhouette.quality.warnings[0]
+    assert "no subject" in silhouette.quality.warnings[0].text
     assert np.isfinite(silhouette.distance).all()
 
 
@@ -186,7 +187,7 @@ def test_a_fault_in_one_view_is_named_by_the_others(
     capture, rig = scan
     edited = edit(capture.images[name], capture.backgrounds[name][0], true_mask(name))
     silhouettes = segment(replace(capture, images={**capture.images, name: edited}), rig, SETTINGS, report=quiet)
-    said = " ".join(silhouettes[name].quality.warnings)
+    said = " ".join(texts_of(silhouettes[name].quality.warnings))
     assert any(part in said for part in word.split("|")), said
     mask = true_mask(name)
     iou = np.count_nonzero(silhouettes[name].mask & mask) / np.count_nonzero(silhouettes[name].mask | mask)

@@ -12,8 +12,9 @@ from pipeline.multiview.head_size import WrongScale
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.segment import _mask_quality
 from pipeline.silhouettes.usable_views import TooFewViews, UsableViews, usable_views
-from rig.capture import Capture, Remark
+from rig.capture import Capture
 from rig.geometry import RigidTransform, rotation_from_vector
+from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -38,9 +39,9 @@ def judged(rig: Rig, silhouettes: dict[str, Silhouette], capture: Capture | None
 
 def test_good_views_all_take_part_and_remarks_of_the_reader_are_passed_on(seen: Seen) -> None:
     rig, silhouettes = seen
-    found = judged(rig, silhouettes, Capture({}, remarks=(Remark("unknown-key", "the key x is not read"),)))
+    found = judged(rig, silhouettes, Capture({}, remarks=(compose("unknown-key", remark="the key x is not read"),)))
     assert all(silhouette.quality.usable for silhouette in found.silhouettes.values())
-    assert [(warning.code, warning.message) for warning in found.warnings] == [("unknown-key", "the key x is not read")]
+    assert [(warning.code, warning.text) for warning in found.warnings] == [("unknown-key", "the key x is not read")]
 
 
 def test_a_camera_that_was_turned_takes_no_part(seen: Seen) -> None:
@@ -97,7 +98,7 @@ def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
             mask = np.roll(bust, -40, axis=0) if cut else bust
             mask[-40:] |= cut & bust[-1]
             quality = _mask_quality(np.ascontiguousarray(np.rot90(mask, turns)), settings)
-            assert [text for text in quality.warnings if "cut off" in text] == (
+            assert [told.text for told in quality.warnings if "cut off" in told.text] == (
                 [f"the head is cut off at the {side} of the image: move the camera back or "
                  f"{'tilt it up' if side == 'top' else 'turn it'}"] if cut else []
             )  # fmt: skip

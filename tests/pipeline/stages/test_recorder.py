@@ -4,18 +4,18 @@ import time
 
 import pytest
 
-from pipeline.diagnostics import ReportWarning
 from pipeline.eigenheads.model import load_model
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Recorder, Staged, stage
 from rig.capture import Capture
 from rig.errors import Cancelled
+from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from tests.support.scenes import fan
 
 PAUSE_S = 0.02
-DIM = ReportWarning("view", "cam00: dim")
+DIM = compose("view", remark="cam00: dim")
 
 
 @stage("measure")

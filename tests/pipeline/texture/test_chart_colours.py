@@ -76,7 +76,7 @@ def test_without_a_chart_there_is_a_warning() -> None:
     colours, warnings = chart_colours(Capture(images={}, backgrounds={"cam05": (grey(1),)}), default_layout())
     assert colours is None
     assert [warning.code for warning in warnings] == ["no-chart"]
-    assert warnings[0].message.startswith("no clean plate shows a ColorChecker Classic")
+    assert warnings[0].text.startswith("no clean plate shows a ColorChecker Classic")
 
 
 def test_light_is_levelled_to_what_falls_on_the_chart() -> None:

@@ -164,7 +164,7 @@ def test_a_strongly_different_exposure_is_named() -> None:
     gains[2] = 0.4
     warnings = colour(shoot(gains)).warnings
     assert [w.code for w in warnings] == ["camera-gain"]
-    assert "cam02" in warnings[0].message
+    assert "cam02" in warnings[0].text
 
 
 def test_sharpening_takes_back_blur_where_there_is_detail_and_lifts_no_noise() -> None:

@@ -8,8 +8,10 @@ import pytest
 
 from rig.acquisition.plates import VERSIONS_MOST, keep_plates, plates_versions, read_plates, use_plates, write_plates
 from rig.errors import InputError
+from rig.messages.message import verbatim
 
 CAMERAS = ("cam00", "cam01")
+SOMEBODY = verbatim("cam00: occupied: somebody")
 
 
 def pictures(value: int) -> dict[str, tuple[np.ndarray, ...]]:
@@ -45,9 +47,9 @@ def test_plates_that_were_replaced_are_put_back(tmp_path: Path) -> None:
 def test_refused_plates_are_kept_beside_those_in_use(tmp_path: Path) -> None:
     folder = tmp_path / "plates"
     write_plates(folder, pictures(10))
-    version = keep_plates(folder, pictures(30), ("cam00: occupied: somebody",))
+    version = keep_plates(folder, pictures(30), (SOMEBODY,))
     assert value_in_use(folder) == 10
-    assert plates_versions(folder)[0].refused == ("cam00: occupied: somebody",)
+    assert plates_versions(folder)[0].refused == (SOMEBODY,)
     use_plates(folder, version, CAMERAS)
     assert value_in_use(folder) == 30
 
@@ -66,7 +68,7 @@ def test_refused_versions_are_let_go_and_so_is_what_a_crash_left(tmp_path: Path)
     left.mkdir(parents=True)
     os.utime(left, (0.0, 0.0))
     for value in range(VERSIONS_MOST + 3):
-        keep_plates(folder, pictures(value), ("cam00: occupied: somebody",))
+        keep_plates(folder, pictures(value), (SOMEBODY,))
     assert not left.exists()
     assert len(list(left.parent.iterdir())) == VERSIONS_MOST
     assert value_in_use(folder) == 10

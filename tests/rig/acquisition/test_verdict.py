@@ -6,6 +6,7 @@ import pytest
 from rig.acquisition.shot import FAULTS, REMEDIES, Fault
 from rig.acquisition.verdict import check_view, verdict_of, view_faults
 from rig.formats.rig_toml import ShotConfig
+from rig.messages.message import verbatim
 from tests.support.textured_studio import NAMES, FlatStudio
 
 EMPTY, SEATED = FlatStudio(False, 640, 480), FlatStudio(True, 640, 480)
@@ -31,7 +32,7 @@ def test_every_fault_has_a_remedy() -> None:
 def test_the_verdict_follows_from_the_cameras_without_a_fault(
     faulty: list[str | None], cameras: int, verdict: str
 ) -> None:
-    assert verdict_of([Fault("moved", camera, "") for camera in faulty], NAMES[:cameras]) == verdict
+    assert verdict_of([Fault("moved", camera, verbatim("")) for camera in faulty], NAMES[:cameras]) == verdict
 
 
 def test_who_is_not_in_the_picture_is_named() -> None:

@@ -157,7 +157,7 @@ def test_a_camera_that_is_not_there(driver: str, identity: str, tmp_path: Path) 
 
 def test_settings_that_cannot_be_met_are_said(studio: StudioDevices) -> None:
     camera = CameraConfig(name="cam00", driver="opencv", identity=studio.streams.url("cam00"), exposure_ms=5.0)
-    assert "exposure_ms" in driver_for(camera, Path()).configure()[0]
+    assert "exposure_ms" in driver_for(camera, Path()).configure()[0].text
 
 
 def test_a_missing_vendor_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:

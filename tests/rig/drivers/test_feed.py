@@ -16,6 +16,7 @@ from rig.drivers.feed import CameraFeed
 from rig.drivers.registry import driver_for
 from rig.drivers.simulated import SimulatedDriver
 from rig.formats.rig_toml import CameraConfig
+from rig.messages.message import Message, verbatim
 from tests.support.textured_studio import FlatStudio
 
 
@@ -29,9 +30,9 @@ class HangingDriver:
 
     def open(self, timeout_s: float) -> None:
         self.let_go.wait()
-        raise DriverError("cam01", "let go")
+        raise DriverError("cam01", verbatim("let go"))
 
-    def configure(self) -> tuple[str, ...]:
+    def configure(self) -> tuple[Message, ...]:
         return ()
 
     def grab(self, timeout_s: float) -> Arrival:
@@ -71,7 +72,7 @@ def test_a_hanging_camera_does_not_hold_the_others() -> None:
     assert not feeds[0].close(time.monotonic() + 0.1)
     hanging.let_go.set()
     assert feeds[0].close(time.monotonic() + 1.0)
-    assert feeds[0].state().error == "cam01: let go"
+    assert str(feeds[0].state().error) == "cam01: let go"
 
 
 def test_a_camera_that_comes_back_is_opened_again(recorded: Path, tmp_path: Path) -> None:
@@ -80,7 +81,7 @@ def test_a_camera_that_comes_back_is_opened_again(recorded: Path, tmp_path: Path
     feed.start()
     try:
         assert not feed.wait_opened(time.monotonic() + 1.0)
-        assert "no camera 'later'" in (feed.state().error or "")
+        assert "no camera 'later'" in str(feed.state().error)
         shutil.copytree(recorded, tmp_path / "later")
         deadline_s = time.monotonic() + 5.0
         while not feed.state().opened and time.monotonic() < deadline_s:

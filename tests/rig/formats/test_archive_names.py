@@ -12,6 +12,7 @@ import pytest
 
 from rig.errors import InputError
 from rig.formats.archive import extract_archive, is_archive
+from rig.messages.message import texts_of
 from tests.rig.formats.test_archive import tar_of, zip_of
 
 FOLDERS = {
@@ -60,7 +61,7 @@ def refused(data: bytes, folder: Path) -> tuple[str, ...]:
     with pytest.raises(InputError) as caught:
         unpacked(data, folder)
     assert list((folder / "out").iterdir()) == []
-    return caught.value.faults
+    return tuple(texts_of(caught.value.faults))
 
 
 def packed(kind: str, names: list[str]) -> bytes:

@@ -11,6 +11,7 @@ import pytest
 from rig.errors import InputError
 from rig.formats import archive as rules
 from rig.formats.archive import ArchiveLimits, extract_archive
+from rig.messages.message import texts_of
 from tests.rig.formats.test_archive import encrypted_zip, overlapping_zip, tar_entry, tar_of, zip_entry, zip_of
 
 LIMITS = ArchiveLimits()
@@ -21,7 +22,7 @@ def refused(data: bytes, folder: Path, limits: ArchiveLimits = LIMITS) -> tuple[
     with pytest.raises(InputError) as caught:
         extract_archive(folder / "upload", folder / "out", limits)
     assert caught.value.subject == "archive"
-    return caught.value.faults
+    return tuple(texts_of(caught.value.faults))
 
 
 def unpacked(data: bytes, folder: Path, limits: ArchiveLimits = LIMITS) -> tuple[str, ...]:
@@ -146,7 +147,7 @@ def test_it_unpacks_into_a_folder_that_is_there_or_is_not_yet(tmp_path: Path) ->
     with pytest.raises(InputError) as caught:
         extract_archive(tmp_path / "upload", tmp_path / "one" / "two")
     assert caught.value.subject == "two"
-    assert caught.value.faults == ("is not empty; an archive is unpacked into a folder of its own",)
+    assert texts_of(caught.value.faults) == ["is not empty; an archive is unpacked into a folder of its own"]
 
 
 def test_what_was_written_before_a_fault_is_removed_with_its_folders(tmp_path: Path) -> None:

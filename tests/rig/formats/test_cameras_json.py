@@ -123,7 +123,7 @@ def test_a_fault_is_named(path: str, value: Any, words: str) -> None:
     with pytest.raises(InputError) as caught:
         rig_from_document(fault(path, value))
     assert len(caught.value.faults) == 1
-    assert words in caught.value.faults[0]
+    assert words in caught.value.faults[0].text
     assert len(str(caught.value)) < 400
 
 

@@ -17,6 +17,7 @@ from rig.formats.capture_folder import capture_root, read_capture, size_fault, w
 from rig.formats.features_json import features_from_bytes
 from rig.formats.images import read_image, write_image
 from rig.geometry import look_at
+from rig.messages.message import texts_of
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from tests.support.shared_data import shared
@@ -177,7 +178,7 @@ def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str
     with pytest.raises(InputError) as caught:
         read_capture(folder)
     assert len(caught.value.faults) == 1
-    assert words in caught.value.faults[0]
+    assert words in caught.value.faults[0].text
 
 
 def test_names_that_are_all_others_are_one_fault(folder: Path) -> None:
@@ -187,9 +188,9 @@ def test_names_that_are_all_others_are_one_fault(folder: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_capture(folder)
     (fault,) = caught.value.faults
-    assert fault.startswith("no camera has a picture in images/: ")
-    assert f"{names[0]} to {names[-1]}" in fault
-    assert "IMG_0000.png to IMG_" in fault
+    assert fault.text.startswith("no camera has a picture in images/: ")
+    assert f"{names[0]} to {names[-1]}" in fault.text
+    assert "IMG_0000.png to IMG_" in fault.text
 
 
 def test_a_plate_and_a_folder_of_plates_go_together(folder: Path) -> None:
@@ -225,7 +226,7 @@ def test_two_spellings_of_one_name_are_no_guess(folder: Path) -> None:
     (folder / "features.json").unlink()
     with pytest.raises(InputError) as caught:
         read_capture(folder)
-    assert any("images/A.png is missing" in fault for fault in caught.value.faults)
+    assert any("images/A.png is missing" in fault.text for fault in caught.value.faults)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +236,7 @@ def test_a_folder_that_nobody_would_read_is_named(folder: Path, called: str, mea
     (folder / meant).rename(folder / called)
     with pytest.raises(InputError) as caught:
         read_capture(folder)
-    assert caught.value.faults == (f"{called}/ is not read: call it {meant}/",)
+    assert texts_of(caught.value.faults) == [f"{called}/ is not read: call it {meant}/"]
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def test_inverted_masks_are_turned_and_told(folder: Path, names: str, words: str
         np.testing.assert_array_equal(capture.masks[name], BUST)
     (remark,) = capture.remarks
     assert remark.code == "mask-inverted"
-    assert words in remark.message
+    assert words in remark.text
 
 
 def test_soft_masks_keep_their_greys_and_are_written_with_them(folder: Path, tmp_path: Path) -> None:
@@ -55,4 +55,4 @@ def test_what_is_true_of_all_masks_is_said_once(folder: Path) -> None:
     with pytest.raises(InputError) as refused:
         read_capture(folder)
     (fault,) = refused.value.faults
-    assert fault.startswith("each of the 3 masks masks/a.png to masks/c.png holds areas of")
+    assert fault.text.startswith("each of the 3 masks masks/a.png to masks/c.png holds areas of")

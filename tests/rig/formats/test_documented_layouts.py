@@ -12,6 +12,7 @@ from rig.camera import Distortion
 from rig.errors import InputError
 from rig.formats.cameras_file import read_rig_file, write_rig_file
 from rig.formats.images import write_image
+from rig.messages.message import texts_of
 from rig.rig import Rig
 from tests.rig.formats.test_other_cameras import POINTS, fan
 
@@ -89,8 +90,8 @@ def test_realitycapture_sidecars_project_by_their_article(tmp_path: Path) -> Non
     (tmp_path / "v2.xmp").write_text(XMP.replace("brown3", "division"))
     with pytest.raises(InputError) as refused:
         read_rig_file(tmp_path / "v0.xmp")
-    assert {"v1: its picture is wanted" in fault for fault in refused.value.faults} == {True, False}
-    assert any("'division'" in fault for fault in refused.value.faults)
+    assert {"v1: its picture is wanted" in fault.text for fault in refused.value.faults} == {True, False}
+    assert any("'division'" in fault.text for fault in refused.value.faults)
 
 
 def test_a_heading_turns_clockwise_and_zero_looks_down(tmp_path: Path) -> None:
@@ -124,7 +125,7 @@ def test_blender_frames_tell_an_angle_and_no_size(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError) as refused:
         read_rig_file(tmp_path / "transforms.json")
-    told = " ".join(refused.value.faults)
+    told = " ".join(texts_of(refused.value.faults))
     for fault in ("r_0.fl_x is '9'", "r_0.k4", "r_1 has neither fl_x nor camera_angle_x"):
         assert fault in told
 

@@ -306,7 +306,7 @@ def test_each_key_is_treated_as_its_row_says(kind: str, key: str, tmp_path: Path
         return
     read = read_cameras(path)
     assert signature(read) == before
-    told = [remark for remark in read.remarks if word in remark.message]
+    told = [remark for remark in read.remarks if word in remark.text]
     assert bool(told) == (rule.treatment == "told")
     assert len(read.remarks) == len(told)
 
@@ -318,7 +318,7 @@ def test_a_key_that_the_table_does_not_have_is_told_once(kind: str, key: str, tm
     PLANTS[kind](path, name, 1)
     (remark,) = read_cameras(path).remarks
     assert remark.code == "unknown-key"
-    assert key in remark.message
+    assert key in remark.text
 
 
 def test_the_page_shows_the_table() -> None:
@@ -394,7 +394,7 @@ def test_a_camera_that_is_switched_off_takes_no_part_and_is_told(word: str, tmp_
     assert read.rig.names == ("cam00", "cam02", "cam04")
     (remark,) = read.remarks
     assert remark.code == "view-left-out"
-    assert remark.message.startswith('cam01, cam03 switched off (enabled="false") in cameras.xml')
+    assert remark.text.startswith('cam01, cam03 switched off (enabled="false") in cameras.xml')
     with pytest.raises(InputError, match="enabled is 'perhaps', wanted true or false"):
         read_cameras(metashape(tmp_path, ('label="cam01">', 'label="cam01" enabled="perhaps">')))
 
@@ -402,7 +402,7 @@ def test_a_camera_that_is_switched_off_takes_no_part_and_is_told(word: str, tmp_
 def test_cameras_that_are_not_aligned_are_told(tmp_path: Path) -> None:
     read = read_cameras(metashape(tmp_path, (r'(label="cam02">)\s*<transform>[^<]*</transform>', r"\1")))
     assert list(read.left_out) == ["cam02"]
-    assert "cam02 not aligned in cameras.xml" in read.remarks[0].message
+    assert "cam02 not aligned in cameras.xml" in read.remarks[0].text
 
 
 def test_a_dot_in_a_label_belongs_to_the_name(tmp_path: Path) -> None:
@@ -424,7 +424,7 @@ def test_slaves_of_a_rig_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         read_cameras(metashape(tmp_path, (r'<sensor id="([1-9])"', r'<sensor id="\1" master_id="0"')))
     (fault,) = refused.value.faults
-    assert "4 cameras (cam01, cam02, cam03, cam04): sensor@master_id is '0': slave of another sensor" in fault
+    assert "4 cameras (cam01, cam02, cam03, cam04): sensor@master_id is '0': slave of another sensor" in fault.text
     read_cameras(metashape(tmp_path, (r'<sensor id="([1-9])"', r'<sensor id="\1" master_id="\1"')))  # their own
 
 

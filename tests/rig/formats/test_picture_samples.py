@@ -60,4 +60,4 @@ def test_a_capture_of_10_or_12_bits_in_16_is_read_as_one_of_8(tmp_path: Path, sh
         np.testing.assert_array_equal(again.backgrounds[name][0], plain.backgrounds[name][0])
     (remark,) = again.remarks
     assert remark.code == "picture-levels"
-    assert f"is above {2 ** (8 + shift) - 1} of 65535" in remark.message
+    assert f"is above {2 ** (8 + shift) - 1} of 65535" in remark.text

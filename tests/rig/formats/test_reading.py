@@ -5,6 +5,7 @@ import pytest
 from rig.errors import InputError
 from rig.formats.foreign_keys import ForeignKey
 from rig.formats.reading import Reading, listed, say_once, shown
+from rig.messages.message import texts_of
 
 TABLE = {
     "shutter": ForeignKey("refused", "calibrate without it", (0,)),
@@ -20,18 +21,18 @@ def test_a_long_value_keeps_its_quotation_marks(text: str) -> None:
 
 def test_faults_that_differ_in_more_than_names_are_all_said() -> None:
     faults = ["images/cam00.png is black", "images/cam01.png is black", "images/cam02.png is 7 wide"]
-    assert say_once(faults, ["cam00", "cam01", "cam02"]) == faults
-    assert say_once(["a", "b", "c"], []) == ["a", "b", "c"]
+    assert texts_of(say_once(faults, ["cam00", "cam01", "cam02"])) == faults
+    assert texts_of(say_once(["a", "b", "c"], [])) == ["a", "b", "c"]
 
 
 def test_many_files_with_one_fault_are_one_sentence() -> None:
     names = [f"cam{i:02}" for i in range(11)]
-    (told,) = say_once([f"images/{name}.png is missing" for name in names], names)
+    (told,) = texts_of(say_once([f"images/{name}.png is missing" for name in names], names))
     assert told == ("images/cam00.png is missing; the same is true of 10 more (cam01, cam02, cam03, cam04 and 6 more)")
     plates = [f"background/{name}/{i:03}.png is 3 x 4 pixels" for name in names for i in range(2)]
-    (told,) = say_once(plates, names)
+    (told,) = texts_of(say_once(plates, names))
     assert "the same is true of 21 more (" in told
-    assert say_once(["cam1 is a", "cam11 is a", "cam111 is a"], ["cam1", "cam11"])[0].startswith("cam1 is a")
+    assert say_once(["cam1 is a", "cam11 is a", "cam111 is a"], ["cam1", "cam11"])[0].text.startswith("cam1 is a")
 
 
 def test_what_cameras_have_alike_is_said_once() -> None:
@@ -40,7 +41,7 @@ def test_what_cameras_have_alike_is_said_once() -> None:
         reading.judge(TABLE, {"shutter": [0, 0.1], "mask": "m.png", "other": 1}, name)
     with pytest.raises(InputError) as refused:
         reading.finish([])
-    assert refused.value.faults == (
+    assert tuple(texts_of(refused.value.faults)) == (
         "3 cameras (a, b, c): shutter is [0, 0.1]: calibrate without it",
         "0 cameras; between 3 and 64 work",
     )

@@ -17,6 +17,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import document_from_rig, rig_from_document
 from rig.formats.features_json import features_from_document
 from rig.geometry import RigidTransform
+from rig.messages.message import texts_of
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 
@@ -87,7 +88,7 @@ def faults_of_cameras(document: Any) -> list[str]:
     try:
         rig_from_document(document)
     except InputError as error:
-        return list(error.faults)
+        return texts_of(error.faults)
     return []
 
 

@@ -13,6 +13,7 @@ from rig.formats.archive import ArchiveLimits, pack_folder
 from rig.formats.cameras_json import read_rig, write_rig
 from rig.formats.capture_folder import read_capture
 from rig.formats.serials import BODY_SERIAL, DNG_SERIAL, EXIF_IFD, camera_serial, with_serials
+from rig.messages.message import texts_of
 from server.cli.check import checked
 from server.tasks.child import Bench
 from server.tasks.ingest import ingest_archive
@@ -98,7 +99,7 @@ def test_what_cannot_be_filed_is_named(tmp_path: Path) -> None:
     photograph(folder / "background" / "IMG_6998.jpg", "999")
     with pytest.raises(InputError) as refused:
         read_capture(folder)
-    faults = "; ".join(refused.value.faults)
+    faults = "; ".join(texts_of(refused.value.faults))
     for words in (
         "images/IMG_6999.jpg is no camera's name, and its EXIF has no serial number: name it after its camera",
         "images/IMG_7000.jpg and IMG_6998.jpg were both taken by the body 0007 (cam00): leave one",

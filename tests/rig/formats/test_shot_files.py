@@ -16,6 +16,7 @@ from rig.formats.cameras_file import write_rig_file
 from rig.formats.capture_folder import capture_root, read_capture, write_capture
 from rig.formats.shot_files import find_files
 from rig.geometry import look_at
+from rig.messages.message import texts_of
 from rig.rig import Rig
 
 HEIGHT, WIDTH, COUNT = 48, 64, 5
@@ -118,7 +119,7 @@ def only_fault(folder: Path) -> str:
     with pytest.raises(InputError) as caught:
         read_capture(folder)
     (fault,) = caught.value.faults
-    return fault
+    return fault.text
 
 
 def test_two_shots_in_one_folder_are_one_sentence(folder: Path) -> None:
@@ -154,7 +155,7 @@ def test_what_may_be_what_is_missing_is_told_beside_it(folder: Path) -> None:
     (folder / "masks" / "cam03.png").rename(folder / "masks" / "kam03.png")
     with pytest.raises(InputError) as caught:
         read_capture(folder)
-    assert caught.value.faults == (
+    assert tuple(texts_of(caught.value.faults)) == (
         "background/cam03.png is missing: a clean plate, or masks/cam03.png, is needed",
         "masks/kam03.png has no camera: the rig has cam00, cam01, cam02, cam03, cam04",
     )
@@ -167,13 +168,13 @@ def test_strays_beside_what_is_used_are_told(kind: str, folder: Path) -> None:
     capture, _ = read_capture(folder)
     (remark,) = capture.remarks
     assert remark.code == "file-unread"
-    assert remark.message.startswith(f"{kind}/DSC_100.png, ")
-    assert "and 1 more have no camera: the rig has cam00, cam01, cam02, cam03, cam04" in remark.message
+    assert remark.text.startswith(f"{kind}/DSC_100.png, ")
+    assert "and 1 more have no camera: the rig has cam00, cam01, cam02, cam03, cam04" in remark.text
 
 
 def test_pictures_of_cameras_that_the_file_lacks_are_told(folder: Path) -> None:
     write_rig_file(rig_of().subset(["cam00", "cam02", "cam04"]), folder / "cameras.json", "eigenhead")
-    messages = [remark.message for remark in read_capture(folder)[0].remarks]
+    messages = [remark.text for remark in read_capture(folder)[0].remarks]
     assert len(messages) == 1
     assert "images/cam01.png, images/cam03.png, masks/cam01.png" in messages[0]
 
@@ -211,13 +212,13 @@ def test_pictures_that_are_not_read_are_called_what_they_are(ending: str, kind: 
 def test_a_file_of_another_kind_beside_pictures_is_told(folder: Path) -> None:
     (folder / "images" / "cam00.exr").write_bytes(b"v/1")
     (remark,) = read_capture(folder)[0].remarks
-    assert remark.message.startswith("images/cam00.exr has no camera")
+    assert remark.text.startswith("images/cam00.exr has no camera")
 
 
 def test_a_folder_of_pictures_that_nobody_reads_is_told(folder: Path) -> None:
     shutil.copytree(folder / "images", folder / "depth")
     (remark,) = read_capture(folder)[0].remarks
-    assert remark.message == "depth/ is not read: pictures lie in images/, masks/ and background/"
+    assert remark.text == "depth/ is not read: pictures lie in images/, masks/ and background/"
 
 
 @pytest.mark.parametrize("around", ["anna", "anna/anna", "anna/2024/shot"])
@@ -235,7 +236,7 @@ def test_colmap_models_that_are_not_read_are_told(folder: Path) -> None:
     write_rig_file(rig_of(), folder / "sparse/0", "colmap")
     write_rig_file(rig_of(), folder / "sparse/0", "colmap-text")
     write_rig_file(rig_of(3), folder / "sparse/1", "colmap-text")
-    told = [remark.message for remark in read_capture(folder)[0].remarks]
+    told = [remark.text for remark in read_capture(folder)[0].remarks]
     assert told == [
         "sparse/0/cameras.txt is not read: the cameras come from sparse/0/cameras.bin",
         "sparse/1/cameras.txt is not read: the cameras come from sparse/0/cameras.bin",
@@ -248,8 +249,10 @@ def test_one_size_that_is_wrong_everywhere_is_one_sentence(folder: Path) -> None
     write_rig_file(larger, folder / "cameras.json", "eigenhead")
     with pytest.raises(InputError) as caught:
         read_capture(folder)
-    assert len([fault for fault in caught.value.faults if "pixels, but its camera is" in fault]) <= 3  # one a folder
-    assert any("the same is true of 4 more (" in fault for fault in caught.value.faults)
+    assert (
+        len([fault for fault in caught.value.faults if "pixels, but its camera is" in fault.text]) <= 3
+    )  # one a folder
+    assert any("the same is true of 4 more (" in fault.text for fault in caught.value.faults)
 
 
 def test_files_are_found_without_reading_one(folder: Path) -> None:

@@ -58,7 +58,7 @@ def test_a_capture_with_such_a_key_is_read_and_says_so(tmp_path: Path) -> None:
     path.write_text(json.dumps(document))
     assert len(read_rig(path)) == 3
     capture, _ = read_capture(folder)
-    assert [r for r in capture.remarks if r.code == "unknown-key" and "'cameras.covarianse' is not read" in r.message]
+    assert [r for r in capture.remarks if r.code == "unknown-key" and "'cameras.covarianse' is not read" in r.text]
 
 
 def test_each_lens_model_has_its_own_keys() -> None:

@@ -15,6 +15,7 @@ from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import write_capture
+from rig.messages.message import verbatim
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from server.cli.refine import refine_locally
@@ -75,10 +76,10 @@ def test_a_rejected_change_says_so_and_keeps_the_rig() -> None:
     residuals = Residuals(cameras, px)
     proposed = disturbed(TRUE, 0.1, np.random.default_rng(1))
     found = Refinement(
-        TRUE, proposed, residuals, replace(residuals, px=1.1 * px), 0.1, 0.11, 0.1, False, "no <better>",
+        TRUE, proposed, residuals, replace(residuals, px=1.1 * px), 0.1, 0.11, 0.1, False, verbatim("no <better>"),
         dict(zip(TRUE.names, image_distance(proposed, TRUE).tolist(), strict=True)),
     )  # fmt: skip
-    report = RefinementRun(found, TRUE, ("anna", "ben"), ("cam03 has moved",))
+    report = RefinementRun(found, TRUE, ("anna", "ben"), (verbatim("cam03 has moved"),))
     document = report.document()
     assert not document["kept"]
     assert document["rig"]["cameras"][0]["camera_from_world"]["translation"] == pytest.approx(

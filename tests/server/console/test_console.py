@@ -17,10 +17,11 @@ from rig.errors import InputError
 from rig.formats.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
+from rig.messages.message import verbatim
 from rig.rig import Rig
 from server.console import comparison, coverage, guides
 from server.console.identity import cookie_secret, is_foreign, is_rebound
-from server.console.live import message_of
+from server.console.live import look_bytes
 from server.console.live_frame import LiveFrame
 from server.console.mount import path_below
 from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
@@ -112,8 +113,11 @@ def test_a_cookie_secret_that_a_full_disk_left_empty_is_made_again(tmp_path: Pat
 def test_a_removal_waits_and_can_be_taken_back() -> None:
     removals, removed = Removals(wait_s=0.15), []
     for name in ("a", "b"):
-        removals.add(name, lambda name=name: removed.append(name), f"capture {name}", "capture")
-    assert {name: removal.title for name, removal in removals.waiting().items()} == {"a": "capture a", "b": "capture b"}
+        removals.add(name, lambda name=name: removed.append(name), verbatim(f"capture {name}"), "capture")
+    assert {name: removal.title.text for name, removal in removals.waiting().items()} == {
+        "a": "capture a",
+        "b": "capture b",
+    }
     assert removals.undo("a")
     assert not removals.undo("a")
     deadline = time.monotonic() + 5
@@ -130,7 +134,7 @@ def test_a_removal_that_fails_shows_the_thing_again() -> None:
         tried.set()
         raise Conflict("capture-in-use", "a job needs it")
 
-    removals.add("a", refuse, "capture a", "capture")
+    removals.add("a", refuse, verbatim("capture a"), "capture")
     assert tried.wait(5)
     deadline = time.monotonic() + 5
     while "a" in removals and time.monotonic() < deadline:
@@ -234,15 +238,15 @@ def test_coverage_names_the_next_thing_to_do() -> None:
     everywhere = [[x, y] for x in np.linspace(0.02, 0.98, 9) for y in np.linspace(0.02, 0.98, 7)]
     corner = [[0.1, 0.1], [0.12, 0.2], [0.2, 0.12]]
     lines = coverage.summary(["a", "b", "c"], [])
-    assert "Hold the board" in coverage.advice(lines)
+    assert "Hold the board" in coverage.advice(lines).text
     lines = coverage.summary(["a", "b", "c"], [{"a": everywhere, "b": corner, "c": []}])
     assert [line["covered"] for line in lines] == [1.0, round(1 / 12, 3), 0.0]
-    assert "c" in coverage.advice(lines)
+    assert coverage.advice(lines).parameters["cameras"] == ("c",)
     lines = coverage.summary(["a", "b"], [{"a": everywhere, "b": corner}] * 6)
     assert [line["enough"] for line in lines] == [True, False]
-    assert coverage.advice(lines).startswith("Least covered: b")
+    assert coverage.advice(lines).text.startswith("Least covered: b")
     lines = coverage.summary(["a"], [{"a": everywhere}] * 6)
-    assert coverage.advice(lines) == "Every camera is covered. Calibrate."
+    assert coverage.advice(lines).text == "Every camera is covered. Calibrate."
 
 
 def test_a_jobs_log_has_one_line_a_stage() -> None:
@@ -275,9 +279,9 @@ def test_the_captures_form_becomes_work() -> None:
 def test_a_look_on_the_wire_holds_every_picture() -> None:
     frames: list[LiveFrame] = [
         {"name": "a", "jpeg": b"abc", "mean": 1.0},
-        {"name": "b", "jpeg": None, "fault": "unplugged"},
+        {"name": "b", "jpeg": None, "fault": verbatim("unplugged").document()},
     ]
-    message = message_of(frames, "")
+    message = look_bytes(frames, None)
     header, body = struct.unpack(">II", message[:8])
     told = json.loads(message[8 : 8 + header])
     assert [(c["name"], c["bytes"]) for c in told["cameras"]] == [("a", 3), ("b", 0)]

@@ -47,7 +47,7 @@ class Door:
         with pytest.raises(Problem) as caught:
             self.ask(*args, **kwargs)
         told = caught.value
-        return told.status, told.kind, told.detail, dict(told.headers or {}).get("WWW-Authenticate", "")
+        return told.status, told.kind, told.detail.text, dict(told.headers or {}).get("WWW-Authenticate", "")
 
 
 @pytest.fixture

@@ -169,4 +169,5 @@ def test_a_failed_job_says_why_and_the_next_one_works(
     assert error is not None
     assert error["type"].endswith(kind)
     assert word in error["detail"]
+    assert error["detail_message"]["message"] == error["detail"]
     assert client.wait(client.submit(capture)["id"])["state"] == "succeeded"

@@ -11,7 +11,7 @@ from server.services.presets import PRESETS, Preset, settings_of
 @pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset.id or "standard")
 def test_no_preset_is_warned_of_as_an_old_setting(preset: Preset) -> None:
     _, warnings = find_layout(load_model(), settings_from_document(preset.settings))
-    assert [warning.message for warning in warnings] == []
+    assert [warning.text for warning in warnings] == []
 
 
 def test_renderers_get_the_formats_that_they_read() -> None:

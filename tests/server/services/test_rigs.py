@@ -15,6 +15,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import read_rig, write_rig
 from rig.formats.capture_folder import read_capture
 from rig.formats.rig_toml import CameraConfig, read_rig_config
+from rig.messages.message import texts_of
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from rig.studio.scene.layout import default_layout
 from server.errors import Conflict, NotFound, Unavailable
@@ -63,7 +64,7 @@ def test_a_calibration_put_to_use_goes_into_the_next_capture(
     write_rig(flat_rig(NAMES[:-1]), tmp_path / "fewer.json")
     with pytest.raises(Conflict) as refused:
         rig.use(tmp_path / "fewer.json")
-    assert refused.value.errors == [f"{NAMES[-1]}: only in one of the two"]
+    assert texts_of(refused.value.errors) == [f"{NAMES[-1]}: only in one of the two"]
     write_rig(flat_rig(NAMES), tmp_path / "cameras.json")
     rig.use(tmp_path / "cameras.json")
     rig.capture(tmp_path / "shot", seed=None)
@@ -133,7 +134,7 @@ def test_settings_reach_the_driver_and_are_kept(
     changed = rig.set_camera("cam03", {"exposure_ms": 8.0, "gain_db": 3.0})
     assert (told["cam03"].exposure_ms, told["cam03"].gain_db, told["cam04"].exposure_ms) == (8.0, 3.0, None)
     assert (changed.exposure_ms, changed.gain_db, changed.white_balance_k) == (8.0, 3.0, None)
-    assert [line.split()[0] for line in changed.unmet] == ["exposure_ms", "gain_db"]
+    assert [line.text.split()[0] for line in changed.unmet] == ["exposure_ms", "gain_db"]
     again = RealRig(studio.folder / "rig.toml", tmp_path / "rig" / "cameras.json")
     assert again.camera_settings("cam03").exposure_ms == 8.0
     assert rig.set_camera("cam03", {"exposure_ms": None}).exposure_ms is None

@@ -7,6 +7,7 @@ import pytest
 from pipeline.eigenheads.data_folder import DATA
 from pipeline.eigenheads.model_names import model_path
 from rig.errors import InputError
+from rig.messages.message import Message
 from server.services.work import Work
 from tests.support.template_headers import header_file
 
@@ -21,7 +22,7 @@ def _data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "models" / "other.npz").write_bytes(model_path("default").read_bytes() + b"\n")
 
 
-def asked(model: str | None = None, **settings: object) -> tuple[str, tuple[str, ...]]:
+def asked(model: str | None = None, **settings: object) -> tuple[str, tuple[Message, ...]]:
     with pytest.raises(InputError) as refused:
         Work(model, settings).check()
     return refused.value.subject, refused.value.faults
@@ -35,22 +36,22 @@ def test_what_can_be_done_is_not_refused() -> None:
 
 def test_a_template_that_there_is_not_or_that_another_model_carries_is_refused() -> None:
     subject, (told,) = asked(outputs={"template": "ict"})
-    assert (subject, "outputs.template: no template 'ict': known are damaged, flame" in told) == ("settings", True)
+    assert (subject, "outputs.template: no template 'ict': known are damaged, flame" in told.text) == ("settings", True)
     subject, (told,) = asked("other", outputs={"template": "flame"})
     assert subject == "settings"
-    assert "registered to the model 'makehuman-138', and the job's is 'other'" in told
+    assert "registered to the model 'makehuman-138', and the job's is 'other'" in told.text
     _, (told,) = asked(outputs={"template": "damaged"})
-    assert "Register it again" in told
+    assert "Register it again" in told.text
 
 
 def test_every_fault_is_named_at_once() -> None:
     subject, told = asked("nobody", metod="contour", outputs={"template": "ict", "formats": ["xyz"]})
     assert subject == "request"
     for part in ("model: 'nobody' is not at hand", "metod", "'xyz' is none of", "no template 'ict'"):
-        assert any(part in fault for fault in told), (part, told)
+        assert any(part in fault.text for fault in told), (part, told)
     assert len(told) == 4
     _, told = asked(outputs={"template": "../x"})
     assert len(told) == 1
-    assert "is no name" in told[0]
+    assert "is no name" in told[0].text
     _, told = asked(outputs={"template": 3})
     assert len(told) == 1

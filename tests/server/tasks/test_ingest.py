@@ -13,6 +13,7 @@ from rig.formats.cameras_file import write_rig_file
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture, write_capture
 from rig.formats.images import read_image, write_image
+from rig.messages.message import texts_of
 from server.storage.records import CaptureContent
 from server.tasks.child import Bench
 from server.tasks.ingest import check_capture, ingest_archive
@@ -35,7 +36,7 @@ def test_every_spoilt_capture_is_refused_with_its_fault(tmp_path: Path, case: st
     spoil(folder)
     with pytest.raises(InputError) as refusal:
         checked(folder)
-    assert word in " ".join(refusal.value.faults)
+    assert word in " ".join(texts_of(refusal.value.faults))
 
 
 def test_faults_of_cameras_files_and_features_are_told_at_once(tmp_path: Path) -> None:
@@ -45,7 +46,7 @@ def test_faults_of_cameras_files_and_features_are_told_at_once(tmp_path: Path) -
     with pytest.raises(InputError) as refusal:
         checked(folder)
     for word in ("at one place", "images/foo.png has no camera", "'third_eye' is no landmark"):
-        assert any(word in fault for fault in refusal.value.faults)
+        assert any(word in fault.text for fault in refusal.value.faults)
 
 
 def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
@@ -56,7 +57,7 @@ def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
     write_capture(tmp_path, Capture(images, {name: (empty(name, 0.0),) for name in NAMES}), flat_rig(NAMES))
     found = checked(tmp_path)
     assert [(fault.code, fault.camera) for fault in found.faults] == [("moved", "cam03")]
-    assert "calibrate again" in found.faults[0].remedy
+    assert "calibrate again" in found.faults[0].remedy.text
     assert found.checks["cam03"].get("background_moved_px") == pytest.approx(8.5, abs=0.3)
     outlined = {name for name, view in found.checks.items() if (view.get("subject") or {}).get("outline")}
     assert outlined >= set(NAMES) - {"cam03"}
@@ -142,8 +143,8 @@ def test_what_is_missing_everywhere_is_one_fault(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         checked(folder)
     (fault,) = refused.value.faults
-    assert fault.startswith("images/cam00.png is missing")
-    assert "the same is true of 11 more (" in fault
+    assert fault.text.startswith("images/cam00.png is missing")
+    assert "the same is true of 11 more (" in fault.text
 
 
 def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     assert order[-1] == "write"  # nothing is called done before its files are there
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert all(camera["used"] for camera in report["cameras"].values())
-    assert report["warnings"][0] == told
+    assert report["warnings"][0] == {**told, "parameters": {}}
     assert {warning["code"] for warning in report["warnings"][1:]} <= {"view"}
     face = shot.scene.head.vertices[shot.scene.photographed]
     away, _ = KDTree(read_mesh(tmp_path / "result" / "head.ply").vertices).query(face)

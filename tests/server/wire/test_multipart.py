@@ -11,6 +11,7 @@ import pytest
 from fastapi import Request
 
 from rig.errors import EigenheadError, InputError
+from rig.messages.message import texts_of
 from server.errors import DiskFull, TooLarge
 from server.services.service import Service
 from server.services.threads import Threads
@@ -134,7 +135,7 @@ def test_what_is_no_such_body_is_refused(
 ) -> None:
     with pytest.raises(Problem) as refused:
         received(tmp_path, data, content_type)
-    assert (refused.value.status, refused.value.kind, tuple(refused.value.errors)) == (status, kind, errors)
+    assert (refused.value.status, refused.value.kind, tuple(texts_of(refused.value.errors))) == (status, kind, errors)
     assert str(refused.value.detail).startswith(detail)
 
 
@@ -263,7 +264,7 @@ def test_each_field_that_a_form_does_not_have_is_named() -> None:
     check_fields(["label", "settings"], ("label", "settings"))
     with pytest.raises(InputError) as refused:
         check_fields(["settigns", "label", "webhook", ""], ("label", "settings"))
-    assert list(refused.value.faults) == [
+    assert texts_of(refused.value.faults) == [
         "unknown field 'settigns'; did you mean 'settings'?",
         "unknown field 'webhook'; there are file, label, settings",
         "unknown field ''; there are file, label, settings",
@@ -279,4 +280,4 @@ def test_calibration_pictures_from_elsewhere_are_refused(tmp_path: Path) -> None
     with pytest.raises(Problem, match=r"from is neither 'board' nor 'scene'\.") as refused:
         pictures_of(tmp_path, part("from", b"moon"))
     assert (refused.value.status, refused.value.kind) == (422, "invalid-request")
-    assert tuple(refused.value.errors) == ("from: 'moon'",)
+    assert texts_of(refused.value.errors) == ["from: 'moon'"]

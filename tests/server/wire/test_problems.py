@@ -10,7 +10,7 @@ from sqlalchemy.exc import DataError, OperationalError
 
 from rig.errors import EigenheadError, InputError
 from server.errors import Refused
-from server.services.jobs import JobFailed
+from server.services.failures import JobFailed
 from server.wire.problems import STATUS_OF, Problem, problem_from
 
 ROOT = Path(__file__).resolve().parents[3]

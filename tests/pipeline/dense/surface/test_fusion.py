@@ -134,7 +134,7 @@ def test_wrong_mask_of_one_view_cuts_nothing_that_others_see(ball: Scene) -> Non
     errors = np.abs(seen_errors(surface, ball))
     assert np.percentile(errors, 99) < 1.0
     assert errors.max() < 6.0  # a few vertices beside what the wrong mask leaves out, at the edge of what is seen
-    assert [(warning.code, warning.message[:5]) for warning in surface.warnings] == [("mask-contradicted", "cam03")]
+    assert [(warning.code, warning.text[:5]) for warning in surface.warnings] == [("mask-contradicted", "cam03")]
     assert surface.seen.sum() > 0.95 * fused(ball).seen.sum()
 
 

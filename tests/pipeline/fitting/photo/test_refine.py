@@ -83,7 +83,7 @@ def test_pictures_that_show_nothing_leave_the_fit_as_it_was(model: HeadModel, ki
     solved, detail = refine_with_photographs(start, images, SETTINGS)
     assert solved is start
     assert detail.level == "kernel"
-    assert "needed" in detail.reason
+    assert "needed" in detail.reason.text
 
 
 def test_a_camera_that_was_moved_does_not_move_the_surface(

@@ -25,7 +25,7 @@ def test_masks_of_the_studio_without_its_plates(renderer: Renderer) -> None:
         taken, _ = take(seed, renderer)
         bare = Capture(taken.capture.images)
         found = segment(bare, taken.rig, SegmentationSettings(), report=lambda *_: None)
-        told = " ".join(warning.message for warning in view_warnings(found))
+        told = " ".join(warning.text for warning in view_warnings(found))
         for name, silhouette in found.items():
             overlap.append(iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5))
             off.append(rms(silhouette, coverage(taken, name, RESOLUTION_PX)))

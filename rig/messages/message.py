@@ -1,0 +1,118 @@
+"""The one value of everything that the program tells somebody: warnings, faults, refusals, failures."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NotRequired, Protocol, TypedDict, Union, runtime_checkable
+
+from rig.messages.catalogue import CATALOGUE
+from rig.messages.templates import fields_of, render
+from rig.text import printable
+
+Parameter = Union[str, int, float, "Message", tuple[Any, ...]]  # a list is of parameters, too
+Raw = Union[str, int, float, "Scalar", "Message", Iterable[Any]]
+VERBATIM = "verbatim"  # the code of text that another program or an earlier version wrote
+
+
+@runtime_checkable
+class Scalar(Protocol):
+    """A number of NumPy, which this room does not load: a command line that only refuses something starts at once."""
+
+    @property
+    def dtype(self) -> Any: ...
+
+    def item(self) -> Any:
+        """The plain number."""
+        ...
+
+
+class MessageDocument(TypedDict):
+    """A message in JSON. Those of earlier versions have no parameters."""
+
+    code: str
+    message: str
+    parameters: NotRequired[dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """``code``: of the catalogue, stable, for programs; ``parameters``: by their names in its template; ``text``: the
+    English sentence."""
+
+    code: str
+    parameters: Mapping[str, Parameter]
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __hash__(self) -> int:
+        return hash((self.code, self.text))
+
+    def document(self) -> MessageDocument:
+        """Returns the message for JSON; what cannot be written as UTF-8 is escaped."""
+        parameters = {name: _document(value) for name, value in self.parameters.items()}
+        return {"code": self.code, "message": printable(self.text), "parameters": parameters}
+
+
+def compose(code: str, /, **parameters: Raw) -> Message:
+    """Makes the message of a code. Its parameters are exactly those that the template names."""
+    template, values = CATALOGUE[code], {name: _parameter(value) for name, value in parameters.items()}
+    assert values.keys() == fields_of(template).keys(), f"{code}: {sorted(values)} for {template!r}"
+    return Message(code, values, render(template, values))
+
+
+def verbatim(text: str) -> Message:
+    """Makes a message of text that has no code: another program's, or an earlier version's."""
+    return Message(VERBATIM, {"text": text}, text)
+
+
+def message_of(told: Message | str) -> Message:
+    """Returns the message; a text becomes a verbatim one."""
+    return told if isinstance(told, Message) else verbatim(told)
+
+
+def read_message(document: object) -> Message:
+    """Reads what ``Message.document`` wrote, and the texts and ``{code, message}`` of earlier versions. Raises
+    ValueError for anything else."""
+    if isinstance(document, str):
+        return verbatim(document)
+    if not isinstance(document, Mapping) or not all(isinstance(document.get(key), str) for key in ("code", "message")):
+        raise ValueError(f"no message: {document!r:.80}")
+    parameters = document.get("parameters") or {}
+    return Message(document["code"], {name: _read(value) for name, value in parameters.items()}, document["message"])
+
+
+def texts_of(messages: Iterable[Message]) -> list[str]:
+    """Returns the English texts."""
+    return [message.text for message in messages]
+
+
+def documents_of(messages: Iterable[Message]) -> list[MessageDocument]:
+    """Returns messages for JSON."""
+    return [message.document() for message in messages]
+
+
+def _parameter(value: Raw) -> Parameter:
+    if isinstance(value, Scalar):
+        value = value.item()
+    if isinstance(value, str | int | float | Message):
+        return value
+    assert isinstance(value, Iterable), type(value)
+    return tuple(_parameter(item) for item in value)
+
+
+def _document(value: Parameter) -> Any:
+    if isinstance(value, Message):
+        return value.document()
+    if isinstance(value, tuple):
+        return [_document(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)  # JSON has no such number
+    return printable(value) if isinstance(value, str) else value
+
+
+def _read(value: Any) -> Parameter:
+    if isinstance(value, Mapping):
+        return read_message(value)
+    return tuple(_read(item) for item in value) if isinstance(value, list) else value

@@ -1,0 +1,18 @@
+"""Messages as pages show them."""
+
+from rig.messages.message import Message
+from server.services.documents import ErrorDocument, failure_document
+from server.services.records import Failure
+
+
+def shown_detail(detail: Message) -> Message:
+    """Returns the detail of a refusal; who reads a page sends no document again, and is not told to."""
+    found = detail.parameters.get("found")
+    return found if detail.code == "input-unusable" and isinstance(found, Message) else detail
+
+
+def shown_failure(failure: Failure | None) -> ErrorDocument | None:
+    """Returns why a job failed, for a page."""
+    if failure is None:
+        return None
+    return failure_document(Failure(failure.type, shown_detail(failure.detail), failure.errors))

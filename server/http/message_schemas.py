@@ -1,0 +1,30 @@
+"""Messages on the wire: as text where text always stood, and as data beside it."""
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
+
+from rig.messages.message import Message
+from server.storage.records import JsonObject
+
+TextOf = Annotated[str, BeforeValidator(lambda told: told.text if isinstance(told, Message) else told)]
+Texts = list[TextOf]
+
+
+class MessageOut(BaseModel):
+    """What the service tells, as data: who shows it in another language goes by ``code`` and ``parameters``."""
+
+    code: str = Field(description="stable; decides what parameters there are")
+    message: str = Field(description="in English")
+    parameters: JsonObject = Field(default_factory=dict, description="what stands in the message, by name")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_message(cls, value: Any) -> Any:
+        return value.document() if isinstance(value, Message) else value
+
+
+class WarningOut(MessageOut):
+    """As in report.json."""
+
+    code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")

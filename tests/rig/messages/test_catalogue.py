@@ -1,0 +1,153 @@
+"""The catalogue and the code agree: what is composed is in it, and the reverse; and no sentence goes past it."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.diagnostics import WARNING_CODES
+from rig.messages.catalogue import CATALOGUE
+from rig.messages.templates import fields_of
+from tests.support.sentences import ROOT, composed, modules, raw_sentences
+
+# Sentences that are no messages yet, by module. The numbers fall; a module without any has no line.
+RAW = {
+    "rig/formats/archive.py": 9,
+    "rig/formats/archive_names.py": 6,
+    "rig/formats/cameras_file.py": 3,
+    "rig/formats/cameras_json.py": 17,
+    "rig/formats/capture_folder.py": 4,
+    "rig/formats/capture_masks.py": 1,
+    "rig/formats/colmap.py": 1,
+    "rig/formats/features_json.py": 8,
+    "rig/formats/foreign.py": 11,
+    "rig/formats/images.py": 5,
+    "rig/formats/mesh_file.py": 4,
+    "rig/formats/metashape.py": 11,
+    "rig/formats/opencv_toml.py": 5,
+    "rig/formats/opencv_yaml.py": 7,
+    "rig/formats/outlines_json.py": 3,
+    "rig/formats/ply.py": 3,
+    "rig/formats/polygon_obj.py": 12,
+    "rig/formats/reading.py": 1,
+    "rig/formats/realitycapture.py": 9,
+    "rig/formats/rig_toml.py": 24,
+    "rig/formats/scale_json.py": 16,
+    "rig/formats/serials.py": 4,
+    "rig/formats/shot_files.py": 6,
+    "rig/formats/transforms_json.py": 12,
+    "rig/formats/usdz.py": 1,
+    "rig/render/context.py": 4,
+    "rig/render/silhouettes.py": 4,
+    "rig/render/tile_packing.py": 1,
+    "rig/rig.py": 3,
+    "rig/studio/devices/serve.py": 3,
+    "rig/studio/scene/beard.py": 1,
+    "rig/studio/scene/hairstyles.py": 1,
+    "rig/studio/scene/headwear.py": 1,
+    "rig/studio/scene/simulate.py": 1,
+    "rig/studio/sensor/faults.py": 2,
+    "rig/studio/sensor/realism.py": 1,
+    "calibration/board/board.py": 8,
+    "calibration/board/detection.py": 5,
+    "pipeline/eigenheads/correspondence/scan_checks.py": 11,
+    "pipeline/eigenheads/correspondence/scans.py": 6,
+    "pipeline/eigenheads/expressions.py": 4,
+    "pipeline/eigenheads/model_file.py": 5,
+    "pipeline/eigenheads/model_names.py": 2,
+    "pipeline/eigenheads/sources/fetch.py": 9,
+    "pipeline/eigenheads/sources/foreign.py": 1,
+    "pipeline/eigenheads/sources/imports.py": 14,
+    "pipeline/eigenheads/sources/makehuman.py": 1,
+    "pipeline/eigenheads/subdivision.py": 4,
+    "pipeline/eigenheads/training/build.py": 2,
+    "pipeline/experiments/eye_states.py": 1,
+    "pipeline/experiments/light.py": 2,
+    "pipeline/experiments/openmvs.py": 5,
+    "pipeline/experiments/people.py": 1,
+    "pipeline/experiments/people_subjects.py": 1,
+    "pipeline/experiments/real.py": 1,
+    "pipeline/experiments/runner.py": 5,
+    "pipeline/experiments/span.py": 1,
+    "pipeline/experiments/surfaces.py": 1,
+    "pipeline/experiments/texture.py": 1,
+    "pipeline/experiments/visible.py": 1,
+    "pipeline/faces/landmark_map.py": 1,
+    "pipeline/faces/networks.py": 3,
+    "pipeline/verification/best_fit.py": 1,
+    "pipeline/verification/judgement.py": 1,
+    "pipeline/verification/measured.py": 4,
+    "server/address.py": 2,
+    "server/cli/answers.py": 3,
+    "server/cli/cameras.py": 1,
+    "server/cli/client.py": 7,
+    "server/cli/demo.py": 1,
+    "server/cli/doctor.py": 2,
+    "server/cli/real.py": 1,
+    "server/cli/reconstruct_local.py": 2,
+    "server/cli/refine.py": 2,
+    "server/cli/studio.py": 1,
+    "server/cli/verify.py": 4,
+    "server/services/keys.py": 1,
+    "server/storage/database.py": 1,
+    "server/tasks/ingest.py": 2,
+    "server/tasks/photographs.py": 3,
+    "server/tasks/simulate.py": 1,
+}
+
+
+def test_every_code_is_composed_with_its_parameters() -> None:
+    wrong = []
+    for path, tree in modules().items():
+        for line, codes, given in composed(tree):
+            known = codes & CATALOGUE.keys()
+            if not known or (given is not None and codes != known):
+                wrong.append(f"{path.relative_to(ROOT)}:{line}: {sorted(codes)} are not in the catalogue")
+            wrong += [
+                f"{path.relative_to(ROOT)}:{line}: {code} has {sorted(fields_of(CATALOGUE[code]))}"
+                for code in known
+                if given is not None and given != fields_of(CATALOGUE[code]).keys()
+            ]
+    assert wrong == []
+
+
+def test_every_code_of_the_catalogue_is_used() -> None:
+    used = {code for tree in modules().values() for _, codes, _ in composed(tree) for code in codes}
+    assert CATALOGUE.keys() - used - {"verbatim"} == set()
+
+
+def test_every_warning_of_a_result_is_a_message() -> None:
+    assert set(WARNING_CODES) - CATALOGUE.keys() == set()
+
+
+def test_sentences_are_messages() -> None:
+    found = {path.relative_to(ROOT).as_posix(): raw_sentences(tree) for path, tree in modules().items()}
+    more = {path: lines for path, lines in found.items() if len(lines) > RAW.get(path, 0)}
+    assert more == {}
+    assert [path for path in RAW if not found.get(path)] == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'raise InputError("capture", ["is no picture"])',
+        'raise EigenheadError(f"the camera {name} is gone")',
+        'faults.append(f"{name} is empty")',
+        'faults += [f"{name} is empty" for name in names]',
+        'detail = "The job is gone."\n    raise Conflict("gone", detail)',
+        'warnings = [*told, "the view is " + "left out"]',
+    ],
+)
+def test_a_raw_sentence_is_found(line: str, tmp_path: Path) -> None:
+    import ast
+
+    assert len(raw_sentences(ast.parse(f"def planted(name, names, told):\n    {line}\n"))) >= 1
+
+
+@pytest.mark.parametrize(
+    "line",
+    ['raise InputError("capture", [compose("no-json-object")])', 'faults.append(compose("tag-empty", tag=number))'],
+)
+def test_a_message_is_none(line: str) -> None:
+    import ast
+
+    assert raw_sentences(ast.parse(f"def planted(number):\n    {line}\n")) == []

@@ -1,0 +1,100 @@
+"""Messages: made, written, read, and carried from process to process."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from rig.errors import EigenheadError, InputError
+from rig.messages.message import (
+    Message,
+    compose,
+    documents_of,
+    message_of,
+    read_message,
+    texts_of,
+    verbatim,
+)
+
+MOVED = compose("camera-moved", finding=compose("camera-misplaced", camera="cam03"))
+
+
+def through_json(message: Message) -> Message:
+    return read_message(json.loads(json.dumps(message.document(), allow_nan=False)))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        MOVED,
+        compose("not-in-sync", cameras=["cam00", "cam01"]),
+        compose("input-refused", subject="capture", faults=[MOVED, verbatim("as it came")]),
+        compose("disk-free", free_gb=12.34567, spare_gb=2),
+        compose("no-json-object"),
+    ],
+)
+def test_code_and_parameters_survive_every_way(message: Message) -> None:
+    for carried in (through_json(message), pickle.loads(pickle.dumps(message))):
+        assert carried == message
+        assert str(carried) == message.text
+
+
+def test_the_text_is_the_templates() -> None:
+    assert compose("disk-free", free_gb=12.34567, spare_gb=2).text == "12.3 GB free; uploads and jobs leave 2.0 GB"
+    assert MOVED.text.startswith("cam03 contradicts all other cameras")
+
+
+@pytest.mark.parametrize(
+    ("code", "parameters"),
+    [("no-json-object", {"more": 1}), ("camera-gain", {"camera": "cam00"}), ("camera-gain", {})],
+)
+def test_parameters_are_those_of_the_template(code: str, parameters: dict[str, str]) -> None:
+    with pytest.raises((AssertionError, KeyError)):
+        compose(code, **parameters)
+
+
+def test_an_unknown_code_is_no_message() -> None:
+    with pytest.raises(KeyError):
+        compose("nobody-says-this")
+
+
+def test_numbers_of_numpy_become_plain_and_infinite_ones_words() -> None:
+    told = compose("camera-gain", camera="cam00", factor=np.float32(0.5))
+    assert type(told.parameters["factor"]) is float
+    endless = compose("camera-gain", camera="cam00", factor=np.inf)
+    assert endless.document()["parameters"] == {"camera": "cam00", "factor": "inf"}  # pyright: ignore
+    assert through_json(endless).text == "cam00 is inf times as bright as the others: check its exposure"
+
+
+def test_what_is_no_text_is_escaped() -> None:
+    document = verbatim("key \ud800").document()
+    assert json.dumps(document).encode()
+    assert (document["message"], document["parameters"]) == ("key \\ud800", {"text": "key \\ud800"})  # pyright: ignore
+
+
+@pytest.mark.parametrize("told", ["the view is left out", {"code": "view", "message": "the view is left out"}])
+def test_messages_of_earlier_versions_have_their_text(told: object) -> None:
+    assert read_message(told).text == "the view is left out"
+    assert read_message(told).code in ("view", "verbatim")
+
+
+@pytest.mark.parametrize("told", [None, 3, {"code": "view"}, {"message": "text"}, ["text"]])
+def test_what_is_no_message_is_refused(told: object) -> None:
+    with pytest.raises(ValueError, match="no message"):
+        read_message(told)
+
+
+def test_an_error_carries_its_message() -> None:
+    error = EigenheadError(MOVED)
+    assert (error.message, str(error)) == (MOVED, MOVED.text)
+    assert pickle.loads(pickle.dumps(error)).message == MOVED
+    assert EigenheadError("as it came").message == verbatim("as it came")
+
+
+def test_faults_of_input_are_messages() -> None:
+    error = InputError("cam.json", ["is no JSON", compose("no-json-object")])
+    assert error.faults == (message_of("is no JSON"), compose("no-json-object"))
+    assert str(error) == "cam.json: is no JSON; is no JSON object; send one, as application/json"
+    assert texts_of(error.located()) == [f"cam.json: {fault}" for fault in error.faults]
+    assert [document["code"] for document in documents_of(error.faults)] == ["verbatim", "no-json-object"]
