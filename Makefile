@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup demo serve test test-slow check coverage format bench dependencies results pictures docs sbom audit mutants
+.PHONY: setup setup-tests demo serve test test-slow check coverage format bench dependencies results pictures docs sbom audit mutants
 BIN := .venv/bin
 # The tests start many processes: with compiled modules kept beside them each starts in half the time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -7,6 +7,9 @@ UV = $(shell command -v uv || echo $${XDG_CACHE_HOME:-$$HOME/.cache}/eigenhead/u
 
 setup:       ## uv, the locked environment, an EGL; nothing where nothing is missing
 	@deploy/setup.sh
+
+setup-tests: ## also the Debian packages without which some tests skip
+	@deploy/setup.sh --tests
 
 demo:        ## the main job: simulated rig, capture, service, textured head in out/demo
 	@deploy/setup.sh --quick
@@ -21,12 +24,13 @@ test: setup  ## the fast tests
 test-slow: setup  ## the tests that take more than a few seconds each
 	$(BIN)/pytest -m slow -n 2 --dist loadfile
 
-check: ## ruff, pyright, import-linter, dead links of the documents
+check: ## ruff, pyright, import-linter, biome (JavaScript), dead links of the documents
 	@deploy/setup.sh --docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports
+	@if [ -x $(BIN)/biome ]; then $(BIN)/biome ci; else echo "check: skipped: no biome for this machine, JavaScript is not checked"; fi
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 coverage: setup ## what share of the product's lines the fast tests run, child processes included, compiled loops left out
@@ -35,9 +39,11 @@ coverage: setup ## what share of the product's lines the fast tests run, child p
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report --skip-covered --sort=cover
 
-format: setup
+format:
+	@deploy/setup.sh --docs
 	$(BIN)/ruff check --fix --select I .
 	$(BIN)/ruff format .
+	@if [ -x $(BIN)/biome ]; then $(BIN)/biome format --write; else echo "format: skipped: no biome for this machine, JavaScript is as it was"; fi
 
 bench: setup ## timings of inner loops
 	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/benchmarks

@@ -108,7 +108,10 @@ def test_a_tagged_commit_has_the_version_of_its_tag() -> None:
     """The version stands in pyproject.toml: a clone without tags, an archive and an installed wheel know it alike."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     assert importlib.metadata.version("eigenhead") == project
-    assert f"\n## {project}\n" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    headings = re.findall(
+        r"^## \[(.+?)\](?: - \d{4}-\d\d-\d\d)?$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert headings[:2] == ["Unreleased", project]
     command = ["git", "tag", "--points-at", "HEAD", "--list", "v*"]
     tags = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False).stdout.split()
     assert tags in ([], [f"v{project}"])
