@@ -94,7 +94,7 @@ export default spoken({
       if (!file) return;
       this.upload = { name: file.name, state: "0 %", detail: "", errors: [] };
       const mine = this.upload;
-      const { status, document } = await send("/console/calibrations", file, { from: this.source, label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => (mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking"));
+      const { status, document } = await send("/console/calibrations", file, { from: this.source, label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => { mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking"; });
       if (status === 202) { this.upload = null; this.chosen = document.id; window.eigenheadSay("done", "The calibration is queued."); }
       else { mine.state = "refused"; mine.detail = told(document); mine.errors = toldFaults(document); }
     },

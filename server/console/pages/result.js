@@ -124,7 +124,7 @@ export default spoken({
     },
     build() {
       try { this.renderer = new THREE.WebGLRenderer({ canvas: this.$refs.canvas, antialias: true, alpha: true }); }
-      catch (error) { this.fault = "This browser shows no 3D (WebGL is off). The downloads work."; return; }
+      catch { this.fault = "This browser shows no 3D (WebGL is off). The downloads work."; return; }
       this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
       this.scene = new THREE.Scene();
       this.camera = new THREE.PerspectiveCamera(FOV_DEG, 1, 0.01, 10);
@@ -244,7 +244,7 @@ export default spoken({
     },
     paintParts(values) {
       const all = this.withRepeated(values), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
-      all.forEach((value, i) => colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      all.forEach((value, i) => { colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i); });
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
     },
@@ -262,7 +262,7 @@ export default spoken({
     },
     heat(values, repeated, most) {
       const all = this.withRepeated(values, repeated), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
-      all.forEach((value, i) => colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i));
+      all.forEach((value, i) => { colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i); });
       return new THREE.BufferAttribute(colours, 3);
     },
     spread(values, title) {

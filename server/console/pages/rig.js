@@ -129,7 +129,7 @@ export default spoken({
   created() { this.faultsOf = faultsOf; this.clock = clock; this.sessionName = sessionName; this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; this.span = span; this.stageWords = stageWords; },
   mounted() {
     window.addEventListener("keydown", this.key);
-    this.clockTimer = setInterval(() => (this.now = Date.now()), 500);
+    this.clockTimer = setInterval(() => { this.now = Date.now(); }, 500);
     this.look();
     if (!this.job && !this.shot && begunHere()) this.$emit("choose", { job: begunHere() });
   },

@@ -61,7 +61,7 @@ export default spoken({
     async show_key(key) { this.secret = key; await this.$nextTick(); this.$refs.secret.focus(); },
     async copy() {
       this.$refs.secret.select();
-      try { await navigator.clipboard.writeText(this.secret); this.copied = true; } catch (error) { this.copied = document.execCommand("copy"); } // without https there is no clipboard
+      try { await navigator.clipboard.writeText(this.secret); this.copied = true; } catch { this.copied = document.execCommand("copy"); } // without https there is no clipboard
     },
     when(u) { return u.goes === null ? say(u.why === "make_room" ? "when the disk is full" : "when more come") : new Date(u.goes) <= new Date() ? say("at the next sweep") : clock(u.goes); },
   },

@@ -33,11 +33,11 @@ export const exports3d = {
       pen.drawImage(this.renderer.domElement, 0, 0);
       if (!this.scale) return;
       const ramp = pen.createLinearGradient(0, 11 * rem, 0, rem), right = width - rem;
-      this.gradientStops().forEach((colour, i, all) => ramp.addColorStop(i / (all.length - 1), colour));
+      this.gradientStops().forEach((colour, i, all) => { ramp.addColorStop(i / (all.length - 1), colour); });
       pen.fillStyle = ramp; pen.fillRect(right - rem, rem, rem, 10 * rem);
       pen.fillStyle = ground ? "#e8ebf0" : "#6b7686"; pen.font = `${rem}px sans-serif`; pen.textAlign = "right"; pen.textBaseline = "middle";
-      const digits = this.digits, end = (this.scale.beyond ? "≥ " : "") + fixed(this.scale.most, digits) + " mm";
-      [[end, 1.5], [fixed(this.scale.most / 2, digits), 6], ["0", 10.5]].forEach(([text, at]) => pen.fillText(text, right - 1.5 * rem, at * rem));
+      const digits = this.digits, end = `${this.scale.beyond ? "≥ " : ""}${fixed(this.scale.most, digits)} mm`;
+      [[end, 1.5], [fixed(this.scale.most / 2, digits), 6], ["0", 10.5]].forEach(([text, at]) => { pen.fillText(text, right - 1.5 * rem, at * rem); });
       pen.textAlign = "left"; pen.fillText(this.scale.title, rem, 1.5 * rem);
     },
     async savePicture() {
@@ -63,7 +63,7 @@ export const exports3d = {
       };
       requestAnimationFrame(step);
       await stopped;
-      stream.getTracks().forEach((track) => track.stop());
+      stream.getTracks().forEach((track) => { track.stop(); });
       const whole = this.turning === 1;
       if (whole && pictures < FEW_A_SECOND * this.turnS) this.fault = say("This machine draws slowly: the turn has {count} pictures.", { count: pictures });
       this.turning = null; this.controls.enabled = true;

@@ -35,7 +35,7 @@ const PARTS = /(<[^!](?:"[^"]*"|[^">])*>)|([^<]+)/g, READ_OUT = /(\s(?:aria-labe
 const key = (words) => words.trim().replace(/\s+/g, " ");
 
 function inLanguage(markup) {
-  return markup.replace(PARTS, (_, tag, words) => (tag ? tag.replace(READ_OUT, (_, before, read) => before + (table[read] ?? read)) : words.replace(/\S(?:[^]*\S)?/, (said) => table[key(said)] ?? said)));
+  return markup.replace(PARTS, (_, tag, words) => (tag ? tag.replace(READ_OUT, (_, before, read) => before + (table[read] ?? read)) : words.replace(/\S(?:[\s\S]*\S)?/, (said) => table[key(said)] ?? said)));
 }
 
 export function spoken(component) {

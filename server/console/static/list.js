@@ -1,6 +1,6 @@
 // A list that the service pages, searches and sorts: what is sought stands in the address, and the arrows walk in it.
 // A page that uses it has fields() for the address, question() for the service, and listed, the rows with their ids.
-import { say, spoken } from "/console/static/language.js";
+import { spoken } from "/console/static/language.js";
 import { keepAddress } from "/console/static/words.js";
 
 const TYPING_MS = 250;

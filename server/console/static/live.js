@@ -12,7 +12,7 @@ export const liveView = {
           if (!answer.ok) throw new Error(answer.statusText);
           this.reader = answer.body.getReader();
           await this.read(this.reader);
-        } catch (error) { this.fault = "Waiting for the service ..."; }
+        } catch { this.fault = "Waiting for the service ..."; }
         await new Promise((resolve) => setTimeout(resolve, 1000));
       }
     },
@@ -38,7 +38,8 @@ export const liveView = {
       this.fault = document.fault;
       let start = 0;
       const drawn = document.cameras.map(async (camera) => {
-        const data = body.subarray(start, (start += camera.bytes));
+        const data = body.subarray(start, start + camera.bytes);
+        start += camera.bytes;
         const before = this.live[camera.name]?.frames || 0;
         this.live[camera.name] = { ...camera, at: Date.now(), frames: before + (camera.bytes > 0) };
         const canvas = this.canvas[camera.name];

@@ -1,6 +1,6 @@
 // A tour of four steps through an empty service, from page to page. Who skips or ends it in this browser is not shown it
 // again, unless they ask for it among the keys.
-import { say, spoken } from "/console/static/language.js";
+import { spoken } from "/console/static/language.js";
 
 const KEPT = "eigenhead-tour", OVER = "over";
 const STEPS = [

@@ -40,7 +40,7 @@ export function stageWords(stage) { return say(STAGES[stage] || stage); }
 export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
 export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }
 // What was typed and not sent is kept in this browser tab: a reload brings it back.
-export function kept(name) { try { return JSON.parse(sessionStorage.getItem(`eigenhead ${name}`)); } catch (error) { return null; } }
+export function kept(name) { try { return JSON.parse(sessionStorage.getItem(`eigenhead ${name}`)); } catch { return null; } }
 export function keepDraft(name, value) { value ? sessionStorage.setItem(`eigenhead ${name}`, JSON.stringify(value)) : sessionStorage.removeItem(`eigenhead ${name}`); }
 // What is chosen and sought stands in the address, so that a reload or a bookmark brings it back.
 export function keepAddress(fields) {
@@ -51,7 +51,7 @@ export function keepAddress(fields) {
 export function sessionName(session, all) {
   if (!session) return "";
   const twice = all.some((other) => other.id !== session.id && other.label === session.label);
-  return session.label ? session.label + (twice ? ", " + say("begun {time}", { time: clock(session.created) }) : "") : clock(session.created);
+  return session.label ? `${session.label}${twice ? `, ${say("begun {time}", { time: clock(session.created) })}` : ""}` : clock(session.created);
 }
 
 // Sends one file as the form part "file"; resolves with {status, document} and never rejects.
@@ -62,7 +62,7 @@ export function send(address, file, fields, progress) {
     request.upload.onprogress = (event) => event.lengthComputable && progress(event.loaded / event.total);
     request.onload = () => {
       let document = { detail: request.statusText, errors: [] };
-      try { document = JSON.parse(request.responseText); } catch (error) { /* an answer without JSON has its status text */ }
+      try { document = JSON.parse(request.responseText); } catch { /* an answer without JSON has its status text */ }
       resolve({ status: request.status, document });
     };
     request.onerror = () => resolve({ status: 0, document: { detail: "The service did not answer; send it again.", errors: [] } });
