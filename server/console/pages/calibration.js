@@ -8,20 +8,75 @@ export default spoken({
   mixins: [liveView],
   props: { state: Object },
   emits: ["act"],
-  data: () => ({ chosen: new URLSearchParams(location.search).get("calibration"), sure: false, board: { kind: "charuco", columns: 12, rows: 9, square_mm: 30, marker_ratio: 0.75, dictionary: "DICT_4X4_1000", measured_width_mm: null, inverted: false, ...kept("board") }, label: kept("calibration name") || "", busy: "", source: kept("calibration source") || "board", over: false, upload: null }),
-  watch: { chosen(id) { keepAddress({ calibration: id }); this.sure = false; },
-    board: { handler(board) { keepDraft("board", board); }, deep: true }, label(text) { keepDraft("calibration name", text); }, source(of) { keepDraft("calibration source", of); },
-    "state.board": { handler(board) { if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board); }, immediate: true },
-    "state.rig.kind": { handler(kind) { if (kind === "real") this.look(); }, immediate: true } }, // nobody holds a board in the simulated studio
+  data: () => ({
+    chosen: new URLSearchParams(location.search).get("calibration"),
+    sure: false,
+    board: {
+      kind: "charuco",
+      columns: 12,
+      rows: 9,
+      square_mm: 30,
+      marker_ratio: 0.75,
+      dictionary: "DICT_4X4_1000",
+      measured_width_mm: null,
+      inverted: false,
+      ...kept("board"),
+    },
+    label: kept("calibration name") || "",
+    busy: "",
+    source: kept("calibration source") || "board",
+    over: false,
+    upload: null,
+  }),
+  watch: {
+    chosen(id) {
+      keepAddress({ calibration: id });
+      this.sure = false;
+    },
+    board: {
+      handler(board) {
+        keepDraft("board", board);
+      },
+      deep: true,
+    },
+    label(text) {
+      keepDraft("calibration name", text);
+    },
+    source(of) {
+      keepDraft("calibration source", of);
+    },
+    "state.board": {
+      handler(board) {
+        if (board?.kind) Object.assign(this.board, { measured_width_mm: null, inverted: false }, board);
+      },
+      immediate: true,
+    },
+    "state.rig.kind": {
+      handler(kind) {
+        if (kind === "real") this.look();
+      },
+      immediate: true,
+    },
+  }, // nobody holds a board in the simulated studio
   computed: {
-    collecting() { return this.state.shots > 0; }, // then the board stays what it is
-    list() { return this.state.calibrations || []; },
-    current() { return this.list.find((c) => c.id === this.chosen) || null; },
-    cameras() { return Object.entries(this.current?.figures?.cameras || {}); },
+    collecting() {
+      return this.state.shots > 0;
+    }, // then the board stays what it is
+    list() {
+      return this.state.calibrations || [];
+    },
+    current() {
+      return this.list.find((c) => c.id === this.chosen) || null;
+    },
+    cameras() {
+      return Object.entries(this.current?.figures?.cameras || {});
+    },
     lead() {
       if (this.state.loading) return say("Reading");
       const used = this.list.find((c) => c.in_use);
-      return used ? say("In use: {name}", { name: used.label || clock(used.created) }) : say(this.state.rig.calibration ? "In use: the rig's own" : "No calibration in use");
+      return used
+        ? say("In use: {name}", { name: used.label || clock(used.created) })
+        : say(this.state.rig.calibration ? "In use: the rig's own" : "No calibration in use");
     },
   },
   template: `
@@ -85,18 +140,41 @@ export default spoken({
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, fixed, span, stageWords }); },
+  created() {
+    Object.assign(this, { clock, fixed, span, stageWords });
+  },
   methods: {
-    act(name, more) { this.busy = name; this.$emit("act", { name, ...more }); },
-    acted(name, done) { this.busy = ""; if (name === "use" && done) this.sure = false; if (name === "calibrate" && done) this.label = ""; },
+    act(name, more) {
+      this.busy = name;
+      this.$emit("act", { name, ...more });
+    },
+    acted(name, done) {
+      this.busy = "";
+      if (name === "use" && done) this.sure = false;
+      if (name === "calibrate" && done) this.label = "";
+    },
     async take(files) {
       const file = files[0];
       if (!file) return;
       this.upload = { name: file.name, state: "0 %", detail: "", errors: [] };
       const mine = this.upload;
-      const { status, document } = await send("/console/calibrations", file, { from: this.source, label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") }, (share) => { mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking"; });
-      if (status === 202) { this.upload = null; this.chosen = document.id; window.eigenheadSay("done", "The calibration is queued."); }
-      else { mine.state = "refused"; mine.detail = told(document); mine.errors = toldFaults(document); }
+      const { status, document } = await send(
+        "/console/calibrations",
+        file,
+        { from: this.source, label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, "") },
+        (share) => {
+          mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking";
+        },
+      );
+      if (status === 202) {
+        this.upload = null;
+        this.chosen = document.id;
+        window.eigenheadSay("done", "The calibration is queued.");
+      } else {
+        mine.state = "refused";
+        mine.detail = told(document);
+        mine.errors = toldFaults(document);
+      }
     },
   },
 });

@@ -3,7 +3,17 @@ import { Pager, paged } from "/console/static/list.js";
 import { say, spoken } from "/console/static/language.js";
 import { english, told, toldFaults } from "/console/static/messages.js";
 import { Outline, Verdict, checksOf, faultsOf, verdictTag } from "/console/static/verdict.js";
-import { clock, keepDraft, keepSession, kept, openSession, send, sessionName, size, typing } from "/console/static/words.js";
+import {
+  clock,
+  keepDraft,
+  keepSession,
+  kept,
+  openSession,
+  send,
+  sessionName,
+  size,
+  typing,
+} from "/console/static/words.js";
 
 const asked = new URLSearchParams(location.search);
 
@@ -12,35 +22,119 @@ export default spoken({
   components: { Outline, Pager, Verdict },
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ labels: kept("captures form tags") || "", chosen: asked.get("capture") || "", verdict: asked.get("verdict") || "", tag: asked.get("tag") || "", tagging: "", sort: asked.get("sort") || "", outlines: false, drawing: 0, large: null, removal: null, sure: false, over: false, uploads: [], busy: "", session: asked.get("session") || openSession(), form: kept("captures form"), erasing: false, renaming: {}, draft: {}, writing: false, method: "", model: "", template: "" }),
+  data: () => ({
+    labels: kept("captures form tags") || "",
+    chosen: asked.get("capture") || "",
+    verdict: asked.get("verdict") || "",
+    tag: asked.get("tag") || "",
+    tagging: "",
+    sort: asked.get("sort") || "",
+    outlines: false,
+    drawing: 0,
+    large: null,
+    removal: null,
+    sure: false,
+    over: false,
+    uploads: [],
+    busy: "",
+    session: asked.get("session") || openSession(),
+    form: kept("captures form"),
+    erasing: false,
+    renaming: {},
+    draft: {},
+    writing: false,
+    method: "",
+    model: "",
+    template: "",
+  }),
   computed: {
-    sessions() { return this.state.sessions || []; },
-    open() { return this.sessions.find((s) => s.id === this.session) || null; },
-    captures() { return this.state.captures || []; },
-    listed() { return this.captures; },
-    models() { return this.state.models || []; },
-    current() { return this.state.chosen || null; },
-    templates() { return (this.state.templates || []).filter((t) => t.models.includes(this.model || "default")).map((t) => t.name); },
-    preset() { return (this.state.presets || []).find((p) => p.id === this.method); },
-    narrowed() { return !!(this.sought || this.verdict || this.tag); },
+    sessions() {
+      return this.state.sessions || [];
+    },
+    open() {
+      return this.sessions.find((s) => s.id === this.session) || null;
+    },
+    captures() {
+      return this.state.captures || [];
+    },
+    listed() {
+      return this.captures;
+    },
+    models() {
+      return this.state.models || [];
+    },
+    current() {
+      return this.state.chosen || null;
+    },
+    templates() {
+      return (this.state.templates || []).filter((t) => t.models.includes(this.model || "default")).map((t) => t.name);
+    },
+    preset() {
+      return (this.state.presets || []).find((p) => p.id === this.method);
+    },
+    narrowed() {
+      return !!(this.sought || this.verdict || this.tag);
+    },
   },
   watch: {
-    sessions: { handler(all) {
-      const made = this.begun && all.find((s) => s.label === this.begun.label && !this.begun.known.includes(s.id));
-      if (made) { this.session = made.id; this.begun = null; }
-      else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
-    }, immediate: true },
-    session(id) { keepSession(id); this.erasing = false; this.large = null; this.chosen = ""; this.first(); },
-    "current.id": { handler(id) { this.readChecks(id); this.removal = null; if (!this.state.loading) this.keepAddress(); }, immediate: true },
-    templates(names) { if (!names.includes(this.template)) this.template = ""; }, // of another model
-    labels(text) { keepDraft("captures form tags", text || null); },
-    verdict() { this.first(); }, tag() { this.first(); }, sort() { this.first(); },
-    form: { handler(form) { keepDraft("captures form", form); }, deep: true },
-    current: { handler(c) {
-      if (this.writing) return;
-      const mine = kept("capture draft"); // typed before a reload, and not sent
-      this.draft = !c ? {} : mine?.id === c.id ? mine : { label: c.label, expression: c.expression, tags: c.tags.join(", "), session: c.session || "" };
-    }, immediate: true },
+    sessions: {
+      handler(all) {
+        const made = this.begun && all.find((s) => s.label === this.begun.label && !this.begun.known.includes(s.id));
+        if (made) {
+          this.session = made.id;
+          this.begun = null;
+        } else if (this.state.sessions && this.session && !this.open) this.session = ""; // it was erased, perhaps on another page
+      },
+      immediate: true,
+    },
+    session(id) {
+      keepSession(id);
+      this.erasing = false;
+      this.large = null;
+      this.chosen = "";
+      this.first();
+    },
+    "current.id": {
+      handler(id) {
+        this.readChecks(id);
+        this.removal = null;
+        if (!this.state.loading) this.keepAddress();
+      },
+      immediate: true,
+    },
+    templates(names) {
+      if (!names.includes(this.template)) this.template = "";
+    }, // of another model
+    labels(text) {
+      keepDraft("captures form tags", text || null);
+    },
+    verdict() {
+      this.first();
+    },
+    tag() {
+      this.first();
+    },
+    sort() {
+      this.first();
+    },
+    form: {
+      handler(form) {
+        keepDraft("captures form", form);
+      },
+      deep: true,
+    },
+    current: {
+      handler(c) {
+        if (this.writing) return;
+        const mine = kept("capture draft"); // typed before a reload, and not sent
+        this.draft = !c
+          ? {}
+          : mine?.id === c.id
+            ? mine
+            : { label: c.label, expression: c.expression, tags: c.tags.join(", "), session: c.session || "" };
+      },
+      immediate: true,
+    },
   },
   template: `
     <section class="page" aria-label="Captures" @dragover.prevent="over = true" @dragleave="over = false" @drop.prevent="drop">
@@ -138,58 +232,145 @@ export default spoken({
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, size, keepDraft, faultsOf, verdictTag }); },
-  mounted() { window.addEventListener("keydown", this.key); },
-  unmounted() { window.removeEventListener("keydown", this.key); },
+  created() {
+    Object.assign(this, { clock, size, keepDraft, faultsOf, verdictTag });
+  },
+  mounted() {
+    window.addEventListener("keydown", this.key);
+  },
+  unmounted() {
+    window.removeEventListener("keydown", this.key);
+  },
   methods: {
-    address(camera, kind) { return `/console/captures/${this.current.id}/${encodeURIComponent(camera)}${kind}`; },
+    address(camera, kind) {
+      return `/console/captures/${this.current.id}/${encodeURIComponent(camera)}${kind}`;
+    },
     async askRemoval() {
-      const id = this.current.id, answer = await fetch(`/console/captures/${id}/holdings`);
+      const id = this.current.id,
+        answer = await fetch(`/console/captures/${id}/holdings`);
       if (answer.ok) this.removal = { id, ...(await answer.json()) };
     },
-    act(name, id, more) { this.busy = name; this.removal = null; this.$emit("act", { name, id, ...more }); },
+    act(name, id, more) {
+      this.busy = name;
+      this.removal = null;
+      this.$emit("act", { name, id, ...more });
+    },
     acted(name, done) {
       this.busy = "";
       if (name === "new_session" && done) this.form = null;
-      if (name === "bulk") { this.sure = false; if (done) this.tagging = ""; this.picked = this.picked.filter((id) => this.captures.some((c) => c.id === id)); }
+      if (name === "bulk") {
+        this.sure = false;
+        if (done) this.tagging = "";
+        this.picked = this.picked.filter((id) => this.captures.some((c) => c.id === id));
+      }
     },
-    seekAll() { this.sought = this.verdict = this.tag = ""; },
-    async openForm() { this.form = { label: "", consent: "" }; await this.$nextTick(); this.$refs.subject.focus(); },
-    fields() { return { capture: this.current?.id, find: this.sought, verdict: this.verdict, tag: this.tag, sort: this.sort }; },
-    question() { return { ...this.fields(), capture: this.chosen, session: this.session, after: this.behind.at(-1) || "" }; },
-    bulk(action, id, more) { this.busy = "bulk"; this.$emit("act", { name: "bulk", action, id: id || "", ids: [...this.picked], ...more }); },
-    name(session) { return sessionName(session, this.sessions); },
-    count(id) { return this.sessions.find((s) => s.id === id)?.captures || 0; },
-    begin() { this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) }; this.act("new_session", "", this.form); },
-    tags(c) { // all its jobs: heads, what is under way, what failed
-      const of = (state) => c.jobs.filter((j) => j.state === state), heads = of("succeeded").length, running = of("running"), failed = of("failed").length;
-      const told = [running.length && { text: `${Math.round(100 * (running[0].progress || 0))} %`, kind: "accent" }, of("queued").length && { text: say("queued | {count} queued", { count: of("queued").length }), kind: "" },
-        heads && { text: say("head | {count} heads", { count: heads }), kind: "good" }, failed && { text: say("failed | {count} failed", { count: failed }), kind: "fault" }].filter(Boolean);
+    seekAll() {
+      this.sought = this.verdict = this.tag = "";
+    },
+    async openForm() {
+      this.form = { label: "", consent: "" };
+      await this.$nextTick();
+      this.$refs.subject.focus();
+    },
+    fields() {
+      return { capture: this.current?.id, find: this.sought, verdict: this.verdict, tag: this.tag, sort: this.sort };
+    },
+    question() {
+      return { ...this.fields(), capture: this.chosen, session: this.session, after: this.behind.at(-1) || "" };
+    },
+    bulk(action, id, more) {
+      this.busy = "bulk";
+      this.$emit("act", { name: "bulk", action, id: id || "", ids: [...this.picked], ...more });
+    },
+    name(session) {
+      return sessionName(session, this.sessions);
+    },
+    count(id) {
+      return this.sessions.find((s) => s.id === id)?.captures || 0;
+    },
+    begin() {
+      this.begun = { label: this.form.label, known: this.sessions.map((s) => s.id) };
+      this.act("new_session", "", this.form);
+    },
+    tags(c) {
+      // all its jobs: heads, what is under way, what failed
+      const of = (state) => c.jobs.filter((j) => j.state === state),
+        heads = of("succeeded").length,
+        running = of("running"),
+        failed = of("failed").length;
+      const told = [
+        running.length && { text: `${Math.round(100 * (running[0].progress || 0))} %`, kind: "accent" },
+        of("queued").length && { text: say("queued | {count} queued", { count: of("queued").length }), kind: "" },
+        heads && { text: say("head | {count} heads", { count: heads }), kind: "good" },
+        failed && { text: say("failed | {count} failed", { count: failed }), kind: "fault" },
+      ].filter(Boolean);
       return told.length ? told : [{ text: say(c.jobs.length ? "cancelled" : "new"), kind: "" }];
     },
-    jobKind(j) { return { succeeded: "good", running: "accent", failed: "fault" }[j.state] || ""; },
-    failed() { if (this.outlines) { this.outlines = false; window.eigenheadSay("fault", "No silhouettes: a camera of this capture has neither a usable clean plate nor a mask."); } },
-    step(by) { this.large = (this.large + by + this.current.cameras.length) % this.current.cameras.length; },
+    jobKind(j) {
+      return { succeeded: "good", running: "accent", failed: "fault" }[j.state] || "";
+    },
+    failed() {
+      if (this.outlines) {
+        this.outlines = false;
+        window.eigenheadSay(
+          "fault",
+          "No silhouettes: a camera of this capture has neither a usable clean plate nor a mask.",
+        );
+      }
+    },
+    step(by) {
+      this.large = (this.large + by + this.current.cameras.length) % this.current.cameras.length;
+    },
     key(event) {
       if (typing(event)) return;
-      if (event.key === "Escape" && (this.removal || this.erasing || this.sure)) { this.removal = null; this.erasing = this.sure = false; }
-      else if (this.large === null) return;
+      if (event.key === "Escape" && (this.removal || this.erasing || this.sure)) {
+        this.removal = null;
+        this.erasing = this.sure = false;
+      } else if (this.large === null) return;
       else if (event.key === "Escape") this.large = null;
       else if (event.key === "ArrowLeft") this.step(-1);
       else if (event.key === "ArrowRight") this.step(1);
     },
-    drop(event) { this.over = false; this.take(event.dataTransfer.files); },
+    drop(event) {
+      this.over = false;
+      this.take(event.dataTransfer.files);
+    },
     async take(files) {
       for (const file of files) {
-        const entry = { id: Math.random(), name: file.name, share: 0, state: "0 %", done: false, detail: "", errors: [] };
+        const entry = {
+          id: Math.random(),
+          name: file.name,
+          share: 0,
+          state: "0 %",
+          done: false,
+          detail: "",
+          errors: [],
+        };
         this.uploads = [entry, ...this.uploads];
         const mine = this.uploads[0];
-        const { status, document } = await send("/console/captures", file, { label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, ""), tags: this.labels, ...(this.open ? { session: this.open.id } : {}) }, (share) => {
-          mine.share = share; mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking";
-        });
+        const { status, document } = await send(
+          "/console/captures",
+          file,
+          {
+            label: file.name.replace(/\.(zip|tar|tgz|tar\.gz)$/, ""),
+            tags: this.labels,
+            ...(this.open ? { session: this.open.id } : {}),
+          },
+          (share) => {
+            mine.share = share;
+            mine.state = share < 1 ? `${Math.round(100 * share)} %` : "checking";
+          },
+        );
         mine.done = true;
-        if (status === 201) { this.choose(document.id); this.uploads = this.uploads.filter((u) => u.id !== mine.id); window.eigenheadSay("done", say("{name} is here.", { name: file.name })); }
-        else { mine.state = "refused"; mine.detail = told(document); mine.errors = toldFaults(document).filter((fault) => english(fault) !== document.detail); }
+        if (status === 201) {
+          this.choose(document.id);
+          this.uploads = this.uploads.filter((u) => u.id !== mine.id);
+          window.eigenheadSay("done", say("{name} is here.", { name: file.name }));
+        } else {
+          mine.state = "refused";
+          mine.detail = told(document);
+          mine.errors = toldFaults(document).filter((fault) => english(fault) !== document.detail);
+        }
       }
     },
   },

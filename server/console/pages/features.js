@@ -2,35 +2,92 @@
 import { say, spoken } from "/console/static/language.js";
 import { clock, fixed, keepAddress, typing } from "/console/static/words.js";
 
-const TITLES = { exocanthion_right: "Right eye, outer corner", exocanthion_left: "Left eye, outer corner", pronasale: "Tip of the nose", subnasale: "Below the nose",
-  cheilion_right: "Right corner of the mouth", cheilion_left: "Left corner of the mouth", gnathion: "Underside of the chin" };
-const ZOOM = 5, LENS_REM = 11;
+const TITLES = {
+  exocanthion_right: "Right eye, outer corner",
+  exocanthion_left: "Left eye, outer corner",
+  pronasale: "Tip of the nose",
+  subnasale: "Below the nose",
+  cheilion_right: "Right corner of the mouth",
+  cheilion_left: "Left corner of the mouth",
+  gnathion: "Underside of the chin",
+};
+const ZOOM = 5,
+  LENS_REM = 11;
 const GRAB_SHARE = 0.012; // of the image's width: who drags from so near carries the point, or the model's landmark
 const DRAG_PX = 3; // of the screen, which the pointer moves before a click is a drag
 const SEVEN = 7;
-const VIEWS_LEAST = 2, POINTS_LEAST = 3;
+const VIEWS_LEAST = 2,
+  POINTS_LEAST = 3;
 
 export default spoken({
   props: { state: Object },
   emits: ["act", "choose"],
   watch: {
-    views(names, before) { if (names.join() !== before.join()) this.$emit("choose", { views: names.join("\n") }); },
-    point: { handler(name) { if (name) { this.$emit("choose", { point: name }); keepAddress({ point: this.at }); } }, immediate: true },
+    views(names, before) {
+      if (names.join() !== before.join()) this.$emit("choose", { views: names.join("\n") });
+    },
+    point: {
+      handler(name) {
+        if (name) {
+          this.$emit("choose", { point: name });
+          keepAddress({ point: this.at });
+        }
+      },
+      immediate: true,
+    },
   },
-  data: () => ({ at: Number(new URLSearchParams(location.search).get("point")) || 0, all: false, chosen: {}, lens: null, drag: null, count: 4, busy: "", pending: {}, sent: 0 }),
+  data: () => ({
+    at: Number(new URLSearchParams(location.search).get("point")) || 0,
+    all: false,
+    chosen: {},
+    lens: null,
+    drag: null,
+    count: 4,
+    busy: "",
+    pending: {},
+    sent: 0,
+  }),
   computed: {
-    capture() { return this.state.capture; },
-    names() { return this.capture?.names || []; },
-    point() { return this.names[this.at]; },
-    offered() { return this.names.map((name, i) => ({ name, i })).filter(({ name, i }) => i < SEVEN || this.all || i === this.at || Object.keys(this.capture.points[name] || {}).length); },
-    wrong() { return Object.entries(this.capture?.contradictions || {}); },
-    sizes() { return Object.fromEntries((this.capture?.cameras || []).map((c) => [c.name, c])); },
-    views() { return (this.capture?.views || []).slice(0, this.count).map((name, i) => this.chosen[i] || name); },
-    ready() { return this.names.filter((n) => Object.keys(this.capture.points[n] || {}).length >= VIEWS_LEAST).length; },
+    capture() {
+      return this.state.capture;
+    },
+    names() {
+      return this.capture?.names || [];
+    },
+    point() {
+      return this.names[this.at];
+    },
+    offered() {
+      return this.names
+        .map((name, i) => ({ name, i }))
+        .filter(
+          ({ name, i }) =>
+            i < SEVEN || this.all || i === this.at || Object.keys(this.capture.points[name] || {}).length,
+        );
+    },
+    wrong() {
+      return Object.entries(this.capture?.contradictions || {});
+    },
+    sizes() {
+      return Object.fromEntries((this.capture?.cameras || []).map((c) => [c.name, c]));
+    },
+    views() {
+      return (this.capture?.views || []).slice(0, this.count).map((name, i) => this.chosen[i] || name);
+    },
+    ready() {
+      return this.names.filter((n) => Object.keys(this.capture.points[n] || {}).length >= VIEWS_LEAST).length;
+    },
     lead() {
       if (!this.capture) return this.state.loading ? say("Reading") : "";
       if (!Object.keys(this.capture.points).length) return say("Optional. Without points the head is found by itself.");
-      return this.ready < POINTS_LEAST ? say("{ready} of at least {least} points are in two views", { ready: this.ready, least: POINTS_LEAST }) : say(this.capture.dirty ? "{ready} points in two views or more, not saved" : "{ready} points in two views or more, saved", { ready: this.ready });
+      return this.ready < POINTS_LEAST
+        ? say("{ready} of at least {least} points are in two views", { ready: this.ready, least: POINTS_LEAST })
+        : say(
+            this.capture.dirty
+              ? "{ready} points in two views or more, not saved"
+              : "{ready} points in two views or more, saved",
+            { ready: this.ready },
+          );
     },
   },
   template: `
@@ -78,49 +135,104 @@ export default spoken({
         <g fill="none" stroke="#6cb2ff"><polyline v-for="(curve, k) in curves(lens.camera)" :key="k" :points="line(curve)" :stroke-width="lens.step * 1.2" opacity=".8"></polyline>
         <path :d="'M' + (lens.x + .5) + ' ' + (lens.y - 999) + 'v1998M' + (lens.x - 999) + ' ' + (lens.y + .5) + 'h1998'" stroke="#ffffff" :stroke-width="lens.step" opacity=".8"></path></g></svg>
     </section>`,
-  created() { Object.assign(this, { clock, fixed }); },
-  mounted() { window.addEventListener("keydown", this.key); },
-  unmounted() { window.removeEventListener("keydown", this.key); },
+  created() {
+    Object.assign(this, { clock, fixed });
+  },
+  mounted() {
+    window.addEventListener("keydown", this.key);
+  },
+  unmounted() {
+    window.removeEventListener("keydown", this.key);
+  },
   methods: {
-    title(name) { return say(TITLES[name] || name.replaceAll("_", " ")); },
-    address(camera) { return `/console/captures/${this.capture.id}/${encodeURIComponent(camera)}.image`; },
-    act(name, more) { this.busy = name; this.$emit("act", { name, ...more }); },
-    acted(name) { this.busy = ""; if (name === "place" && --this.sent === 0) this.pending = {}; },
-    placed(name) { const n = Object.keys(this.capture.points[name] || {}).length; return n ? say("{count} view | {count} views", { count: n }) : say("not set"); },
-    worst(name) { const off = Object.values(this.capture.off_px[name] || {}); return off.length ? Math.max(...off) : null; },
+    title(name) {
+      return say(TITLES[name] || name.replaceAll("_", " "));
+    },
+    address(camera) {
+      return `/console/captures/${this.capture.id}/${encodeURIComponent(camera)}.image`;
+    },
+    act(name, more) {
+      this.busy = name;
+      this.$emit("act", { name, ...more });
+    },
+    acted(name) {
+      this.busy = "";
+      if (name === "place" && --this.sent === 0) this.pending = {};
+    },
+    placed(name) {
+      const n = Object.keys(this.capture.points[name] || {}).length;
+      return n ? say("{count} view | {count} views", { count: n }) : say("not set");
+    },
+    worst(name) {
+      const off = Object.values(this.capture.off_px[name] || {});
+      return off.length ? Math.max(...off) : null;
+    },
     here(camera) {
       if (this.drag?.camera === camera) return this.drag.at;
       const sent = this.pending[`${this.point} ${camera}`]; // not yet answered by the service
       return sent === undefined ? this.capture.points[this.point]?.[camera] : sent;
     },
-    position(camera) { const p = this.here(camera); return p ? `${p[0].toFixed(1)}, ${p[1].toFixed(1)}` : ""; },
-    suggested(kind, camera) { return this.capture[kind][this.point]?.[camera]; },
-    curves(camera) { return this.capture.guides[this.point]?.[camera] || []; },
-    line(curve) { return curve.map(([x, y]) => `${x + 0.5},${y + 0.5}`).join(" "); },
-    unit(camera) { return this.sizes[camera].width / 520; },
-    cross([x, y], camera, arm) { const a = arm * this.unit(camera), g = a * 0.3; return `M${x + 0.5 - a} ${y + 0.5}h${a - g}m${2 * g} 0h${a - g}M${x + 0.5} ${y + 0.5 - a}v${a - g}m0 ${2 * g}v${a - g}`; },
-    diamond([x, y], camera) { const a = 8 * this.unit(camera); return `M${x + 0.5} ${y + 0.5 - a}l${a} ${a}l${-a} ${a}l${-a} ${-a}z`; },
+    position(camera) {
+      const p = this.here(camera);
+      return p ? `${p[0].toFixed(1)}, ${p[1].toFixed(1)}` : "";
+    },
+    suggested(kind, camera) {
+      return this.capture[kind][this.point]?.[camera];
+    },
+    curves(camera) {
+      return this.capture.guides[this.point]?.[camera] || [];
+    },
+    line(curve) {
+      return curve.map(([x, y]) => `${x + 0.5},${y + 0.5}`).join(" ");
+    },
+    unit(camera) {
+      return this.sizes[camera].width / 520;
+    },
+    cross([x, y], camera, arm) {
+      const a = arm * this.unit(camera),
+        g = a * 0.3;
+      return `M${x + 0.5 - a} ${y + 0.5}h${a - g}m${2 * g} 0h${a - g}M${x + 0.5} ${y + 0.5 - a}v${a - g}m0 ${2 * g}v${a - g}`;
+    },
+    diamond([x, y], camera) {
+      const a = 8 * this.unit(camera);
+      return `M${x + 0.5} ${y + 0.5 - a}l${a} ${a}l${-a} ${a}l${-a} ${-a}z`;
+    },
     others(camera) {
       const found = {};
-      for (const name of this.names) if (name !== this.point && this.capture.points[name]?.[camera]) found[name] = this.cross(this.capture.points[name][camera], camera, 5);
+      for (const name of this.names)
+        if (name !== this.point && this.capture.points[name]?.[camera])
+          found[name] = this.cross(this.capture.points[name][camera], camera, 5);
       return found;
     },
     pixel(event, svg) {
       const p = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
       return [p.x - 0.5, p.y - 0.5];
     },
-    inside([x, y], camera) { return x >= -0.5 && y >= -0.5 && x <= this.sizes[camera].width - 0.5 && y <= this.sizes[camera].height - 0.5; },
+    inside([x, y], camera) {
+      return x >= -0.5 && y >= -0.5 && x <= this.sizes[camera].width - 0.5 && y <= this.sizes[camera].height - 0.5;
+    },
     press(event, camera) {
       const at = this.pixel(event, event.currentTarget);
       if (event.button || !this.inside(at, camera)) return;
-      event.currentTarget.focus(); event.currentTarget.setPointerCapture(event.pointerId);
-      const reach = GRAB_SHARE * this.sizes[camera].width, held = this.here(camera) || this.suggested("reprojected", camera) || this.suggested("predicted", camera);
+      event.currentTarget.focus();
+      event.currentTarget.setPointerCapture(event.pointerId);
+      const reach = GRAB_SHARE * this.sizes[camera].width,
+        held = this.here(camera) || this.suggested("reprojected", camera) || this.suggested("predicted", camera);
       const off = held ? [held[0] - at[0], held[1] - at[1]] : [0, 0];
       this.drag = { camera, at, from: [event.clientX, event.clientY], off: Math.hypot(...off) < reach ? off : [0, 0] };
     },
     move(event, camera) {
       const at = this.pixel(event, event.currentTarget);
-      this.lens = this.inside(at, camera) ? { camera, x: at[0], y: at[1], clientX: event.clientX, clientY: event.clientY, step: 1 / ZOOM / event.currentTarget.getScreenCTM().a } : null;
+      this.lens = this.inside(at, camera)
+        ? {
+            camera,
+            x: at[0],
+            y: at[1],
+            clientX: event.clientX,
+            clientY: event.clientY,
+            step: 1 / ZOOM / event.currentTarget.getScreenCTM().a,
+          }
+        : null;
       if (this.drag?.camera !== camera) return;
       const { from, off } = this.drag;
       this.drag.moved ||= Math.hypot(event.clientX - from[0], event.clientY - from[1]) > DRAG_PX;
@@ -129,26 +241,54 @@ export default spoken({
     release() {
       if (!this.drag) return;
       const { camera, at } = this.drag;
-      this.set(camera, at); this.drag = null;
+      this.set(camera, at);
+      this.drag = null;
     },
     set(camera, at) {
-      const clamped = at && [Math.min(this.sizes[camera].width - 0.5, Math.max(-0.5, at[0])), Math.min(this.sizes[camera].height - 0.5, Math.max(-0.5, at[1]))];
-      this.pending[`${this.point} ${camera}`] = clamped; this.sent += 1;
+      const clamped = at && [
+        Math.min(this.sizes[camera].width - 0.5, Math.max(-0.5, at[0])),
+        Math.min(this.sizes[camera].height - 0.5, Math.max(-0.5, at[1])),
+      ];
+      this.pending[`${this.point} ${camera}`] = clamped;
+      this.sent += 1;
       this.$emit("act", { name: "place", point: this.point, camera, at: clamped });
     },
     nudge(event, camera) {
-      const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key], p = this.here(camera);
-      if (by && p) { event.preventDefault(); const step = event.shiftKey ? 2 : 0.25; this.set(camera, [p[0] + by[0] * step, p[1] + by[1] * step]); }
-      else if (event.key === "Enter") { const to = this.suggested("reprojected", camera) || this.suggested("predicted", camera) || [this.sizes[camera].width / 2, this.sizes[camera].height / 2]; if (!p) this.set(camera, to); }
-      else if ((event.key === "Delete" || event.key === "Backspace") && p) this.set(camera, null);
+      const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key],
+        p = this.here(camera);
+      if (by && p) {
+        event.preventDefault();
+        const step = event.shiftKey ? 2 : 0.25;
+        this.set(camera, [p[0] + by[0] * step, p[1] + by[1] * step]);
+      } else if (event.key === "Enter") {
+        const to = this.suggested("reprojected", camera) ||
+          this.suggested("predicted", camera) || [this.sizes[camera].width / 2, this.sizes[camera].height / 2];
+        if (!p) this.set(camera, to);
+      } else if ((event.key === "Delete" || event.key === "Backspace") && p) this.set(camera, null);
     },
     lensStyle() {
-      const side = LENS_REM * parseFloat(getComputedStyle(document.documentElement).fontSize), gap = 24;
-      const left = this.lens.clientX + gap + side > window.innerWidth ? this.lens.clientX - gap - side : this.lens.clientX + gap;
+      const side = LENS_REM * parseFloat(getComputedStyle(document.documentElement).fontSize),
+        gap = 24;
+      const left =
+        this.lens.clientX + gap + side > window.innerWidth ? this.lens.clientX - gap - side : this.lens.clientX + gap;
       const top = Math.max(4, Math.min(window.innerHeight - side - 4, this.lens.clientY - side / 2));
-      return { position: "fixed", left: `${left}px`, top: `${top}px`, width: `${side}px`, height: `${side}px`, borderRadius: "50%", border: "2px solid var(--accent)", background: "#000", pointerEvents: "none", zIndex: 30 };
+      return {
+        position: "fixed",
+        left: `${left}px`,
+        top: `${top}px`,
+        width: `${side}px`,
+        height: `${side}px`,
+        borderRadius: "50%",
+        border: "2px solid var(--accent)",
+        background: "#000",
+        pointerEvents: "none",
+        zIndex: 30,
+      };
     },
-    lensBox() { const side = this.lens.step * LENS_REM * parseFloat(getComputedStyle(document.documentElement).fontSize); return `${this.lens.x + 0.5 - side / 2} ${this.lens.y + 0.5 - side / 2} ${side} ${side}`; },
+    lensBox() {
+      const side = this.lens.step * LENS_REM * parseFloat(getComputedStyle(document.documentElement).fontSize);
+      return `${this.lens.x + 0.5 - side / 2} ${this.lens.y + 0.5 - side / 2} ${side} ${side}`;
+    },
     key(event) {
       if (typing(event) || !this.capture) return;
       if (/^[1-7]$/.test(event.key)) this.at = Number(event.key) - 1;

@@ -13,26 +13,67 @@ export default spoken({
   components: { Pager },
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ chosen: asked.get("job") || "", only: asked.get("state") || "", sort: asked.get("sort") || "", form: null, busy: "", show: "" }),
+  data: () => ({
+    chosen: asked.get("job") || "",
+    only: asked.get("state") || "",
+    sort: asked.get("sort") || "",
+    form: null,
+    busy: "",
+    show: "",
+  }),
   watch: {
-    "job.id": { handler(id) { if (id) this.keepAddress(); this.form = kept("restart")?.job === id ? kept("restart") : null; }, immediate: true },
-    only() { this.first(); }, sort() { this.first(); },
-    form: { handler(form) { keepDraft("restart", form); }, deep: true },
+    "job.id": {
+      handler(id) {
+        if (id) this.keepAddress();
+        this.form = kept("restart")?.job === id ? kept("restart") : null;
+      },
+      immediate: true,
+    },
+    only() {
+      this.first();
+    },
+    sort() {
+      this.first();
+    },
+    form: {
+      handler(form) {
+        keepDraft("restart", form);
+      },
+      deep: true,
+    },
   },
   computed: {
-    jobs() { return this.state.jobs || []; },
-    listed() { return this.jobs; },
-    job() { return this.state.job || null; },
-    active() { return this.job && ["queued", "running"].includes(this.job.state); },
+    jobs() {
+      return this.state.jobs || [];
+    },
+    listed() {
+      return this.jobs;
+    },
+    job() {
+      return this.state.job || null;
+    },
+    active() {
+      return this.job && ["queued", "running"].includes(this.job.state);
+    },
     waiting() {
       if (this.job.notice_message) return say(this.job.notice_message);
       const before = this.job.ahead || 0;
-      return before ? say("Waiting, {count} job before it | Waiting, {count} jobs before it", { count: before }) : say("Waiting for the worker");
+      return before
+        ? say("Waiting, {count} job before it | Waiting, {count} jobs before it", { count: before })
+        : say("Waiting for the worker");
     },
-    sheet() { return `/console/jobs/${this.job.id}/contact_sheet.png`; },
+    sheet() {
+      return `/console/jobs/${this.job.id}/contact_sheet.png`;
+    },
     lead() {
       const { running = 0, queued = 0, succeeded = 0, failed = 0, cancelled = 0 } = this.state.counts || {};
-      return this.state.loading ? say("Reading") : say("{running} running, {queued} queued, {ended} ended", { running, queued, ended: succeeded + failed + cancelled });
+      return this.state.loading
+        ? say("Reading")
+        : say("{running} running, {queued} queued, {ended} ended", {
+            running,
+            queued,
+            ended: succeeded + failed + cancelled,
+          });
     },
   },
   template: `
@@ -99,23 +140,67 @@ export default spoken({
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, fixed, span, stageWords, poor: POOR_PX, mostly: MOSTLY }); },
+  created() {
+    Object.assign(this, { clock, fixed, span, stageWords, poor: POOR_PX, mostly: MOSTLY });
+  },
   methods: {
-    captureOf(j) { return j.captured ? j.capture || clock(j.captured) : say("removed capture"); },
-    kind(j) { return j.state === "failed" ? "fault" : j.state === "running" || j.state === "succeeded" ? "accent" : ""; },
-    took(j) { return j.started && j.finished ? span((new Date(j.finished) - new Date(j.started)) / 1000) : ""; },
-    overlay(name) { return `/console/jobs/${this.job.id}/overlays/${name}.png`; },
-    act(name) { this.busy = name; this.$emit("act", { name, id: this.job.id }); },
+    captureOf(j) {
+      return j.captured ? j.capture || clock(j.captured) : say("removed capture");
+    },
+    kind(j) {
+      return j.state === "failed" ? "fault" : j.state === "running" || j.state === "succeeded" ? "accent" : "";
+    },
+    took(j) {
+      return j.started && j.finished ? span((new Date(j.finished) - new Date(j.started)) / 1000) : "";
+    },
+    overlay(name) {
+      return `/console/jobs/${this.job.id}/overlays/${name}.png`;
+    },
+    act(name) {
+      this.busy = name;
+      this.$emit("act", { name, id: this.job.id });
+    },
     acted(name, done) {
       this.busy = "";
-      if (name === "restart" && done) { this.form = null; this.chosen = this.state.job?.id || ""; }
+      if (name === "restart" && done) {
+        this.form = null;
+        this.chosen = this.state.job?.id || "";
+      }
       if (name === "bulk") this.picked = [];
     },
-    place(j) { return j.ahead ? say("{count} before it", { count: j.ahead }) : say("next"); },
-    fields() { return { job: this.job?.id, find: this.sought, state: this.only, sort: this.sort }; },
-    question() { return { find: this.sought, state: this.only, sort: this.sort, job: this.chosen, after: this.behind.at(-1) || "" }; },
-    bulk(action) { this.busy = "bulk"; this.$emit("act", { name: "bulk", action, ids: [...this.picked] }); },
-    open() { const { method = "", detail = "", front = "", ...more } = this.job.settings; this.form = { job: this.job.id, method, model: "", detail: detail || "", front: front || "", more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "" }; },
-    restart() { this.busy = "restart"; this.$emit("act", { name: "restart", id: this.job.id, ...this.form }); },
+    place(j) {
+      return j.ahead ? say("{count} before it", { count: j.ahead }) : say("next");
+    },
+    fields() {
+      return { job: this.job?.id, find: this.sought, state: this.only, sort: this.sort };
+    },
+    question() {
+      return {
+        find: this.sought,
+        state: this.only,
+        sort: this.sort,
+        job: this.chosen,
+        after: this.behind.at(-1) || "",
+      };
+    },
+    bulk(action) {
+      this.busy = "bulk";
+      this.$emit("act", { name: "bulk", action, ids: [...this.picked] });
+    },
+    open() {
+      const { method = "", detail = "", front = "", ...more } = this.job.settings;
+      this.form = {
+        job: this.job.id,
+        method,
+        model: "",
+        detail: detail || "",
+        front: front || "",
+        more: Object.keys(more).length ? JSON.stringify(more, null, 1) : "",
+      };
+    },
+    restart() {
+      this.busy = "restart";
+      this.$emit("act", { name: "restart", id: this.job.id, ...this.form });
+    },
   },
 });

@@ -9,22 +9,63 @@ import { views3d } from "/console/static/views.js";
 import { clock, fixed, keepAddress, size, span, typing } from "/console/static/words.js";
 
 // viridis sampled at nine places (dark is small), as linear steps between them; it stays readable without colour vision
-const RAMP = [[0.267, 0.005, 0.329], [0.283, 0.141, 0.458], [0.254, 0.265, 0.53], [0.207, 0.372, 0.553], [0.164, 0.471, 0.558],
-  [0.128, 0.567, 0.551], [0.267, 0.679, 0.48], [0.478, 0.821, 0.318], [0.993, 0.906, 0.144]];
-const LIGHTS = { studio: [[0.6, 0.8, 1.2, 1.6], [-1.2, 0.3, 0.7, 0.7], [0.2, 0.9, -1.2, 0.8]], side: [[1.5, 0.3, 0.25, 2.6], [-1, 0, 0.4, 0.15], [0, 1, -1, 0.3]], flat: [[0, 0.2, 1, 1.0], [0, 0, -1, 0.6], [0, 1, 0, 0.3]] };
-const COLOURINGS = [["texture", "Texture", "T"], ["clay", "Clay", "G"], ["uncertainty", "Uncertainty", "U"], ["parts", "Parts", "P"]];
-const SURFACES = [["head", "Head", "H"], ["bust", "Bust", "B"]];
-const PARTS = [["unseen", [0.45, 0.47, 0.5]], ["skin", [0.9, 0.65, 0.5]], ["hair", [0.35, 0.25, 0.6]], ["clothes", [0.2, 0.6, 0.55]]];
+const RAMP = [
+  [0.267, 0.005, 0.329],
+  [0.283, 0.141, 0.458],
+  [0.254, 0.265, 0.53],
+  [0.207, 0.372, 0.553],
+  [0.164, 0.471, 0.558],
+  [0.128, 0.567, 0.551],
+  [0.267, 0.679, 0.48],
+  [0.478, 0.821, 0.318],
+  [0.993, 0.906, 0.144],
+];
+const LIGHTS = {
+  studio: [
+    [0.6, 0.8, 1.2, 1.6],
+    [-1.2, 0.3, 0.7, 0.7],
+    [0.2, 0.9, -1.2, 0.8],
+  ],
+  side: [
+    [1.5, 0.3, 0.25, 2.6],
+    [-1, 0, 0.4, 0.15],
+    [0, 1, -1, 0.3],
+  ],
+  flat: [
+    [0, 0.2, 1, 1.0],
+    [0, 0, -1, 0.6],
+    [0, 1, 0, 0.3],
+  ],
+};
+const COLOURINGS = [
+  ["texture", "Texture", "T"],
+  ["clay", "Clay", "G"],
+  ["uncertainty", "Uncertainty", "U"],
+  ["parts", "Parts", "P"],
+];
+const SURFACES = [
+  ["head", "Head", "H"],
+  ["bust", "Bust", "B"],
+];
+const PARTS = [
+  ["unseen", [0.45, 0.47, 0.5]],
+  ["skin", [0.9, 0.65, 0.5]],
+  ["hair", [0.35, 0.25, 0.6]],
+  ["clothes", [0.2, 0.6, 0.55]],
+];
 const FAR = 4; // medians: what lies beyond is shown as the scale's end, so that shoulders do not stretch it
 const FOV_DEG = 28; // up and down; in a view that is higher than wide about as much across
 const MM = 1000;
 
 function ramp(share) {
-  const at = Math.min(1, Math.max(0, share)) * (RAMP.length - 1), i = Math.min(RAMP.length - 2, Math.floor(at)), rest = at - i;
+  const at = Math.min(1, Math.max(0, share)) * (RAMP.length - 1),
+    i = Math.min(RAMP.length - 2, Math.floor(at)),
+    rest = at - i;
   return RAMP[i].map((value, k) => value + rest * (RAMP[i + 1][k] - value));
 }
 
-function stop(values, share) { // a quantile: one far vertex must not stretch the scale
+function stop(values, share) {
+  // a quantile: one far vertex must not stretch the scale
   const sorted = Float32Array.from(values).sort();
   return sorted[Math.floor(share * (sorted.length - 1))];
 }
@@ -38,29 +79,106 @@ export default spoken({
   mixins: [besideIt, exports3d, views3d],
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ sought: new URLSearchParams(location.search).get("find") || "", surface: "head", through: "", fade: 0.35, cameras: [], camerasKnown: false, strangers: false, picture: null, colouring: "texture", wire: false, measuring: false, lights: "studio", other: "", scale: null, loading: false, fault: "", points: [], pins: [], loaded: "", drawn: false, digits: 1 }),
+  data: () => ({
+    sought: new URLSearchParams(location.search).get("find") || "",
+    surface: "head",
+    through: "",
+    fade: 0.35,
+    cameras: [],
+    camerasKnown: false,
+    strangers: false,
+    picture: null,
+    colouring: "texture",
+    wire: false,
+    measuring: false,
+    lights: "studio",
+    other: "",
+    scale: null,
+    loading: false,
+    fault: "",
+    points: [],
+    pins: [],
+    loaded: "",
+    drawn: false,
+    digits: 1,
+  }),
   computed: {
-    job() { return this.state.job; },
-    surfaces() { return SURFACES.filter(([name]) => this.job?.files[`${name}.glb`]); },
-    colourings() { return COLOURINGS.filter(([name]) => name !== "parts" || this.surface === "bust"); },
-    others() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && (this.strangers || this.same(r))); },
-    elsewhere() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)).length; },
-    ofSubject() { return (this.state.results || []).filter((r) => r.id === this.job?.id || this.same(r)); },
-    ofOthers() { return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)); },
-    fileName() { // head-<subject>-<label>-<id>, of what every disk takes as a name
-      const told = [this.job.subject, this.job.capture].filter(Boolean).join("-").normalize("NFC").replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "").slice(0, 60);
+    job() {
+      return this.state.job;
+    },
+    surfaces() {
+      return SURFACES.filter(([name]) => this.job?.files[`${name}.glb`]);
+    },
+    colourings() {
+      return COLOURINGS.filter(([name]) => name !== "parts" || this.surface === "bust");
+    },
+    others() {
+      return (this.state.results || []).filter((r) => r.id !== this.job?.id && (this.strangers || this.same(r)));
+    },
+    elsewhere() {
+      return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r)).length;
+    },
+    ofSubject() {
+      return (this.state.results || []).filter((r) => r.id === this.job?.id || this.same(r));
+    },
+    ofOthers() {
+      return (this.state.results || []).filter((r) => r.id !== this.job?.id && !this.same(r));
+    },
+    fileName() {
+      // head-<subject>-<label>-<id>, of what every disk takes as a name
+      const told = [this.job.subject, this.job.capture]
+        .filter(Boolean)
+        .join("-")
+        .normalize("NFC")
+        .replace(/[^\p{L}\p{N}]+/gu, "-")
+        .replace(/^-|-$/g, "")
+        .slice(0, 60);
       return ["head", told, this.job.id.slice(-6)].filter(Boolean).join("-");
     },
-    distance() { return this.points.length === 2 ? MM * this.points[0].distanceTo(this.points[1]) : null; },
+    distance() {
+      return this.points.length === 2 ? MM * this.points[0].distanceTo(this.points[1]) : null;
+    },
   },
   watch: {
-    "job.id"(id) { if (id) { this.keepPlace(); this.strangers = false; this.load(id); this.readCameras(id); } },
-    sought(text) { clearTimeout(this.typed); this.typed = setTimeout(() => this.$emit("choose", { find: text }), 250); },
-    surface() { if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture"; this.load(this.job.id); },
-    through() { this.fit(); },
-    async colouring() { await this.paint(); this.paintMate(); this.shine(); }, other() { this.compare(); this.keepPlace(); },
-    wire() { this.showWire(); this.paintMate(); this.draw(); },
-    lights() { this.shine(); }, measuring(on) { if (!on) this.clearPoints(); },
+    "job.id"(id) {
+      if (id) {
+        this.keepPlace();
+        this.strangers = false;
+        this.load(id);
+        this.readCameras(id);
+      }
+    },
+    sought(text) {
+      clearTimeout(this.typed);
+      this.typed = setTimeout(() => this.$emit("choose", { find: text }), 250);
+    },
+    surface() {
+      if (this.surface === "head" && this.colouring === "parts") this.colouring = "texture";
+      this.load(this.job.id);
+    },
+    through() {
+      this.fit();
+    },
+    async colouring() {
+      await this.paint();
+      this.paintMate();
+      this.shine();
+    },
+    other() {
+      this.compare();
+      this.keepPlace();
+    },
+    wire() {
+      this.showWire();
+      this.paintMate();
+      this.draw();
+    },
+    lights() {
+      this.shine();
+    },
+    measuring(on) {
+      if (!on) this.clearPoints();
+    },
   },
   template: `
     <section class="page" aria-label="Result">
@@ -108,74 +226,171 @@ export default spoken({
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { resumed: new URLSearchParams(location.search).get("other") || "", three: { THREE, GLTFLoader }, clock, fixed, size, span, parts: PARTS, gradient: `linear-gradient(to top, ${this.gradientStops().join(", ")})` }); },
-  mounted() { this.build(); window.addEventListener("keydown", this.key); if (this.job) { this.keepPlace(); this.load(this.job.id); this.readCameras(this.job.id); } },
-  unmounted() { window.removeEventListener("keydown", this.key); this.observer?.disconnect(); this.renderer?.dispose(); },
+  created() {
+    Object.assign(this, {
+      resumed: new URLSearchParams(location.search).get("other") || "",
+      three: { THREE, GLTFLoader },
+      clock,
+      fixed,
+      size,
+      span,
+      parts: PARTS,
+      gradient: `linear-gradient(to top, ${this.gradientStops().join(", ")})`,
+    });
+  },
+  mounted() {
+    this.build();
+    window.addEventListener("keydown", this.key);
+    if (this.job) {
+      this.keepPlace();
+      this.load(this.job.id);
+      this.readCameras(this.job.id);
+    }
+  },
+  unmounted() {
+    window.removeEventListener("keydown", this.key);
+    this.observer?.disconnect();
+    this.renderer?.dispose();
+  },
   methods: {
     acted() {},
-    keepPlace() { // which head, and with which it is compared, outlive a reload
+    keepPlace() {
+      // which head, and with which it is compared, outlive a reload
       history.replaceState(history.state, "", `/result/${this.job.id}`);
       keepAddress({ find: this.sought, other: this.other || this.resumed });
     },
     goOnComparing() {
-      const other = this.resumed, known = (this.state.results || []).find((r) => r.id === other);
+      const other = this.resumed,
+        known = (this.state.results || []).find((r) => r.id === other);
       this.resumed = "";
-      if (known || (other === "truth" && this.job.truth)) { this.strangers ||= !!known && !this.same(known); this.other = other; }
+      if (known || (other === "truth" && this.job.truth)) {
+        this.strangers ||= !!known && !this.same(known);
+        this.other = other;
+      }
     },
     build() {
-      try { this.renderer = new THREE.WebGLRenderer({ canvas: this.$refs.canvas, antialias: true, alpha: true }); }
-      catch { this.fault = "This browser shows no 3D (WebGL is off). The downloads work."; return; }
+      try {
+        this.renderer = new THREE.WebGLRenderer({ canvas: this.$refs.canvas, antialias: true, alpha: true });
+      } catch {
+        this.fault = "This browser shows no 3D (WebGL is off). The downloads work.";
+        return;
+      }
       this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
       this.scene = new THREE.Scene();
       this.camera = new THREE.PerspectiveCamera(FOV_DEG, 1, 0.01, 10);
       this.controls = new OrbitControls(this.camera, this.$refs.canvas);
-      this.controls.addEventListener("change", this.draw); this.controls.addEventListener("end", this.turned);
-      this.material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.85, metalness: 0, side: THREE.DoubleSide });
+      this.controls.addEventListener("change", this.draw);
+      this.controls.addEventListener("end", this.turned);
+      this.material = new THREE.MeshStandardMaterial({
+        vertexColors: true,
+        roughness: 0.85,
+        metalness: 0,
+        side: THREE.DoubleSide,
+      });
       this.flat = new THREE.MeshBasicMaterial({ vertexColors: true, side: THREE.DoubleSide }); // data are not lit: shading would shift them off the legend
-      this.rig3d = new THREE.Group(); this.scene.add(this.rig3d); this.marks = new THREE.Group(); this.scene.add(this.marks);
+      this.rig3d = new THREE.Group();
+      this.scene.add(this.rig3d);
+      this.marks = new THREE.Group();
+      this.scene.add(this.marks);
       this.shine();
-      this.observer = new ResizeObserver(this.fit); this.observer.observe(this.$refs.view); this.fit();
+      this.observer = new ResizeObserver(this.fit);
+      this.observer.observe(this.$refs.view);
+      this.fit();
     },
     shine() {
       if (!this.rig3d) return;
       this.rig3d.clear();
-      this.rig3d.add(new THREE.AmbientLight("#ffffff", this.lights === "side" ? 0.25 : this.lights === "flat" ? 2.2 : this.colouring === "texture" ? 1.6 : 0.9));
-      for (const [x, y, z, power] of LIGHTS[this.lights]) { const light = new THREE.DirectionalLight("#ffffff", power); light.position.set(x, y, z); this.rig3d.add(light); }
+      this.rig3d.add(
+        new THREE.AmbientLight(
+          "#ffffff",
+          this.lights === "side" ? 0.25 : this.lights === "flat" ? 2.2 : this.colouring === "texture" ? 1.6 : 0.9,
+        ),
+      );
+      for (const [x, y, z, power] of LIGHTS[this.lights]) {
+        const light = new THREE.DirectionalLight("#ffffff", power);
+        light.position.set(x, y, z);
+        this.rig3d.add(light);
+      }
       this.draw();
     },
     fit() {
       const { clientWidth: w, clientHeight: h } = this.$refs.view;
       if (!w || !h || !this.renderer) return;
-      this.renderer.setSize(w, h, false); this.camera.aspect = w / (this.split ? 2 : 1) / h; this.camera.fov = Math.min(FOV_DEG / Math.min(1, this.camera.aspect), 3 * FOV_DEG); this.camera.updateProjectionMatrix();
+      this.renderer.setSize(w, h, false);
+      this.camera.aspect = w / (this.split ? 2 : 1) / h;
+      this.camera.fov = Math.min(FOV_DEG / Math.min(1, this.camera.aspect), 3 * FOV_DEG);
+      this.camera.updateProjectionMatrix();
       const view = this.cameras.find((c) => c.name === this.through);
       this.seen = view ? lookThrough(THREE, view, w, h) : this.camera;
       const place = view && fitted(view, w, h);
-      this.picture = view ? { address: `/console/jobs/${this.job.id}/photographs/${encodeURIComponent(view.name)}.jpg`, style: `position: absolute; left: ${place.left}px; top: ${place.top}px; width: ${place.width}px; height: ${place.height}px` } : null;
+      this.picture = view
+        ? {
+            address: `/console/jobs/${this.job.id}/photographs/${encodeURIComponent(view.name)}.jpg`,
+            style: `position: absolute; left: ${place.left}px; top: ${place.top}px; width: ${place.width}px; height: ${place.height}px`,
+          }
+        : null;
       this.controls.enabled = !view;
       this.draw();
     },
     async readCameras(id) {
-      this.cameras = []; this.camerasKnown = false; this.through = "";
+      this.cameras = [];
+      this.camerasKnown = false;
+      this.through = "";
       const answer = await fetch(`/console/jobs/${id}/cameras`);
       if (answer.ok && id === this.job?.id) this.cameras = await answer.json();
       this.camerasKnown = true;
     },
-    same(r) { return r.capture_id === this.job?.capture_id || (!!r.session && r.session === this.job?.session) || (!!r.subject && r.subject === this.job?.subject); },
+    same(r) {
+      return (
+        r.capture_id === this.job?.capture_id ||
+        (!!r.session && r.session === this.job?.session) ||
+        (!!r.subject && r.subject === this.job?.subject)
+      );
+    },
     headName(r) {
-      const how = [say(r.settings.method || "contour"), say(r.settings.detail), r.model && r.model !== "default" && r.model].filter(Boolean).join(", ");
-      return [r.subject, r.captured ? r.capture || say("capture {time}", { time: clock(r.captured) }) : say("removed capture"), how, say("made {time}", { time: clock(r.finished) })].filter(Boolean).join(" · ");
+      const how = [
+        say(r.settings.method || "contour"),
+        say(r.settings.detail),
+        r.model && r.model !== "default" && r.model,
+      ]
+        .filter(Boolean)
+        .join(", ");
+      return [
+        r.subject,
+        r.captured ? r.capture || say("capture {time}", { time: clock(r.captured) }) : say("removed capture"),
+        how,
+        say("made {time}", { time: clock(r.finished) }),
+      ]
+        .filter(Boolean)
+        .join(" · ");
     },
     draw() {
       if (!this.renderer || this.waiting) return;
-      this.waiting = requestAnimationFrame(() => { this.waiting = 0; this.renderOnce(); this.place(); });
+      this.waiting = requestAnimationFrame(() => {
+        this.waiting = 0;
+        this.renderOnce();
+        this.place();
+      });
     },
     renderOnce() {
-      if (this.split && this.mate) { const { clientWidth: w, clientHeight: h } = this.$refs.view; this.renderPair(w, h); } else this.renderer.render(this.scene, this.seen || this.camera);
+      if (this.split && this.mate) {
+        const { clientWidth: w, clientHeight: h } = this.$refs.view;
+        this.renderPair(w, h);
+      } else this.renderer.render(this.scene, this.seen || this.camera);
     },
-    gradientStops() { return RAMP.map((c) => `rgb(${c.map((v) => Math.round(255 * v))})`); },
+    gradientStops() {
+      return RAMP.map((c) => `rgb(${c.map((v) => Math.round(255 * v))})`);
+    },
     place() {
       const { clientWidth: w, clientHeight: h } = this.$refs.view || {};
-      this.pins = this.points.map((p) => { const q = p.clone().project(this.seen || this.camera); return { x: this.split ? (q.x + 1) / 4 * w + (this.right ? w / 2 : 0) : (q.x + 1) / 2 * w, y: (1 - q.y) / 2 * h, shown: q.z < 1 }; });
+      this.pins = this.points.map((p) => {
+        const q = p.clone().project(this.seen || this.camera);
+        return {
+          x: this.split ? ((q.x + 1) / 4) * w + (this.right ? w / 2 : 0) : ((q.x + 1) / 2) * w,
+          y: ((1 - q.y) / 2) * h,
+          shown: q.z < 1,
+        };
+      });
     },
     async numbers(name, id = this.job.id) {
       const answer = await fetch(`/console/jobs/${id}/${name}`);
@@ -185,100 +400,191 @@ export default spoken({
     async load(id) {
       if (!this.renderer) return;
       if (!this.surfaces.some(([name]) => name === this.surface)) this.surface = this.surfaces[0]?.[0] || "head";
-      const surface = this.surface, first = this.shown !== id;
-      this.loading = true; this.fault = ""; this.loaded = ""; this.clearPoints();
+      const surface = this.surface,
+        first = this.shown !== id;
+      this.loading = true;
+      this.fault = "";
+      this.loaded = "";
+      this.clearPoints();
       try {
         const head = await new GLTFLoader().loadAsync(`/console/jobs/${id}/${surface}.glb`);
         if (!this.drawn) await this.pictureShown();
         if (id !== this.job?.id || surface !== this.surface) return;
-        if (this.mesh) { this.scene.remove(this.mesh); this.mesh.geometry.dispose(); }
+        if (this.mesh) {
+          this.scene.remove(this.mesh);
+          this.mesh.geometry.dispose();
+        }
         let found = null;
-        head.scene.traverse((o) => { if (o.isMesh) found = o; });
+        head.scene.traverse((o) => {
+          if (o.isMesh) found = o;
+        });
         this.mesh = new THREE.Mesh(found.geometry, this.material);
-        this.skin?.map.dispose(); this.skin?.dispose();
-        this.skin = found.material.map ? new THREE.MeshStandardMaterial({ map: found.material.map, roughness: 0.85, metalness: 0, side: THREE.DoubleSide }) : null;
+        this.skin?.map.dispose();
+        this.skin?.dispose();
+        this.skin = found.material.map
+          ? new THREE.MeshStandardMaterial({
+              map: found.material.map,
+              roughness: 0.85,
+              metalness: 0,
+              side: THREE.DoubleSide,
+            })
+          : null;
         this.showWire();
         this.texture = found.geometry.attributes.color?.clone();
         this.repeated = head.asset.extras?.repeated_vertices || []; // at the texture's seam, after those of the .ply
         this.scene.add(this.mesh);
         this.mesh.geometry.computeBoundingSphere();
         const { radius } = this.mesh.geometry.boundingSphere;
-        this.controls.minDistance = radius * 0.4; this.controls.maxDistance = radius * 12;
+        this.controls.minDistance = radius * 0.4;
+        this.controls.maxDistance = radius * 12;
         if (first || this.side) this.lookFrom(this.side || "threequarter"); // where somebody turned it to, another surface of the head stays
         this.shown = id;
-        this.other = ""; this.kept = {};
+        this.other = "";
+        this.kept = {};
         await this.paint();
         if (first) this.goOnComparing();
         this.loaded = `${id} ${surface}`;
-        requestAnimationFrame(() => requestAnimationFrame(() => { this.drawn = true; })); // the service's picture goes when ours is there
-      } catch (error) { this.fault = say("The head cannot be shown: {reason}", { reason: say(error.message) }); }
+        requestAnimationFrame(() =>
+          requestAnimationFrame(() => {
+            this.drawn = true;
+          }),
+        ); // the service's picture goes when ours is there
+      } catch (error) {
+        this.fault = say("The head cannot be shown: {reason}", { reason: say(error.message) });
+      }
       this.loading = false;
     },
-    async pictureShown() { // a machine without graphics shows nothing while it draws the head: the picture goes first
-      if (this.$refs.first?.complete) await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+    async pictureShown() {
+      // a machine without graphics shows nothing while it draws the head: the picture goes first
+      if (this.$refs.first?.complete)
+        await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
     },
-    paintAs(name) { if (!this.mateId) this.other = ""; this.colouring = name; this.paint(); },
+    paintAs(name) {
+      if (!this.mateId) this.other = "";
+      this.colouring = name;
+      this.paint();
+    },
     async paint() {
       if (!this.mesh || (this.other && !this.mateId)) return;
       const geometry = this.mesh.geometry;
       this.scale = null;
       if (this.colouring === "uncertainty" || this.colouring === "parts") {
-        const name = this.colouring === "parts" ? "part" : "quality", surface = this.surface;
+        const name = this.colouring === "parts" ? "part" : "quality",
+          surface = this.surface;
         try {
           this.kept[name] = this.kept[name] || (await this.numbers(`${surface}.${name}.f32`));
           if (surface !== this.surface) return;
-          if (name === "quality") this.spread(this.kept.quality, say("Standard deviation")); else this.paintParts(this.kept.part);
-        } catch (error) { this.fault = error.message; }
+          if (name === "quality") this.spread(this.kept.quality, say("Standard deviation"));
+          else this.paintParts(this.kept.part);
+        } catch (error) {
+          this.fault = error.message;
+        }
       } else if (this.colouring === "clay") {
         this.mesh.material = this.material;
-        geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * geometry.attributes.position.count).fill(0.55), 3));
+        geometry.setAttribute(
+          "color",
+          new THREE.BufferAttribute(new Float32Array(3 * geometry.attributes.position.count).fill(0.55), 3),
+        );
       } else if (this.skin) this.mesh.material = this.skin;
-      else { this.mesh.material = this.material; geometry.setAttribute("color", this.texture); }
+      else {
+        this.mesh.material = this.material;
+        geometry.setAttribute("color", this.texture);
+      }
       this.draw();
     },
-    showWire() { for (const material of [this.material, this.flat, this.skin]) if (material) material.wireframe = this.wire; },
+    showWire() {
+      for (const material of [this.material, this.flat, this.skin]) if (material) material.wireframe = this.wire;
+    },
     withRepeated(values, repeated = this.repeated) {
       const all = new Float32Array(values.length + repeated.length);
-      all.set(values); repeated.forEach((from, i) => { all[values.length + i] = values[from]; });
+      all.set(values);
+      repeated.forEach((from, i) => {
+        all[values.length + i] = values[from];
+      });
       return all;
     },
     paintParts(values) {
-      const all = this.withRepeated(values), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
-      all.forEach((value, i) => { colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i); });
+      const all = this.withRepeated(values),
+        colours = new Float32Array(3 * all.length),
+        colour = new THREE.Color();
+      all.forEach((value, i) => {
+        colour.setRGB(...PARTS[value][1], THREE.SRGBColorSpace).toArray(colours, 3 * i);
+      });
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
     },
     async compare() {
       if (!this.mesh) return;
-      if (this.other && this.surface !== "head") { const wanted = this.other; this.surface = "head"; await this.$nextTick(); while (this.loading) await new Promise((done) => setTimeout(done, 50)); this.other = wanted; return; }
-      if (!this.other || this.mateId) { await this.paint(); return this.paintMate(); }
-      this.loading = true; this.fault = "";
+      if (this.other && this.surface !== "head") {
+        const wanted = this.other;
+        this.surface = "head";
+        await this.$nextTick();
+        while (this.loading) await new Promise((done) => setTimeout(done, 50));
+        this.other = wanted;
+        return;
+      }
+      if (!this.other || this.mateId) {
+        await this.paint();
+        return this.paintMate();
+      }
+      this.loading = true;
+      this.fault = "";
       const wanted = this.other;
       try {
         const values = await this.numbers(`distance.f32?other=${wanted}`);
-        if (wanted === this.other && !this.mateId) this.spread(values, say(wanted === "truth" ? "Distance to the truth" : this.same((this.state.results || []).find((r) => r.id === wanted) || {}) ? "Distance to the other head" : "Distance to a head of ANOTHER SUBJECT"));
-      } catch (error) { this.fault = error.message; }
-      this.loading = false; this.draw();
+        if (wanted === this.other && !this.mateId)
+          this.spread(
+            values,
+            say(
+              wanted === "truth"
+                ? "Distance to the truth"
+                : this.same((this.state.results || []).find((r) => r.id === wanted) || {})
+                  ? "Distance to the other head"
+                  : "Distance to a head of ANOTHER SUBJECT",
+            ),
+          );
+      } catch (error) {
+        this.fault = error.message;
+      }
+      this.loading = false;
+      this.draw();
     },
     heat(values, repeated, most) {
-      const all = this.withRepeated(values, repeated), colours = new Float32Array(3 * all.length), colour = new THREE.Color();
-      all.forEach((value, i) => { colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i); });
+      const all = this.withRepeated(values, repeated),
+        colours = new Float32Array(3 * all.length),
+        colour = new THREE.Color();
+      all.forEach((value, i) => {
+        colour.setRGB(...ramp(value / most), THREE.SRGBColorSpace).toArray(colours, 3 * i);
+      });
       return new THREE.BufferAttribute(colours, 3);
     },
     spread(values, title) {
-      const p95 = stop(values, 0.95), most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95);
+      const p95 = stop(values, 0.95),
+        most = nice(Math.min(p95, FAR * stop(values, 0.5)) || p95);
       this.mesh.material = this.flat;
       this.mesh.geometry.setAttribute("color", this.heat(values, this.repeated, most));
       this.digits = most < 1 ? 2 : 1;
       this.scale = { title, most, p95, beyond: stop(values, 1) > most, median: stop(values, 0.5) };
     },
-    press(event) { this.pressed = [event.clientX, event.clientY]; },
+    press(event) {
+      this.pressed = [event.clientX, event.clientY];
+    },
     pick(event) {
-      if (!this.measuring || !this.mesh || Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) > 4) return; // that was a turn
+      if (
+        !this.measuring ||
+        !this.mesh ||
+        Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) > 4
+      )
+        return; // that was a turn
       const box = this.$refs.canvas.getBoundingClientRect();
-      const across = (event.clientX - box.left) / box.width, right = this.split && across > 0.5;
-      const at = new THREE.Vector2((this.split ? 2 * across - (right ? 1 : 0) : across) * 2 - 1, 1 - (event.clientY - box.top) / box.height * 2);
-      const ray = new THREE.Raycaster(); if (this.through) {
+      const across = (event.clientX - box.left) / box.width,
+        right = this.split && across > 0.5;
+      const at = new THREE.Vector2(
+        (this.split ? 2 * across - (right ? 1 : 0) : across) * 2 - 1,
+        1 - ((event.clientY - box.top) / box.height) * 2,
+      );
+      const ray = new THREE.Raycaster();
+      if (this.through) {
         ray.ray.origin.setFromMatrixPosition(this.seen.matrixWorld);
         ray.ray.direction.set(at.x, at.y, 0.5).unproject(this.seen).sub(ray.ray.origin).normalize();
       } else ray.setFromCamera(at, this.camera);
@@ -287,26 +593,47 @@ export default spoken({
       if (this.points.length === 2 || right !== this.right) this.clearPoints(); // a distance is on one head
       this.right = right;
       this.points = [...this.points, hit.point.clone()];
-      const dot = new THREE.Mesh(new THREE.SphereGeometry(0.0015, 16, 12), new THREE.MeshBasicMaterial({ color: "#6cb2ff", depthTest: false }));
-      dot.position.copy(hit.point); dot.renderOrder = 2; this.marks.add(dot);
+      const dot = new THREE.Mesh(
+        new THREE.SphereGeometry(0.0015, 16, 12),
+        new THREE.MeshBasicMaterial({ color: "#6cb2ff", depthTest: false }),
+      );
+      dot.position.copy(hit.point);
+      dot.renderOrder = 2;
+      this.marks.add(dot);
       if (this.points.length === 2) {
-        const line = new THREE.Line(new THREE.BufferGeometry().setFromPoints([...this.points]), new THREE.LineBasicMaterial({ color: "#6cb2ff", depthTest: false }));
-        line.renderOrder = 2; this.marks.add(line);
+        const line = new THREE.Line(
+          new THREE.BufferGeometry().setFromPoints([...this.points]),
+          new THREE.LineBasicMaterial({ color: "#6cb2ff", depthTest: false }),
+        );
+        line.renderOrder = 2;
+        this.marks.add(line);
       }
       this.draw();
     },
-    clearPoints() { this.points = []; this.pins = []; this.marks?.clear(); this.draw(); },
+    clearPoints() {
+      this.points = [];
+      this.pins = [];
+      this.marks?.clear();
+      this.draw();
+    },
     turn(event) {
       const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
       if (!by) return;
       event.preventDefault();
       const s = new THREE.Spherical().setFromVector3(this.camera.position.clone().sub(this.controls.target));
-      s.theta += by[0] * 0.08; s.phi = Math.min(3.0, Math.max(0.14, s.phi + by[1] * 0.08));
-      this.camera.position.setFromSpherical(s).add(this.controls.target); this.controls.update(); this.turned(); this.draw();
+      s.theta += by[0] * 0.08;
+      s.phi = Math.min(3.0, Math.max(0.14, s.phi + by[1] * 0.08));
+      this.camera.position.setFromSpherical(s).add(this.controls.target);
+      this.controls.update();
+      this.turned();
+      this.draw();
     },
     key(event) {
       if (typing(event) || !this.job) return;
-      const key = event.key.toLowerCase(), has = ([, , k]) => k.toLowerCase() === key, named = this.colourings.find(has), solid = this.surfaces.find(has);
+      const key = event.key.toLowerCase(),
+        has = ([, , k]) => k.toLowerCase() === key,
+        named = this.colourings.find(has),
+        solid = this.surfaces.find(has);
       if (named) this.paintAs(named[0]);
       else if (solid && this.surfaces.length > 1) this.surface = solid[0];
       else if (key === "w") this.wire = !this.wire;

@@ -3,7 +3,19 @@ import { liveView } from "/console/static/live.js";
 import { say, spoken } from "/console/static/language.js";
 import { begunHere, leaveBegun } from "/console/static/started.js";
 import { Outline, Verdict, checksOf, faultsOf } from "/console/static/verdict.js";
-import { clock, fixed, keepAddress, keepDraft, keepSession, kept, openSession, sessionName, span, stageWords, typing } from "/console/static/words.js";
+import {
+  clock,
+  fixed,
+  keepAddress,
+  keepDraft,
+  keepSession,
+  kept,
+  openSession,
+  sessionName,
+  span,
+  stageWords,
+  typing,
+} from "/console/static/words.js";
 
 const COUNT_S = 3;
 const STALE_MS = 2500;
@@ -15,54 +27,146 @@ export default spoken({
   components: { Outline, Verdict },
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ now: Date.now(), taken: 0, count: 0, busy: "", session: openSession(), label: kept("shot")?.label || "", expression: kept("shot")?.expression || "", asking: null, dismissed: sessionStorage.getItem("eigenhead-plates") || "" }),
+  data: () => ({
+    now: Date.now(),
+    taken: 0,
+    count: 0,
+    busy: "",
+    session: openSession(),
+    label: kept("shot")?.label || "",
+    expression: kept("shot")?.expression || "",
+    asking: null,
+    dismissed: sessionStorage.getItem("eigenhead-plates") || "",
+  }),
   watch: {
-    session(id) { keepSession(id); }, label() { this.keepTyped(); }, expression() { this.keepTyped(); },
-    "state.job"(job, before) { if (job?.id !== before?.id || job?.state !== before?.state) this.keepPlace(); },
-    dismissed(id) { sessionStorage.setItem("eigenhead-plates", id); },
-    "state.shot.id": { handler(id) { this.readChecks(id); if (!this.state.loading) this.keepPlace(); }, immediate: true },
-    "state.sessions": { handler(all) { if (all && this.session && !this.open) this.session = ""; }, immediate: true },
+    session(id) {
+      keepSession(id);
+    },
+    label() {
+      this.keepTyped();
+    },
+    expression() {
+      this.keepTyped();
+    },
+    "state.job"(job, before) {
+      if (job?.id !== before?.id || job?.state !== before?.state) this.keepPlace();
+    },
+    dismissed(id) {
+      sessionStorage.setItem("eigenhead-plates", id);
+    },
+    "state.shot.id": {
+      handler(id) {
+        this.readChecks(id);
+        if (!this.state.loading) this.keepPlace();
+      },
+      immediate: true,
+    },
+    "state.sessions": {
+      handler(all) {
+        if (all && this.session && !this.open) this.session = "";
+      },
+      immediate: true,
+    },
   },
   computed: {
-    open() { return (this.state.sessions || []).find((s) => s.id === this.session) || null; },
-    cameras() { return this.state.cameras || []; },
+    open() {
+      return (this.state.sessions || []).find((s) => s.id === this.session) || null;
+    },
+    cameras() {
+      return this.state.cameras || [];
+    },
     lead() {
       if (this.state.loading) return say("Reading the rig's state");
-      const kind = say(this.state.kind === "simulated" ? "Simulated studio, {count} camera. | Simulated studio, {count} cameras." : "Rig, {count} camera. | Rig, {count} cameras.", { count: this.cameras.length });
+      const kind = say(
+        this.state.kind === "simulated"
+          ? "Simulated studio, {count} camera. | Simulated studio, {count} cameras."
+          : "Rig, {count} camera. | Rig, {count} cameras.",
+        { count: this.cameras.length },
+      );
       return `${kind} ${this.state.last ? say("Last capture {time}", { time: clock(this.state.last.created) }) : say(this.state.calibration ? "No capture yet: seat the subject and press the space bar" : "Calibrate it before the first capture")}`;
     },
     calibration() {
-      if (this.state.in_use) return { text: say("calibrated {time}", { time: clock(this.state.in_use.created) }), kind: "good" };
-      if (this.state.calibration) return { text: say(this.state.calibration === "studio" ? "studio's own layout" : "calibrated"), kind: "good" };
+      if (this.state.in_use)
+        return { text: say("calibrated {time}", { time: clock(this.state.in_use.created) }), kind: "good" };
+      if (this.state.calibration)
+        return { text: say(this.state.calibration === "studio" ? "studio's own layout" : "calibrated"), kind: "good" };
       return { text: say("not calibrated"), kind: "fault" };
     },
     advice() {
       const todo = (this.state.faults || []).map((text) => ({ text: say(text), kind: "fault" }));
-      const where = (test) => this.cameras.map((c) => c.name).filter((name) => this.live[name] && test(this.live[name])).join(", ");
+      const where = (test) =>
+        this.cameras
+          .map((c) => c.name)
+          .filter((name) => this.live[name] && test(this.live[name]))
+          .join(", ");
       const add = (names, text, kind = "warn") => names && todo.push({ text: `${names}: ${say(text)}`, kind });
-      add(where((l) => l.fault), "no picture. Check cable and power.", "fault");
-      add(where((l) => l.clipped > EXPOSURE.clipped || l.mean > EXPOSURE.bright), "too bright, skin burns out. Close the aperture or dim the lamps.");
-      add(where((l) => l.mean < EXPOSURE.dark), "too dark. Open the aperture or raise the lamps.");
-      add(where((l) => l.blur_px > SOFT_PX), "soft. Focus on the subject's near eye.");
-      add(this.cameras.filter((c) => c.moved).map((c) => c.name).join(", "), "has moved since the calibration. Calibrate again.");
-      add(this.cameras.filter((c) => this.sync(c).bad).map((c) => c.name).join(", "), "not in sync in the last shot. Check the trigger cable, shoot again.");
+      add(
+        where((l) => l.fault),
+        "no picture. Check cable and power.",
+        "fault",
+      );
+      add(
+        where((l) => l.clipped > EXPOSURE.clipped || l.mean > EXPOSURE.bright),
+        "too bright, skin burns out. Close the aperture or dim the lamps.",
+      );
+      add(
+        where((l) => l.mean < EXPOSURE.dark),
+        "too dark. Open the aperture or raise the lamps.",
+      );
+      add(
+        where((l) => l.blur_px > SOFT_PX),
+        "soft. Focus on the subject's near eye.",
+      );
+      add(
+        this.cameras
+          .filter((c) => c.moved)
+          .map((c) => c.name)
+          .join(", "),
+        "has moved since the calibration. Calibrate again.",
+      );
+      add(
+        this.cameras
+          .filter((c) => this.sync(c).bad)
+          .map((c) => c.name)
+          .join(", "),
+        "not in sync in the last shot. Check the trigger cable, shoot again.",
+      );
       return todo;
     },
-    looked() { return this.cameras.length > 0 && this.cameras.every((c) => this.live[c.name]?.bytes); },
+    looked() {
+      return this.cameras.length > 0 && this.cameras.every((c) => this.live[c.name]?.bytes);
+    },
     ready() {
       if (!this.looked) return say("Waiting for a picture of every camera.");
       const sharp = this.cameras.filter((c) => typeof this.live[c.name].blur_px === "number").length;
-      const sharpness = sharp ? say("So is sharpness, in the {sharp} of {all} judged so far.", { sharp, all: this.cameras.length }) : say("Sharpness is looked at next.");
-      return [say("Exposure is in order."), sharpness, say(this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot.")].join(" ");
+      const sharpness = sharp
+        ? say("So is sharpness, in the {sharp} of {all} judged so far.", { sharp, all: this.cameras.length })
+        : say("Sharpness is looked at next.");
+      return [
+        say("Exposure is in order."),
+        sharpness,
+        say(this.cameras.every((c) => c.sync) ? "The last shot was in sync." : "Sync shows after a shot."),
+      ].join(" ");
     },
     taking() {
       const seconds = Math.max(0, Math.round((this.now - this.taken) / 1000));
-      return this.state.kind === "simulated" ? say("The simulated studio seats another person and draws every picture: {seconds} s so far.", { seconds }) : say("Every camera delivers, then the pictures are judged: {seconds} s so far.", { seconds });
+      return this.state.kind === "simulated"
+        ? say("The simulated studio seats another person and draws every picture: {seconds} s so far.", { seconds })
+        : say("Every camera delivers, then the pictures are judged: {seconds} s so far.", { seconds });
     },
-    shot() { return this.state.shot; },
-    job() { return this.state.job; },
-    refused() { const found = this.state.plates?.refused; return found && found.id !== this.dismissed ? found : null; },
-    columns() { return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4)))); },
+    shot() {
+      return this.state.shot;
+    },
+    job() {
+      return this.state.job;
+    },
+    refused() {
+      const found = this.state.plates?.refused;
+      return found && found.id !== this.dismissed ? found : null;
+    },
+    columns() {
+      return Math.min(6, Math.ceil(Math.sqrt(Math.max(this.cameras.length + 1, 4))));
+    },
   },
   template: `
     <section class="page" aria-label="Rig" :data-holds="busy || count ? '' : null">
@@ -126,22 +230,43 @@ export default spoken({
           <div class="line"><button class="b main-action" :disabled="!!busy">Go on</button><button type="button" class="b quiet" @click="asking = null">No shot</button></div></form></div>
       <div v-if="count" class="countdown" role="alert"><span>{{ count }}</span></div>
     </section>`,
-  created() { this.faultsOf = faultsOf; this.clock = clock; this.sessionName = sessionName; this.soft = SOFT_PX; this.limit = EXPOSURE; this.fixed = fixed; this.span = span; this.stageWords = stageWords; },
+  created() {
+    this.faultsOf = faultsOf;
+    this.clock = clock;
+    this.sessionName = sessionName;
+    this.soft = SOFT_PX;
+    this.limit = EXPOSURE;
+    this.fixed = fixed;
+    this.span = span;
+    this.stageWords = stageWords;
+  },
   mounted() {
     window.addEventListener("keydown", this.key);
-    this.clockTimer = setInterval(() => { this.now = Date.now(); }, 500);
+    this.clockTimer = setInterval(() => {
+      this.now = Date.now();
+    }, 500);
     this.look();
     if (!this.job && !this.shot && begunHere()) this.$emit("choose", { job: begunHere() });
   },
   unmounted() {
     window.removeEventListener("keydown", this.key);
-    clearInterval(this.clockTimer); clearInterval(this.counter);
+    clearInterval(this.clockTimer);
+    clearInterval(this.counter);
   },
   methods: {
-    leaveJob() { leaveBegun(this.job.id); this.$emit("choose", { job: null }); },
-    keepTyped() { keepDraft("shot", this.label || this.expression ? { label: this.label, expression: this.expression } : null); },
-    keepPlace() { keepAddress({ shot: this.shot?.id, job: this.job?.id }); },
-    percent(share) { return share === undefined ? "-" : `${fixed(100 * share, share < 0.1 ? 1 : 0)}%`; },
+    leaveJob() {
+      leaveBegun(this.job.id);
+      this.$emit("choose", { job: null });
+    },
+    keepTyped() {
+      keepDraft("shot", this.label || this.expression ? { label: this.label, expression: this.expression } : null);
+    },
+    keepPlace() {
+      keepAddress({ shot: this.shot?.id, job: this.job?.id });
+    },
+    percent(share) {
+      return share === undefined ? "-" : `${fixed(100 * share, share < 0.1 ? 1 : 0)}%`;
+    },
     light(name) {
       const mean = this.live[name]?.mean;
       if (mean === undefined || mean === null) return { text: "-", bad: false };
@@ -149,7 +274,8 @@ export default spoken({
     },
     sync(camera) {
       if (!camera.sync) return { text: say("no shot yet"), bad: false };
-      const skew = camera.sync.skew_ms === null || camera.sync.skew_ms === undefined ? "" : ` ${fixed(camera.sync.skew_ms, 1)} ms`;
+      const skew =
+        camera.sync.skew_ms === null || camera.sync.skew_ms === undefined ? "" : ` ${fixed(camera.sync.skew_ms, 1)} ms`;
       return { text: say(camera.sync.status) + skew, bad: !["in sync", "ok"].includes(camera.sync.status) };
     },
     waiting(camera) {
@@ -162,37 +288,72 @@ export default spoken({
     start() {
       if (this.count) this.stop();
       else if (this.busy) return;
-      else if (this.state.ask_consent && !this.open?.consent) this.asking = { id: this.open?.id || "", label: this.open?.label || "", consent: "" };
+      else if (this.state.ask_consent && !this.open?.consent)
+        this.asking = { id: this.open?.id || "", label: this.open?.label || "", consent: "" };
       else this.countDown();
     },
     consent() {
-      this.begun = this.asking.id ? null : { label: this.asking.label, known: (this.state.sessions || []).map((s) => s.id) };
+      this.begun = this.asking.id
+        ? null
+        : { label: this.asking.label, known: (this.state.sessions || []).map((s) => s.id) };
       this.busy = "consent";
       this.$emit("act", { name: this.asking.id ? "edit_session" : "new_session", ...this.asking });
     },
     countDown() {
       this.count = COUNT_S;
-      this.counter = setInterval(() => { this.count -= 1; if (this.count === 0) { clearInterval(this.counter); this.act("capture"); } }, 1000);
+      this.counter = setInterval(() => {
+        this.count -= 1;
+        if (this.count === 0) {
+          clearInterval(this.counter);
+          this.act("capture");
+        }
+      }, 1000);
     },
-    stop() { clearInterval(this.counter); this.count = 0; },
-    usePlates(id) { if (!this.busy) { this.busy = "use_plates"; this.$emit("act", { name: "use_plates", id }); } },
-    plates() { if (!this.busy) this.act("plates"); },
-    act(name) { this.busy = name; this.taken = this.now = Date.now(); this.$emit("act", { name, label: this.label, expression: this.expression, session: this.open?.id }); },
+    stop() {
+      clearInterval(this.counter);
+      this.count = 0;
+    },
+    usePlates(id) {
+      if (!this.busy) {
+        this.busy = "use_plates";
+        this.$emit("act", { name: "use_plates", id });
+      }
+    },
+    plates() {
+      if (!this.busy) this.act("plates");
+    },
+    act(name) {
+      this.busy = name;
+      this.taken = this.now = Date.now();
+      this.$emit("act", { name, label: this.label, expression: this.expression, session: this.open?.id });
+    },
     acted(name) {
       this.busy = "";
       if (name === "new_session" && this.begun) {
-        const made = (this.state.sessions || []).find((s) => s.label === this.begun.label && !this.begun.known.includes(s.id));
+        const made = (this.state.sessions || []).find(
+          (s) => s.label === this.begun.label && !this.begun.known.includes(s.id),
+        );
         if (made) this.session = made.id;
         this.begun = null;
       }
-      if (["new_session", "edit_session"].includes(name) && this.asking && this.open?.consent) { this.asking = null; this.countDown(); }
+      if (["new_session", "edit_session"].includes(name) && this.asking && this.open?.consent) {
+        this.asking = null;
+        this.countDown();
+      }
       if (name === "retake" && !this.shot) this.countDown();
     },
-    decide(name) { if (this.shot && !this.busy) { this.busy = name; this.$emit("act", { name, id: this.shot.id }); } },
+    decide(name) {
+      if (this.shot && !this.busy) {
+        this.busy = name;
+        this.$emit("act", { name, id: this.shot.id });
+      }
+    },
     key(event) {
       if (typing(event)) return;
-      if (event.key === " ") { event.preventDefault(); if (!event.repeat) this.start(); }
-      else if (event.key === "Escape") this.stop();
+      if (event.key === " ") {
+        event.preventDefault();
+        if (!event.repeat) this.start();
+      } else if (event.key === "Escape") this.stop();
       else if (this.shot && "kK".includes(event.key)) this.decide("keep");
       else if (this.shot && "rR".includes(event.key)) this.decide("retake");
       else if (this.shot && event.key === "Enter" && event.target.tagName !== "BUTTON") this.decide("reconstruct");

@@ -2,19 +2,43 @@
 import { say, spoken } from "/console/static/language.js";
 import { clock, size } from "/console/static/words.js";
 
-const MAY = { read: "look and fetch", capture: "capture, upload, calibrate, erase", submit: "start and end jobs", admin: "everything, keys and storage too" };
-const HOLDS = { captures: "photographs and clean plates", results: "heads with their overlays, logs of jobs", caches: "silhouettes and thumbnails, made anew when asked for", calibrations: "board pictures and reports", unfinished: "uploads under way and what is being removed", "set aside": "damaged records, for a person to look at", rig: "clean plates and the rig's calibration", other: "the database, models, sign-ins" };
+const MAY = {
+  read: "look and fetch",
+  capture: "capture, upload, calibrate, erase",
+  submit: "start and end jobs",
+  admin: "everything, keys and storage too",
+};
+const HOLDS = {
+  captures: "photographs and clean plates",
+  results: "heads with their overlays, logs of jobs",
+  caches: "silhouettes and thumbnails, made anew when asked for",
+  calibrations: "board pictures and reports",
+  unfinished: "uploads under way and what is being removed",
+  "set aside": "damaged records, for a person to look at",
+  rig: "clean plates and the rig's calibration",
+  other: "the database, models, sign-ins",
+};
 
 export default spoken({
   props: { state: Object },
   emits: ["act", "choose"],
   data: () => ({ form: null, secret: "", copied: false, revoking: "", busy: "", clearing: false }),
   computed: {
-    keys() { return this.state.keys || []; },
-    kinds() { return this.state.storage?.kinds || []; },
-    held() { return this.kinds.reduce((sum, kind) => sum + kind.bytes, 0); },
-    most() { return Math.max(1, ...this.kinds.map((kind) => kind.bytes)); },
-    kept() { return this.state.retention || []; },
+    keys() {
+      return this.state.keys || [];
+    },
+    kinds() {
+      return this.state.storage?.kinds || [];
+    },
+    held() {
+      return this.kinds.reduce((sum, kind) => sum + kind.bytes, 0);
+    },
+    most() {
+      return Math.max(1, ...this.kinds.map((kind) => kind.bytes));
+    },
+    kept() {
+      return this.state.retention || [];
+    },
   },
   template: `
     <section class="page" aria-label="Service">
@@ -54,15 +78,39 @@ export default spoken({
         </div>
       </div>
     </section>`,
-  created() { Object.assign(this, { clock, size, may: MAY, holds: HOLDS }); },
+  created() {
+    Object.assign(this, { clock, size, may: MAY, holds: HOLDS });
+  },
   methods: {
-    act(name, more) { this.busy = name; this.$emit("act", { name, ...more }); },
-    acted(name, done) { this.busy = ""; if (name === "add_key" && done) this.form = null; if (name === "revoke") this.revoking = ""; },
-    async show_key(key) { this.secret = key; await this.$nextTick(); this.$refs.secret.focus(); },
+    act(name, more) {
+      this.busy = name;
+      this.$emit("act", { name, ...more });
+    },
+    acted(name, done) {
+      this.busy = "";
+      if (name === "add_key" && done) this.form = null;
+      if (name === "revoke") this.revoking = "";
+    },
+    async show_key(key) {
+      this.secret = key;
+      await this.$nextTick();
+      this.$refs.secret.focus();
+    },
     async copy() {
       this.$refs.secret.select();
-      try { await navigator.clipboard.writeText(this.secret); this.copied = true; } catch { this.copied = document.execCommand("copy"); } // without https there is no clipboard
+      try {
+        await navigator.clipboard.writeText(this.secret);
+        this.copied = true;
+      } catch {
+        this.copied = document.execCommand("copy");
+      } // without https there is no clipboard
     },
-    when(u) { return u.goes === null ? say(u.why === "make_room" ? "when the disk is full" : "when more come") : new Date(u.goes) <= new Date() ? say("at the next sweep") : clock(u.goes); },
+    when(u) {
+      return u.goes === null
+        ? say(u.why === "make_room" ? "when the disk is full" : "when more come")
+        : new Date(u.goes) <= new Date()
+          ? say("at the next sweep")
+          : clock(u.goes);
+    },
   },
 });

@@ -13,9 +13,21 @@ export default spoken({
         <button class="b main-action" :disabled="busy || !key" style="justify-content: center">{{ say(busy ? 'Looking ...' : 'Sign in') }}</button>
       </form>
     </div>`,
-  mounted() { document.title = `${say("Sign in")} - eigenhead`; this.$refs.key.focus(); },
+  mounted() {
+    document.title = `${say("Sign in")} - eigenhead`;
+    this.$refs.key.focus();
+  },
   methods: {
-    send() { this.busy = true; this.fault = ""; this.$emit("key", this.key); },
-    refuse(text) { this.busy = false; this.fault = text; this.key = ""; this.$nextTick(() => this.$refs.key.focus()); },
+    send() {
+      this.busy = true;
+      this.fault = "";
+      this.$emit("key", this.key);
+    },
+    refuse(text) {
+      this.busy = false;
+      this.fault = text;
+      this.key = "";
+      this.$nextTick(() => this.$refs.key.focus());
+    },
   },
 });

@@ -8,9 +8,32 @@ export default spoken({
   components: { Pager },
   props: { state: Object },
   emits: ["act", "choose"],
-  data: () => ({ sort: new URLSearchParams(location.search).get("sort") || "", tag: new URLSearchParams(location.search).get("tag") || "", form: kept("subjects form"), busy: "", plain: {} }),
-  watch: { sort() { this.first(); }, tag() { this.first(); }, form: { handler(form) { keepDraft("subjects form", form); }, deep: true } },
-  computed: { listed() { return this.state.subjects || []; } },
+  data: () => ({
+    sort: new URLSearchParams(location.search).get("sort") || "",
+    tag: new URLSearchParams(location.search).get("tag") || "",
+    form: kept("subjects form"),
+    busy: "",
+    plain: {},
+  }),
+  watch: {
+    sort() {
+      this.first();
+    },
+    tag() {
+      this.first();
+    },
+    form: {
+      handler(form) {
+        keepDraft("subjects form", form);
+      },
+      deep: true,
+    },
+  },
+  computed: {
+    listed() {
+      return this.state.subjects || [];
+    },
+  },
   template: `
     <section class="page" aria-label="Subjects">
       <header class="wraps"><h1>Subjects</h1><span class="lead">{{ state.loading ? say('Reading') : say('{count} person | {count} people', { count: state.total }) }}</span>
@@ -35,14 +58,39 @@ export default spoken({
         <pager :behind="behind.length" :next="state.next" :size="listed.length" :total="state.total" @back="back" @forward="forward"></pager>
       </div>
     </section>`,
-  created() { this.clock = clock; },
+  created() {
+    this.clock = clock;
+  },
   methods: {
-    async openForm() { this.form = { label: "", consent: "" }; await this.$nextTick(); this.$refs.subject.focus(); },
-    title(s) { return s.label || say("without a name, {time}", { time: clock(s.created) }); },
-    picture(s) { return this.plain[s.id] ? "" : s.head ? `/console/jobs/${s.head}/portrait.jpg` : s.capture ? `/console/captures/${s.capture}/front` : ""; },
-    open(s) { keepSession(s.id); },
-    fields() { return { find: this.sought, tag: this.tag, sort: this.sort }; },
-    question() { return { ...this.fields(), after: this.behind.at(-1) || "" }; },
-    acted(name, done) { this.busy = ""; if (done && name === "new_session") this.form = null; },
+    async openForm() {
+      this.form = { label: "", consent: "" };
+      await this.$nextTick();
+      this.$refs.subject.focus();
+    },
+    title(s) {
+      return s.label || say("without a name, {time}", { time: clock(s.created) });
+    },
+    picture(s) {
+      return this.plain[s.id]
+        ? ""
+        : s.head
+          ? `/console/jobs/${s.head}/portrait.jpg`
+          : s.capture
+            ? `/console/captures/${s.capture}/front`
+            : "";
+    },
+    open(s) {
+      keepSession(s.id);
+    },
+    fields() {
+      return { find: this.sought, tag: this.tag, sort: this.sort };
+    },
+    question() {
+      return { ...this.fields(), after: this.behind.at(-1) || "" };
+    },
+    acted(name, done) {
+      this.busy = "";
+      if (done && name === "new_session") this.form = null;
+    },
   },
 });

@@ -15,11 +15,25 @@ export default spoken({
   props: { links: Array, current: String, status: Object, removed: Array, followed: Array },
   emits: ["undo", "follow"],
   data: () => ({ messages: [], next: 1, help: false, look: localStorage.getItem("eigenhead-look") || "dark" }),
-  watch: { look: { handler(look) { document.documentElement.dataset.look = look; localStorage.setItem("eigenhead-look", look); }, immediate: true } },
+  watch: {
+    look: {
+      handler(look) {
+        document.documentElement.dataset.look = look;
+        localStorage.setItem("eigenhead-look", look);
+      },
+      immediate: true,
+    },
+  },
   computed: {
-    known() { return !!this.status && "jobs" in this.status; },
-    starting() { return (this.status?.starting || []).map((name) => this.part(name)); },
-    faults() { return Object.entries(this.status?.faults || {}); },
+    known() {
+      return !!this.status && "jobs" in this.status;
+    },
+    starting() {
+      return (this.status?.starting || []).map((name) => this.part(name));
+    },
+    faults() {
+      return Object.entries(this.status?.faults || {});
+    },
   },
   template: `
     <div class="frame">
@@ -55,39 +69,91 @@ export default spoken({
       </div>
     </div>`,
   created() {
-    this.speak = speak; this.otherLanguages = Object.fromEntries(Object.entries(LANGUAGES).filter(([tag]) => tag !== language));
-    this.keys = [["1 - 8", "go to a page"], ["Space", "Rig: capture"], ["B", "Rig: clean plates"], ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"], ["H", "Rig: open the head that is ready"], ["Esc", "stop a countdown, close"],
-      ["1 - 7", "Features: choose a point"], ["Arrows", "Features: move it by 0.25 px (Shift: 2 px)"], ["Tab", "Features: next view"], ["Enter", "Features: take the suggested place"],
-      ["Del", "Features: take the point back"], ["S", "Features: save"], ["H B", "Result: head, bust"], ["T G U P", "Result: texture, clay, uncertainty, parts"], ["W M", "Result: wireframe, measure"], ["V F", "Result: next view, full screen"], ["?", "this list"]];
+    this.speak = speak;
+    this.otherLanguages = Object.fromEntries(Object.entries(LANGUAGES).filter(([tag]) => tag !== language));
+    this.keys = [
+      ["1 - 8", "go to a page"],
+      ["Space", "Rig: capture"],
+      ["B", "Rig: clean plates"],
+      ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"],
+      ["H", "Rig: open the head that is ready"],
+      ["Esc", "stop a countdown, close"],
+      ["1 - 7", "Features: choose a point"],
+      ["Arrows", "Features: move it by 0.25 px (Shift: 2 px)"],
+      ["Tab", "Features: next view"],
+      ["Enter", "Features: take the suggested place"],
+      ["Del", "Features: take the point back"],
+      ["S", "Features: save"],
+      ["H B", "Result: head, bust"],
+      ["T G U P", "Result: texture, clay, uncertainty, parts"],
+      ["W M", "Result: wireframe, measure"],
+      ["V F", "Result: next view, full screen"],
+      ["?", "this list"],
+    ];
     window.eigenheadSay = (kind, text, faults) => this.announce(kind, text, faults || []);
   },
-  mounted() { window.addEventListener("keydown", this.key); document.addEventListener("scroll", this.scrolled, true); this.scrollBack(); this.translatePopups(); this.$el.querySelector(".rail [aria-current]")?.scrollIntoView({ block: "nearest", inline: "center" }); },
-  unmounted() { window.removeEventListener("keydown", this.key); document.removeEventListener("scroll", this.scrolled, true); clearInterval(this.scrolling); },
+  mounted() {
+    window.addEventListener("keydown", this.key);
+    document.addEventListener("scroll", this.scrolled, true);
+    this.scrollBack();
+    this.translatePopups();
+    this.$el.querySelector(".rail [aria-current]")?.scrollIntoView({ block: "nearest", inline: "center" });
+  },
+  unmounted() {
+    window.removeEventListener("keydown", this.key);
+    document.removeEventListener("scroll", this.scrolled, true);
+    clearInterval(this.scrolling);
+  },
   methods: {
     announce(kind, text, faults, link) {
-      const id = this.next++, further = faults.filter((fault) => !english(text).includes(english(fault))).map((fault) => say(fault));
+      const id = this.next++,
+        further = faults.filter((fault) => !english(text).includes(english(fault))).map((fault) => say(fault));
       this.messages = [...this.messages, { id, kind, text: say(text), link, faults: further }].slice(-MESSAGES_MOST);
       if (kind === "done" && !link) setTimeout(() => this.drop(id), MESSAGE_MS); // what went wrong stays until it was read
     },
-    part(name) { return say(name === "egl" ? "graphics" : name); },
-    turn() { this.look = this.look === "light" ? "dark" : "light"; },
-    translatePopups() { document.querySelectorAll(".nicegui-error-popup span").forEach((words) => { words.textContent = say(words.textContent); }); }, // NiceGUI's own
-    place(name) { return `eigenhead scroll ${location.pathname} ${name}`; },
-    scrolled(event) { const name = event.target.dataset?.scroll; if (name && !this.scrolling) sessionStorage.setItem(this.place(name), event.target.scrollTop); },
-    scrollBack() { // to where the lists were before a reload, as soon as they are long enough again
-      const began = Date.now(), wanted = (list) => Number(sessionStorage.getItem(this.place(list.dataset.scroll)) || 0);
+    part(name) {
+      return say(name === "egl" ? "graphics" : name);
+    },
+    turn() {
+      this.look = this.look === "light" ? "dark" : "light";
+    },
+    translatePopups() {
+      document.querySelectorAll(".nicegui-error-popup span").forEach((words) => {
+        words.textContent = say(words.textContent);
+      });
+    }, // NiceGUI's own
+    place(name) {
+      return `eigenhead scroll ${location.pathname} ${name}`;
+    },
+    scrolled(event) {
+      const name = event.target.dataset?.scroll;
+      if (name && !this.scrolling) sessionStorage.setItem(this.place(name), event.target.scrollTop);
+    },
+    scrollBack() {
+      // to where the lists were before a reload, as soon as they are long enough again
+      const began = Date.now(),
+        wanted = (list) => Number(sessionStorage.getItem(this.place(list.dataset.scroll)) || 0);
       this.scrolling = setInterval(() => {
-        const lists = [...document.querySelectorAll("[data-scroll]")], back = lists.filter((list) => list.scrollHeight - list.clientHeight >= wanted(list));
-        back.forEach((list) => { list.scrollTop = wanted(list); });
-        if ((lists.length && back.length === lists.length) || Date.now() - began > SCROLL_BACK_MS) { clearInterval(this.scrolling); this.scrolling = 0; }
+        const lists = [...document.querySelectorAll("[data-scroll]")],
+          back = lists.filter((list) => list.scrollHeight - list.clientHeight >= wanted(list));
+        back.forEach((list) => {
+          list.scrollTop = wanted(list);
+        });
+        if ((lists.length && back.length === lists.length) || Date.now() - began > SCROLL_BACK_MS) {
+          clearInterval(this.scrolling);
+          this.scrolling = 0;
+        }
       }, 100);
     },
-    drop(id) { this.messages = this.messages.filter((m) => m.id !== id); },
+    drop(id) {
+      this.messages = this.messages.filter((m) => m.id !== id);
+    },
     key(event) {
       if (typing(event)) return;
       if (event.key === "?") this.help = !this.help;
       else if (event.key === "Escape") this.help = false;
-      else if (/^[1-8]$/.test(event.key) && !document.querySelector(`[data-digits~="${event.key}"]`)) window.location.href = this.links[event.key - 1].path;
+      else if (/^[1-8]$/.test(event.key) && !document.querySelector(`[data-digits~="${event.key}"]`))
+        window.location.href = this.links[event.key - 1].path;
     },
   },
 });

@@ -11,7 +11,10 @@ const known = (tag) => Object.keys(LANGUAGES).find((language) => tag?.toLowerCas
 export const language = known(localStorage.getItem(KEPT)) || navigator.languages.map(known).find(Boolean) || "en";
 // Times are written as this reader of the language is used to: en-GB and en-US differ.
 export const locale = navigator.languages.find((tag) => known(tag) === language) || language;
-export function speak(chosen) { localStorage.setItem(KEPT, chosen); location.reload(); }
+export function speak(chosen) {
+  localStorage.setItem(KEPT, chosen);
+  location.reload();
+}
 
 const table = language === "en" ? {} : (await import(`./${language}.js`)).default;
 const messages = language === "en" ? {} : (await import(`./messages_${language}.js`)).default;
@@ -24,22 +27,36 @@ export function say(text, values = {}) {
   const found = (values.context && table[`${text} (${values.context})`]) ?? table[text] ?? text;
   if (typeof found !== "string") return found;
   const forms = "count" in values ? found.split(" | ") : [found];
-  return forms[values.count === 1 ? 0 : forms.length - 1].replace(/\{(\w+)\}/g, (whole, name) => (name in values ? values[name] : whole));
+  return forms[values.count === 1 ? 0 : forms.length - 1].replace(/\{(\w+)\}/g, (whole, name) =>
+    name in values ? values[name] : whole,
+  );
 }
 
 // A number that is written with a point, as the language writes it.
-export function decimal(text) { return language === "de" && /^[+-]?\d+\.\d+( [A-Za-z%]+)?$/.test(text) ? text.replace(".", ",") : text; }
+export function decimal(text) {
+  return language === "de" && /^[+-]?\d+\.\d+( [A-Za-z%]+)?$/.test(text) ? text.replace(".", ",") : text;
+}
 
 // Tags, whose quoted values may hold ">", and the text between them.
-const PARTS = /(<[^!](?:"[^"]*"|[^">])*>)|([^<]+)/g, READ_OUT = /(\s(?:aria-label|title|placeholder|alt|label)=")([^"]+)(?=")/g;
+const PARTS = /(<[^!](?:"[^"]*"|[^">])*>)|([^<]+)/g,
+  READ_OUT = /(\s(?:aria-label|title|placeholder|alt|label)=")([^"]+)(?=")/g;
 const key = (words) => words.trim().replace(/\s+/g, " ");
 
 function inLanguage(markup) {
-  return markup.replace(PARTS, (_, tag, words) => (tag ? tag.replace(READ_OUT, (_, before, read) => before + (table[read] ?? read)) : words.replace(/\S(?:[\s\S]*\S)?/, (said) => table[key(said)] ?? said)));
+  return markup.replace(PARTS, (_, tag, words) =>
+    tag
+      ? tag.replace(READ_OUT, (_, before, read) => before + (table[read] ?? read))
+      : words.replace(/\S(?:[\s\S]*\S)?/, (said) => table[key(said)] ?? said),
+  );
 }
 
 export function spoken(component) {
-  return { ...component, template: language === "en" ? component.template : inLanguage(component.template),
-    beforeCreate() { document.documentElement.lang = language; }, // Quasar has set its own
-    methods: { ...component.methods, say } };
+  return {
+    ...component,
+    template: language === "en" ? component.template : inLanguage(component.template),
+    beforeCreate() {
+      document.documentElement.lang = language;
+    }, // Quasar has set its own
+    methods: { ...component.methods, say },
+  };
 }

@@ -12,27 +12,72 @@ export const Pager = spoken({
 });
 
 export const paged = {
-  data: () => ({ chosen: "", sought: new URLSearchParams(location.search).get("find") || "", behind: [], picking: false, picked: [] }),
+  data: () => ({
+    chosen: "",
+    sought: new URLSearchParams(location.search).get("find") || "",
+    behind: [],
+    picking: false,
+    picked: [],
+  }),
   watch: {
-    sought() { clearTimeout(this.waiting); this.waiting = setTimeout(() => this.first(), TYPING_MS); },
+    sought() {
+      clearTimeout(this.waiting);
+      this.waiting = setTimeout(() => this.first(), TYPING_MS);
+    },
   },
-  mounted() { if (Object.values(this.question()).some(Boolean)) this.$emit("choose", this.question()); },
+  mounted() {
+    if (Object.values(this.question()).some(Boolean)) this.$emit("choose", this.question());
+  },
   methods: {
-    keepAddress() { keepAddress(this.fields()); },
-    ask() { this.keepAddress(); this.$emit("choose", this.question()); },
-    first() { this.behind = []; this.picked = []; this.ask(); },
-    forward() { if (this.state.next) { this.behind = [...this.behind, this.state.next]; this.ask(); this.top(); } },
-    back() { this.behind = this.behind.slice(0, -1); this.ask(); this.top(); },
-    top() { this.$el.querySelector("[data-scroll]")?.scrollTo(0, 0); },
-    choose(id) { this.chosen = id; this.ask(); },
-    pickMany() { this.picking = !this.picking; this.picked = []; },
-    pickAll() { this.picked = this.listed.map((one) => one.id); },
-    walk(event) { // arrows go from row to row
-      const by = { ArrowDown: 1, ArrowUp: -1 }[event.key], rows = [...event.currentTarget.querySelectorAll(".row-button")];
+    keepAddress() {
+      keepAddress(this.fields());
+    },
+    ask() {
+      this.keepAddress();
+      this.$emit("choose", this.question());
+    },
+    first() {
+      this.behind = [];
+      this.picked = [];
+      this.ask();
+    },
+    forward() {
+      if (this.state.next) {
+        this.behind = [...this.behind, this.state.next];
+        this.ask();
+        this.top();
+      }
+    },
+    back() {
+      this.behind = this.behind.slice(0, -1);
+      this.ask();
+      this.top();
+    },
+    top() {
+      this.$el.querySelector("[data-scroll]")?.scrollTo(0, 0);
+    },
+    choose(id) {
+      this.chosen = id;
+      this.ask();
+    },
+    pickMany() {
+      this.picking = !this.picking;
+      this.picked = [];
+    },
+    pickAll() {
+      this.picked = this.listed.map((one) => one.id);
+    },
+    walk(event) {
+      // arrows go from row to row
+      const by = { ArrowDown: 1, ArrowUp: -1 }[event.key],
+        rows = [...event.currentTarget.querySelectorAll(".row-button")];
       if (!by || !rows.length) return;
       event.preventDefault();
-      const at = rows.indexOf(document.activeElement), to = rows[Math.min(rows.length - 1, Math.max(0, at < 0 ? 0 : at + by))];
-      to.focus(); to.click(); to.scrollIntoView({ block: "nearest" });
+      const at = rows.indexOf(document.activeElement),
+        to = rows[Math.min(rows.length - 1, Math.max(0, at < 0 ? 0 : at + by))];
+      to.focus();
+      to.click();
+      to.scrollIntoView({ block: "nearest" });
     },
   },
 };

@@ -1,10 +1,17 @@
 // Live pictures for a page: it calls look(), keep()s a canvas a camera, and reads what is known of each in live[name].
 export const liveView = {
   data: () => ({ live: {}, fault: "" }),
-  created() { this.canvas = {}; },
-  unmounted() { this.gone = true; this.reader?.cancel(); },
+  created() {
+    this.canvas = {};
+  },
+  unmounted() {
+    this.gone = true;
+    this.reader?.cancel();
+  },
   methods: {
-    keep(name, element) { if (element) this.canvas[name] = element; },
+    keep(name, element) {
+      if (element) this.canvas[name] = element;
+    },
     async look() {
       while (!this.gone) {
         try {
@@ -12,7 +19,9 @@ export const liveView = {
           if (!answer.ok) throw new Error(answer.statusText);
           this.reader = answer.body.getReader();
           await this.read(this.reader);
-        } catch { this.fault = "Waiting for the service ..."; }
+        } catch {
+          this.fault = "Waiting for the service ...";
+        }
         await new Promise((resolve) => setTimeout(resolve, 1000));
       }
     },
@@ -22,11 +31,14 @@ export const liveView = {
         const { done, value } = await reader.read();
         if (done) return;
         const joined = new Uint8Array(kept.length + value.length);
-        joined.set(kept); joined.set(value, kept.length); kept = joined;
+        joined.set(kept);
+        joined.set(value, kept.length);
+        kept = joined;
         for (;;) {
           if (kept.length < 8) break;
           const view = new DataView(kept.buffer, kept.byteOffset);
-          const header = view.getUint32(0), body = view.getUint32(4);
+          const header = view.getUint32(0),
+            body = view.getUint32(4);
           if (kept.length < 8 + header + body) break;
           const document = JSON.parse(new TextDecoder().decode(kept.subarray(8, 8 + header)));
           await this.show(document, kept.slice(8 + header, 8 + header + body));
@@ -45,7 +57,10 @@ export const liveView = {
         const canvas = this.canvas[camera.name];
         if (!canvas || !camera.bytes) return;
         const picture = await createImageBitmap(new Blob([data], { type: "image/jpeg" }));
-        if (canvas.width !== picture.width || canvas.height !== picture.height) { canvas.width = picture.width; canvas.height = picture.height; }
+        if (canvas.width !== picture.width || canvas.height !== picture.height) {
+          canvas.width = picture.width;
+          canvas.height = picture.height;
+        }
         canvas.getContext("2d").drawImage(picture, 0, 0);
         picture.close();
       });

@@ -4,18 +4,37 @@ import { fixed } from "/console/static/words.js";
 
 const WORDS = { good: "Good", usable: "Usable", poor: "Poor" };
 const KINDS = { good: "good", usable: "warn", poor: "fault" };
-const CODES = { moved: "moved", overexposed: "burnt out", blurred: "out of focus", setting: "setting not taken", plates: "no clean plates",
-  empty: "nobody there", "cut-off": "head cut off", dark: "dark", "lights-off": "lamps off", view: "another view", swapped: "swapped" };
+const CODES = {
+  moved: "moved",
+  overexposed: "burnt out",
+  blurred: "out of focus",
+  setting: "setting not taken",
+  plates: "no clean plates",
+  empty: "nobody there",
+  "cut-off": "head cut off",
+  dark: "dark",
+  "lights-off": "lamps off",
+  view: "another view",
+  swapped: "swapped",
+};
 
 export function verdictTag(capture) {
-  return capture.verdict ? { text: say(WORDS[capture.verdict]), kind: KINDS[capture.verdict] } : { text: say("not judged"), kind: "" };
+  return capture.verdict
+    ? { text: say(WORDS[capture.verdict]), kind: KINDS[capture.verdict] }
+    : { text: say("not judged"), kind: "" };
 }
 
 // One line a fault; the same fault of several cameras is one line.
 function faultLines(faults) {
   const lines = new Map();
   for (const fault of faults || []) {
-    const line = lines.get(fault.code) || { code: fault.code, title: say(CODES[fault.code] || fault.code), cameras: [], details: [], remedy: say({ code: `remedy-${fault.code}`, message: fault.remedy }) };
+    const line = lines.get(fault.code) || {
+      code: fault.code,
+      title: say(CODES[fault.code] || fault.code),
+      cameras: [],
+      details: [],
+      remedy: say({ code: `remedy-${fault.code}`, message: fault.remedy }),
+    };
     line.cameras.push(fault.camera || say("all cameras"));
     line.details.push(say(fault.detail_message ?? fault.detail));
     lines.set(fault.code, line);
@@ -24,21 +43,31 @@ function faultLines(faults) {
 }
 
 export function faultsOf(capture, camera) {
-  return (capture.faults || []).filter((fault) => fault.camera === camera || fault.camera === null).map((fault) => say(CODES[fault.code] || fault.code));
+  return (capture.faults || [])
+    .filter((fault) => fault.camera === camera || fault.camera === null)
+    .map((fault) => say(CODES[fault.code] || fault.code));
 }
 
 export const Verdict = spoken({
   props: { capture: Object },
   computed: {
-    tag() { return verdictTag(this.capture); },
-    lines() { return faultLines(this.capture.faults); },
+    tag() {
+      return verdictTag(this.capture);
+    },
+    lines() {
+      return faultLines(this.capture.faults);
+    },
     sentence() {
-      const named = new Set((this.capture.faults || []).map((fault) => fault.camera)), all = this.capture.cameras.length;
+      const named = new Set((this.capture.faults || []).map((fault) => fault.camera)),
+        all = this.capture.cameras.length;
       if (!this.capture.verdict) return say("This capture was made before pictures were judged.");
-      if (this.capture.verdict === "good") return say("All {all} pictures are exposed, sharp and framed, and no camera moved.", { all });
+      if (this.capture.verdict === "good")
+        return say("All {all} pictures are exposed, sharp and framed, and no camera moved.", { all });
       if (named.has(null)) return say("Something is wrong with all pictures: shoot again.");
       const sound = say("{sound} of {all} cameras are without a fault.", { sound: all - named.size, all });
-      return this.capture.verdict === "usable" ? `${sound} ${say("Enough for a head; better ones are had by mending what is listed.")}` : `${sound} ${say("Too few for a sound head: mend what is listed and shoot again.")}`;
+      return this.capture.verdict === "usable"
+        ? `${sound} ${say("Enough for a head; better ones are had by mending what is listed.")}`
+        : `${sound} ${say("Too few for a sound head: mend what is listed and shoot again.")}`;
     },
   },
   template: `
@@ -51,7 +80,11 @@ export const Verdict = spoken({
 
 export const Outline = {
   props: { view: Object, size: Array },
-  computed: { points() { return (this.view?.subject?.outline || []).map((corner) => corner.join(",")).join(" "); } },
+  computed: {
+    points() {
+      return (this.view?.subject?.outline || []).map((corner) => corner.join(",")).join(" ");
+    },
+  },
   template: `<svg v-if="points" class="outline" :viewBox="'-0.5 -0.5 ' + size[0] + ' ' + size[1]" preserveAspectRatio="xMidYMid meet" aria-hidden="true"><polygon :points="points" vector-effect="non-scaling-stroke"></polygon></svg>`,
 };
 
@@ -64,12 +97,17 @@ export const checksOf = {
       const answer = await fetch(`/console/captures/${id}/checks`);
       if (answer.ok) this.checks[id] = await answer.json();
     },
-    view(id, camera) { return this.checks[id]?.[camera]; },
+    view(id, camera) {
+      return this.checks[id]?.[camera];
+    },
     measures(id, camera) {
       const view = this.view(id, camera);
       if (!view) return "";
-      const parts = [view.subject && say("subject {share} %", { share: Math.round(100 * view.subject.share) }), view.mean !== undefined && say("exp {mean}", { mean: Math.round(view.mean) }),
-        view.blur_px !== undefined && view.blur_px !== null && say("blur {blur} px", { blur: fixed(view.blur_px, 1) })];
+      const parts = [
+        view.subject && say("subject {share} %", { share: Math.round(100 * view.subject.share) }),
+        view.mean !== undefined && say("exp {mean}", { mean: Math.round(view.mean) }),
+        view.blur_px !== undefined && view.blur_px !== null && say("blur {blur} px", { blur: fixed(view.blur_px, 1) }),
+      ];
       return parts.filter(Boolean).join(" · ");
     },
   },

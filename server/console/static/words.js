@@ -2,7 +2,8 @@
 import { decimal, locale, say } from "/console/static/language.js";
 
 export function typing(event) {
-  const target = event.target, ticked = target.type === "checkbox"; // which takes the space bar alone
+  const target = event.target,
+    ticked = target.type === "checkbox"; // which takes the space bar alone
   const taken = ticked ? event.key === " " : /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName);
   return target.isContentEditable || taken || event.ctrlKey || event.metaKey || event.altKey;
 }
@@ -11,7 +12,12 @@ export function clock(moment) {
   if (!moment) return "";
   const date = new Date(moment);
   const today = new Date().toDateString() === date.toDateString();
-  const time = date.toLocaleTimeString(locale, { hour: "2-digit", minute: "2-digit", second: "2-digit", hour12: false });
+  const time = date.toLocaleTimeString(locale, {
+    hour: "2-digit",
+    minute: "2-digit",
+    second: "2-digit",
+    hour12: false,
+  });
   return today ? time : `${date.toLocaleDateString(locale, { day: "numeric", month: "short" })} ${time}`;
 }
 
@@ -23,25 +29,70 @@ export function span(seconds) {
 }
 
 export function size(bytes) {
-  return bytes > 1e9 ? `${fixed(bytes / 1e9, 1)} GB` : bytes > 1e6 ? `${fixed(bytes / 1e6, 1)} MB` : `${Math.ceil(bytes / 1e3)} kB`;
+  return bytes > 1e9
+    ? `${fixed(bytes / 1e9, 1)} GB`
+    : bytes > 1e6
+      ? `${fixed(bytes / 1e6, 1)} MB`
+      : `${Math.ceil(bytes / 1e3)} kB`;
 }
 
 export function fixed(value, digits) {
   return value === null || value === undefined ? "-" : decimal(Number(value).toFixed(digits));
 }
 
-const STAGES = { ingest: "taking the pictures in", read: "reading the pictures", segmentation: "finding silhouettes", faces: "finding the face", alignment: "placing the head", fit: "fitting the head",
-  texture: "colouring the head", evidence: "judging the fit", write: "writing the files", parts: "telling skin, hair and clothes apart", "fit again": "fitting the head again", depth: "measuring depths in the photographs", fine: "drawing the head to the photographs",
-  bust: "closing the surface of the bust", atlas: "painting the texture", compiling: "compiling, once on this machine", done: "done", detection: "finding the board in the pictures", lenses: "estimating the lenses", "pose graph": "placing the cameras", bundle: "adjusting cameras and boards together", checks: "checking the result",
-  features: "finding distinct points in the photographs", matches: "finding the same points in other photographs", structure: "placing the cameras", scale: "measuring the scale", silhouettes: "comparing silhouettes" };
-export function stageWords(stage) { return say(STAGES[stage] || stage); }
+const STAGES = {
+  ingest: "taking the pictures in",
+  read: "reading the pictures",
+  segmentation: "finding silhouettes",
+  faces: "finding the face",
+  alignment: "placing the head",
+  fit: "fitting the head",
+  texture: "colouring the head",
+  evidence: "judging the fit",
+  write: "writing the files",
+  parts: "telling skin, hair and clothes apart",
+  "fit again": "fitting the head again",
+  depth: "measuring depths in the photographs",
+  fine: "drawing the head to the photographs",
+  bust: "closing the surface of the bust",
+  atlas: "painting the texture",
+  compiling: "compiling, once on this machine",
+  done: "done",
+  detection: "finding the board in the pictures",
+  lenses: "estimating the lenses",
+  "pose graph": "placing the cameras",
+  bundle: "adjusting cameras and boards together",
+  checks: "checking the result",
+  features: "finding distinct points in the photographs",
+  matches: "finding the same points in other photographs",
+  structure: "placing the cameras",
+  scale: "measuring the scale",
+  silhouettes: "comparing silhouettes",
+};
+export function stageWords(stage) {
+  return say(STAGES[stage] || stage);
+}
 
 // The session that the operator works in, kept for the pages of this browser tab.
-export function openSession() { return sessionStorage.getItem("eigenhead-session") || ""; }
-export function keepSession(id) { sessionStorage.setItem("eigenhead-session", id); }
+export function openSession() {
+  return sessionStorage.getItem("eigenhead-session") || "";
+}
+export function keepSession(id) {
+  sessionStorage.setItem("eigenhead-session", id);
+}
 // What was typed and not sent is kept in this browser tab: a reload brings it back.
-export function kept(name) { try { return JSON.parse(sessionStorage.getItem(`eigenhead ${name}`)); } catch { return null; } }
-export function keepDraft(name, value) { value ? sessionStorage.setItem(`eigenhead ${name}`, JSON.stringify(value)) : sessionStorage.removeItem(`eigenhead ${name}`); }
+export function kept(name) {
+  try {
+    return JSON.parse(sessionStorage.getItem(`eigenhead ${name}`));
+  } catch {
+    return null;
+  }
+}
+export function keepDraft(name, value) {
+  value
+    ? sessionStorage.setItem(`eigenhead ${name}`, JSON.stringify(value))
+    : sessionStorage.removeItem(`eigenhead ${name}`);
+}
 // What is chosen and sought stands in the address, so that a reload or a bookmark brings it back.
 export function keepAddress(fields) {
   const kept = new URLSearchParams(Object.entries(fields).filter(([, value]) => value));
@@ -51,7 +102,9 @@ export function keepAddress(fields) {
 export function sessionName(session, all) {
   if (!session) return "";
   const twice = all.some((other) => other.id !== session.id && other.label === session.label);
-  return session.label ? `${session.label}${twice ? `, ${say("begun {time}", { time: clock(session.created) })}` : ""}` : clock(session.created);
+  return session.label
+    ? `${session.label}${twice ? `, ${say("begun {time}", { time: clock(session.created) })}` : ""}`
+    : clock(session.created);
 }
 
 // Sends one file as the form part "file"; resolves with {status, document} and never rejects.
@@ -62,10 +115,15 @@ export function send(address, file, fields, progress) {
     request.upload.onprogress = (event) => event.lengthComputable && progress(event.loaded / event.total);
     request.onload = () => {
       let document = { detail: request.statusText, errors: [] };
-      try { document = JSON.parse(request.responseText); } catch { /* an answer without JSON has its status text */ }
+      try {
+        document = JSON.parse(request.responseText);
+      } catch {
+        /* an answer without JSON has its status text */
+      }
       resolve({ status: request.status, document });
     };
-    request.onerror = () => resolve({ status: 0, document: { detail: "The service did not answer; send it again.", errors: [] } });
+    request.onerror = () =>
+      resolve({ status: 0, document: { detail: "The service did not answer; send it again.", errors: [] } });
     const form = new FormData();
     for (const [name, value] of Object.entries(fields)) form.append(name, value);
     form.append("file", file);
