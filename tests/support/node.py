@@ -8,6 +8,11 @@ from typing import Any
 from playwright._impl._driver import compute_driver_executable
 
 
+def node() -> str:
+    """Returns the path of the Node that comes with playwright."""
+    return compute_driver_executable()[0]
+
+
 def evaluate(module: Path, expression: str, given: object = None) -> Any:
     """The value, by way of JSON, of a JavaScript expression over ``m``, the module's exports, and ``given``."""
     script = (
@@ -15,8 +20,7 @@ def evaluate(module: Path, expression: str, given: object = None) -> Any:
         "for await (const part of process.stdin) text += part;"
         f"const given = JSON.parse(text); console.log(JSON.stringify({expression}));"
     )
-    node = compute_driver_executable()[0]
-    command = [node, "--no-warnings", "--input-type=module", "--eval", script]
+    command = [node(), "--no-warnings", "--input-type=module", "--eval", script]
     done = subprocess.run(command, input=json.dumps(given), capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

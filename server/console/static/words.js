@@ -23,9 +23,12 @@ export function clock(moment) {
 
 export function span(seconds) {
   if (seconds === null || seconds === undefined) return "";
-  if (seconds < 60) return `${fixed(Math.max(0, seconds), seconds < 10 ? 1 : 0)} s`;
-  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
-  return `${Math.floor(seconds / 3600)} h ${Math.round((seconds % 3600) / 60)} min`;
+  if (seconds < 9.95) return `${fixed(Math.max(0, seconds), 1)} s`;
+  const whole = Math.round(seconds),
+    minutes = Math.round(whole / 60); // first rounded, then divided: never 1 min 60 s
+  if (whole < 60) return `${whole} s`;
+  if (whole < 3600) return `${Math.floor(whole / 60)} min ${whole % 60} s`;
+  return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
 export function size(bytes) {
