@@ -322,7 +322,7 @@ def warnings_of(report: Path) -> list[MessageDocument]:
     """The warnings of a result's report.json."""
     try:
         return json.loads(report.read_bytes())["warnings"]
-    except (OSError, ValueError, KeyError):  # no result, or another kind of work
+    except (OSError, ValueError, KeyError, TypeError):  # no result, or another kind of work
         return []
 
 

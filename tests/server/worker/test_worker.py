@@ -1,0 +1,201 @@
+"""A worker's steps one by one, without the engine around them: what each leaves on disk and in the job's events. What
+SIGKILL may not do to them is driven in ``test_durability.py``."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+from dbos import DBOS
+
+from rig.errors import Cancelled, InputError
+from server.services.failures import JobFailed
+from server.settings import ServiceSettings
+from server.storage.database import workers
+from server.storage.records import CaptureRecord, JobRequest
+from server.storage.store import Store, new_id
+from server.tasks.child import WorkFailed
+from server.worker.worker import Worker, described, warnings_of
+from tests.support.services import small_capture
+
+JOB = "0123456789ab" + 16 * "c"
+
+
+class Engine:
+    """What the engine says of the job's state; ``None``: it has gone."""
+
+    def __init__(self) -> None:
+        self.status: str | None = "PENDING"
+
+    def get_workflow_status(self, job_id: str) -> Any:
+        return None if self.status is None else type("Row", (), {"status": self.status})
+
+
+@pytest.fixture
+def engine(monkeypatch: pytest.MonkeyPatch) -> Engine:
+    engine = Engine()
+    monkeypatch.setattr(DBOS, "get_workflow_status", engine.get_workflow_status)
+    return engine
+
+
+@pytest.fixture
+def worker(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> Iterator[Worker]:
+    monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path / "cache"))
+    settings = ServiceSettings(data=tmp_path / "data", work="tests.support.tiny:work", poll_s=0.05, free_bytes=1000)
+    worker = Worker(settings)
+    yield worker
+    worker._children.close()
+    worker.engine.dispose()
+
+
+@pytest.fixture
+def capture(worker: Worker, tmp_path: Path) -> str:
+    """A stored capture of noise; its id."""
+    folder = small_capture(tmp_path / "incoming" / "files").parent
+    inputs = {
+        path.relative_to(folder / "files").as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in (folder / "files").rglob("*")
+        if path.is_file()
+    }
+    created = "2026-01-01T00:00:00+00:00"
+    record = CaptureRecord(new_id(), created, "upload", None, "", "", (), "cam00", inputs, bytes=500, features=False)
+    worker.store.add_capture(folder, record)
+    return record.id
+
+
+def request(capture: str, mode: str | None = None) -> JobRequest:
+    return {"capture_id": capture, "model": None, "settings": {} if mode is None else {"front": mode}}
+
+
+def told(worker: Worker) -> list[dict[str, Any]]:
+    return [dict(event.document) for event in worker.events.since(JOB, 0)]
+
+
+def test_a_job_begins_where_its_capture_is_and_the_disk_has_room(
+    worker: Worker, capture: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker.ingest(JOB, request(capture))
+    assert worker.store.folder("jobs", JOB).is_dir()
+    assert told(worker) == [{"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None}]
+    with pytest.raises(JobFailed) as gone:
+        worker.ingest(JOB, request(new_id()))
+    assert gone.value.kind == "not-found"
+    for free, fits in ((1501, True), (1499, False)):  # the capture's 500 bytes beside the 1,000 to leave
+        monkeypatch.setattr(Store, "free_bytes", lambda self, free=free: free)
+        if fits:
+            worker.ingest(JOB, request(capture))
+            continue
+        with pytest.raises(JobFailed) as full:
+            worker.ingest(JOB, request(capture))
+        assert full.value.kind == "disk-full"
+
+
+def test_a_fit_is_published_once_whoever_publishes_it(worker: Worker, capture: str) -> None:
+    worker.ingest(JOB, request(capture))
+    attempts = []
+    for _ in range(2):
+        before = len(told(worker))
+        attempts.append(worker.fit(JOB, request(capture)))
+        shares = [event["progress"] for event in told(worker)[before:]]
+        assert shares == sorted(shares), "progress never goes back within an attempt"
+    first, second = attempts
+    folder = worker.store.folder("jobs", JOB)
+    assert {path.name for path in folder.iterdir()} == {first, second}
+    files = worker.publish(JOB, first)
+    assert files.keys() == {"head.ply", "head.glb", "overlays/cam00.png"}
+    assert {path.name for path in folder.iterdir()} == {"result"}, "other attempts are swept"
+    assert worker.publish(JOB, second) == files, "another worker had published it"
+    assert files == described(folder / "result")
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind", "faults"),
+    [
+        ("fail", "invalid-capture", ["cam00 sees nobody", "cam01 sees nobody"]),
+        ("crash", "work-crashed", []),
+        ("bug", "internal-error", []),
+    ],
+)
+def test_work_that_fails_is_told_by_its_kind_and_leaves_nothing(
+    worker: Worker, capture: str, mode: str, kind: str, faults: list[str]
+) -> None:
+    worker.ingest(JOB, request(capture))
+    with pytest.raises(JobFailed) as failed:
+        worker.fit(JOB, request(capture, mode))
+    assert (failed.value.kind, [fault.text for fault in failed.value.errors]) == (kind, faults)
+    assert list(worker.store.folder("jobs", JOB).iterdir()) == []
+
+
+def test_a_cancelled_job_stops_also_where_it_does_not_listen(worker: Worker, capture: str, engine: Engine) -> None:
+    worker.ingest(JOB, request(capture))
+    engine.status = "CANCELLED"
+    for mode in ("long", "deaf"):  # 120 s each, did nothing stop them
+        with pytest.raises(Cancelled):
+            worker.fit(JOB, request(capture, mode))
+    assert list(worker.store.folder("jobs", JOB).iterdir()) == []
+
+
+def test_the_last_event_names_cameras_that_moved(worker: Worker, capture: str) -> None:
+    worker.ingest(JOB, request(capture))
+    worker.publish(JOB, worker.fit(JOB, request(capture, "moved")))
+    worker.settle(JOB, "succeeded")
+    assert told(worker)[-1] == {"state": "succeeded", "camera_moved": ["cam02 has moved by 5.0 px"]}
+
+
+def test_a_job_without_a_report_ends_without_a_word(worker: Worker) -> None:
+    worker.settle(JOB, "failed")
+    assert told(worker) == [{"state": "failed"}]
+
+
+@pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"warnings": 3'])
+def test_a_report_that_cannot_be_read_has_no_warnings(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        (tmp_path / "report.json").write_text(text)
+    assert warnings_of(tmp_path / "report.json") == []
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (OSError(28, "No space left on device"), "disk-full"),
+        (InputError("cameras.json", ["cameras.json: no camera"]), "invalid-cameras"),
+        (WorkFailed("NoHull", "No hull was found."), "no-hull"),
+        (WorkFailed("NobodyKnowsThis", "?"), "eigenhead-error"),
+    ],
+)
+def test_each_cause_has_its_kind(worker: Worker, error: BaseException, kind: str) -> None:
+    found = worker._failure(error)
+    assert isinstance(found, JobFailed)
+    assert found.kind == kind
+
+
+def test_what_is_no_failure_of_the_job_is_left_to_the_engine(worker: Worker) -> None:
+    for error in (Cancelled(), OSError(13, "Permission denied"), KeyboardInterrupt()):
+        assert worker._failure(error) is error
+
+
+def test_a_worker_is_one_row_however_often_its_heart_beats(worker: Worker) -> None:
+    with worker.engine.begin() as connection:
+        worker._beat()
+        rows = [connection.execute(sa.select(workers)).one()]
+    for _ in range(2):
+        worker._beat()
+    with worker.engine.connect() as connection:
+        rows += connection.execute(sa.select(workers)).all()
+    first, last = rows
+    assert (first.id, last.id, last.stopped) == (worker.id, worker.id, None)
+    assert last.seen >= first.seen
+    assert (last.queue, last.concurrency) == (worker.settings.queue, worker.settings.concurrency)
+
+
+def test_a_result_is_described_by_size_and_content(tmp_path: Path) -> None:
+    (tmp_path / "overlays").mkdir()
+    (tmp_path / "overlays" / "cam00.png").write_bytes(b"abc")
+    (tmp_path / "report.json").write_text(json.dumps({}))
+    assert described(tmp_path) == {
+        "overlays/cam00.png": {"bytes": 3, "sha256": hashlib.sha256(b"abc").hexdigest()},
+        "report.json": {"bytes": 2, "sha256": hashlib.sha256(b"{}").hexdigest()},
+    }
