@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup setup-tests demo serve test test-slow check coverage format bench dependencies results pictures docs sbom audit mutants
+.PHONY: setup setup-tests demo serve test test-slow check coverage format bench dependencies reference results pictures docs sbom audit mutants
 BIN := .venv/bin
 # The tests start many processes: with compiled modules kept beside them each starts in half the time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -50,6 +50,9 @@ bench: setup ## timings of inner loops
 
 dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
 	$(BIN)/python -m tests.support.dependencies
+
+reference: setup ## pages that are made of the program: commands, environment variables, settings
+	$(BIN)/python -m tests.support.reference
 
 results: setup ## the documents' tables from docs/results/; with TABLE=name that table's command is run first (it may take hours)
 	$(BIN)/python -m tests.support.results $(TABLE)

@@ -25,8 +25,10 @@ class ServiceSettings(BaseSettings):
 
     data: Path = Field(default_factory=data_folder, description="folder of captures, results and the job database")
     database_url: str | None = Field(default=None, description="postgresql://...; without it SQLite in the data folder")
-    host: str = "127.0.0.1"
-    port: int = Field(default=8600, ge=0, le=65535)
+    host: str = Field(
+        default="127.0.0.1", description="the address to listen at; beyond loopback only once there is an API key"
+    )
+    port: int = Field(default=8600, ge=0, le=65535, description="the port to listen at; 0: any that is free")
     public_url: str | None = Field(
         default=None,
         pattern=r"^https?://[^/?#\s]+$",
@@ -53,7 +55,7 @@ class ServiceSettings(BaseSettings):
         default=RECONSTRUCT,
         description="what a job runs in the worker's child process",
     )
-    heartbeat_s: float = Field(default=3.0, gt=0)
+    heartbeat_s: float = Field(default=3.0, gt=0, description="how often a worker says that it is alive")
     silent_s: float = Field(
         default=15.0, gt=0, description="a worker that is silent for longer is dead; its jobs are taken over"
     )
@@ -61,9 +63,9 @@ class ServiceSettings(BaseSettings):
     attempts: int = Field(default=50, ge=1, description="a job that took so many workers down with it fails")
 
     body_bytes: int = Field(default=8 << 30, ge=1, description="the largest upload")
-    archive_members: int = Field(default=5000, ge=1)
+    archive_members: int = Field(default=5000, ge=1, description="the most files and folders of one archive")
     archive_bytes: int = Field(default=16 << 30, ge=1, description="the most that one archive unpacks to")
-    archive_ratio: float = Field(default=100.0, gt=1)
+    archive_ratio: float = Field(default=100.0, gt=1, description="the most that an archive may unpack to, by its size")
     image_pixels: int = Field(default=64_000_000, ge=1, description="the largest image of a capture")
     free_bytes: int = Field(default=256 << 20, ge=0, description="disk space that uploads and jobs must leave")
     jobs_per_key: int = Field(default=200, ge=1, description="queued and running jobs of one API key")
@@ -81,7 +83,7 @@ class ServiceSettings(BaseSettings):
         default=False, description="drop the oldest finished results when the disk falls below free_bytes"
     )
     cache_bytes: int = Field(default=4 << 30, ge=0, description="the most that silhouettes and thumbnails take up")
-    sweep_s: float = Field(default=60.0, gt=0)
+    sweep_s: float = Field(default=60.0, gt=0, description="how often what is to go is looked for")
 
     ask_consent: bool = Field(default=False, description="captures need a session with a note of the subject's consent")
     console: bool = Field(default=True, description="serve the operator's pages; they add 1.5 s to the start")
