@@ -15,7 +15,7 @@ PAGES = {
     "SECURITY.md": "SECURITY.md",
 }
 _FROM_TOP = re.compile(r"""(?:(?<=\]\()|(?<=src="))docs/""")
-_TO_TOP = re.compile(r"(?<=\]\()\.\./(\w+\.md)")
+_TO_TOP = re.compile(r"(?<=\]\()((?:\.\./)+)(\w+\.md)")
 
 
 def on_files(files: Files, config: Any, **_: Any) -> Files:
@@ -25,5 +25,13 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    return _TO_TOP.sub(lambda link: PAGES.get(link[1], link[0]), markdown)
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """A page of docs/ reaches the top by one step up for each of its folders and one out of docs/; on the site the
+    latter falls away."""
+    steps = 3 * (page.file.src_uri.count("/") + 1)  # "../" has three letters
+
+    def lead(link: re.Match[str]) -> str:
+        reaches = len(link[1]) == steps and link[2] in PAGES
+        return link[1][3:] + PAGES[link[2]] if reaches else link[0]
+
+    return _TO_TOP.sub(lead, markdown)

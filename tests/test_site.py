@@ -29,14 +29,19 @@ def targets(pattern: re.Pattern[str], page: Path) -> set[str]:
 
 
 def test_every_document_is_a_page(site: Path) -> None:
-    names = {page.stem for page in (ROOT / "docs").glob("*.md")}
-    assert names < {page.stem for page in site.glob("*.html")}
+    docs = ROOT / "docs"
+    pages = {
+        path.relative_to(docs).with_suffix(".html")
+        for path in docs.rglob("*.md")
+        if docs / "results" not in path.parents
+    }
+    assert pages < {page.relative_to(site) for page in site.rglob("*.html")}
     assert "Two commands" in (site / "index.html").read_text(encoding="utf-8")
 
 
 def test_every_link_within_the_site_leads_to_a_file_and_a_place(site: Path) -> None:
     seen = 0
-    for page in site.glob("*.html"):
+    for page in site.rglob("*.html"):
         for link in targets(LINKED, page):
             if link.startswith(("http://", "https://", "mailto:", "javascript:")) or page.name == "404.html":
                 continue
@@ -50,5 +55,5 @@ def test_every_link_within_the_site_leads_to_a_file_and_a_place(site: Path) -> N
 
 
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
-    for page in site.glob("*.html"):
+    for page in site.rglob("*.html"):
         assert [place for place in targets(LOADED, page) if re.match(r"(?:https?:)?//", place)] == [], page.name

@@ -2,7 +2,7 @@
 
 The project's Levenberg-Marquardt on blocks of the normal equations (``corner_term``); with eleven cameras and thirty
 shots they have 339 unknowns, which a dense Cholesky factor solves in ten milliseconds: sparse machinery would only cost
-(docs/results.md has the times beside scipy's and Ceres's).
+(docs/lab-notes/calibration.md has the times beside scipy's and Ceres's).
 
 Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``, rho Cauchy's while outliers are sought and Huber's at the end, sigma_c
 each camera's own noise.

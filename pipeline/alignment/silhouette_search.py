@@ -8,8 +8,8 @@ where it does not, or the views disagree, every quarter turn about the line of s
 around there is no middle of a fan to be guessed, and every way to face is tried. Nothing leans on the axes of the world
 frame. From each start the contour solver takes pose and a few modes on the coarsest mesh, the best few go on with a
 finer one, and the one that all eigenheads explain most closely wins: under thick hair 15 modes cannot tell the right
-pose from one that is 50 degrees off. A start 10 mm off ends in a local minimum under hair (docs/results.md), so the
-robust scale begins at 40 px.
+pose from one that is 50 degrees off. A start 10 mm off ends in a local minimum under hair
+(docs/lab-notes/robustness.md), so the robust scale begins at 40 px.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

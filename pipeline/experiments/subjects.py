@@ -24,7 +24,7 @@ from rig.studio.scene.hair import HairStyle, grow
 
 SPREAD = 0.8  # section 5.2: Gaussian within +-0.8 standard deviations
 TURN, SHIFT_MM = 0.06, 8.0  # a seated subject: standard deviation of its pose
-START_TURN, START_SHIFT_MM = np.radians(2.0), 4.0  # what feature points leave (docs/results.md)
+START_TURN, START_SHIFT_MM = np.radians(2.0), 4.0  # what feature points leave (docs/lab-notes/paper.md)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ import pytest
 
 from tests.support.services import ROOT, RunningService, running_service, small_capture
 
-GUIDE = ROOT / "docs" / "service.md"
+GUIDE = ROOT / "docs" / "http.md"
 REFUSED = """
 import os
 from eigenhead_client import AuthenticatedClient

@@ -67,7 +67,7 @@ _LEFT_OUT = (
 class Sampling:
     """Widths of the population: standard deviations of target weights by folder, clipped at ``clip`` times that.
 
-    The values were widened on random ICT-FaceKit draws until the floor (docs/models.md) stopped falling.
+    The values were widened on random ICT-FaceKit draws until the floor (docs/lab-notes/head-models.md) stopped falling.
     """
 
     seed: int = 2003
