@@ -3,7 +3,7 @@
 #
 #   deploy/setup.sh           what `make demo`, `make test` and the service need
 #   deploy/setup.sh --quick   what `make demo` needs: each command compiles the loops of its own job before it begins
-#   deploy/setup.sh --docs    also what `make docs` and the documents' tests need (dependency group docs)
+#   deploy/setup.sh --docs    also what `make check`, `make docs` and the documents' tests need (dependency group docs)
 #   deploy/setup.sh --tests   that, and the Debian packages without which some tests skip
 #   deploy/setup.sh --extra NAME   an optional part, gphoto for instance, from then on too
 #

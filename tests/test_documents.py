@@ -92,7 +92,7 @@ def test_a_file_is_described_on_one_page(name: str) -> None:
 
 def test_a_term_of_the_glossary_is_one_sentence() -> None:
     text = (DOCS / "glossary.md").read_text(encoding="utf-8")
-    entries = re.findall(r"^- \*\*(.+?)\*\*: (.+)$", text, re.MULTILINE)
+    entries = re.findall(r"^- \*\*(.+?)\*\*: (.+(?:\n  .+)*)$", text, re.MULTILINE)
     assert len(entries) > 50
     names = [name for name, _ in entries]
     assert len(names) == len(set(names))
