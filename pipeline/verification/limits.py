@@ -1,7 +1,8 @@
 """What a studio must reach: limits, each of which a user may set, and their verdicts.
 
 The default limits are near one and a half times what the simulated studio reaches with a bare mannequin of another
-population than the model's (docs/lab-notes/verification.md), so that a sound rig passes and one with a lasting fault does not.
+population than the model's (docs/lab-notes/verification.md), so that a sound rig passes and one with a lasting fault
+does not.
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,8 @@
 """Fit a model straight to a surface: Gauss-Newton on point-to-plane distances, pose and coefficients together.
 
-It measures what a model can reach at best (its floor, docs/lab-notes/head-models.md), carries landmarks from one model to another,
-and gives correspondence its start. Point-to-plane steps follow Chen and Medioni (1992); the prior is z ~ N(0, I).
+It measures what a model can reach at best (its floor, docs/lab-notes/head-models.md), carries landmarks from one model
+to another, and gives correspondence its start. Point-to-plane steps follow Chen and Medioni (1992); the prior is
+z ~ N(0, I).
 """
 
 from dataclasses import dataclass, replace
