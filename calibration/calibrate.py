@@ -46,7 +46,7 @@ from calibration.quality.outliers import CORNER_SIGMAS, Dropped, bad_views, drop
 from calibration.result import Calibration, CalibrationRefused
 from rig.formats.serials import with_serials
 from rig.geometry import RigidTransform
-from rig.messages.message import Message, compose, message_of
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 
@@ -119,7 +119,7 @@ def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) ->
         raise WrongBoard([compose("board-in-no-picture")])
     reasons = []
     for name in blind:
-        notes = [note for note in detections.notes if note.startswith(f"{name}/")]
+        notes = [note.message() for note in detections.notes if note.camera == name]
         lost = [drop.message() for drop in dropped if drop.camera == name]
         why = notes[0] if notes else lost[0] if lost else compose("no-picture-of-board")
         reasons.append(compose("camera-without-board", camera=name, why=why))
@@ -280,7 +280,7 @@ def _judged(
         fit.free.offsets,
         tuple(dropped),
         tuple(checks),
-        (*map(message_of, detections.remarks), *_warnings(fit, lenses, dropped)),
+        (*detections.remarks, *_warnings(fit, lenses, dropped)),
     )
     bad = failed(checks)
     if bad:

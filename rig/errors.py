@@ -37,6 +37,6 @@ class WrongVariable(InputError):
     """A variable of the environment that cannot be used: a fault of nobody's capture."""
 
 
-def how_to_install(extra: str) -> str:
+def how_to_install(extra: str) -> Message:
     """What to type for an optional part of the project, in a checkout and beside a wheel."""
-    return f"run `deploy/setup.sh --extra {extra}`, or install eigenhead[{extra}] where a wheel was installed"
+    return compose("install-extra", extra=extra)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from rig.camera import Camera
 from rig.geometry import RigidTransform
+from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 
@@ -22,12 +23,12 @@ FRAME_LEAST_MM = 100.0  # longer side of what the pictures show where the camera
 FRAME_USUAL_MM = 600.0  # of the studio's arrangements: 556 to 559
 FRAME_MOST_MM = 10_000.0  # and of the spread, since axes that hardly converge meet anywhere: a head is 2% of the side
 UNIT_MOST = 1_000_000  # nanometres; beyond, it is no unit
-UNITS = {10: "centimetres", 100: "decimetres", 1000: "metres"}
+UNITS = {10: compose("centimetres"), 100: compose("decimetres"), 1000: compose("metres")}
 GRID = (9, 7)
 CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
 
 
-def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[str]:
+def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[Message]:
     """Faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base line.
     ``any_unit``: a known length beside them will tell the unit."""
     faults = [fault for camera in rig if (fault := _lens_fault(camera))]
@@ -35,13 +36,11 @@ def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[str]:
     return faults + ([convention] if convention else [] if any_unit else _spread_faults(rig))
 
 
-def _lens_fault(camera: Camera) -> str | None:
+def _lens_fault(camera: Camera) -> Message | None:
     k = camera.intrinsics
     if min(k.fx / k.width, k.fy / k.height) < FOCAL_LEAST:
-        return (
-            f"{camera.name}: a focal length of {min(k.fx, k.fy):g} px is absurd for {k.width} x {k.height} pixels: "
-            "of one in mm give mm times the picture's width in px, divided by the sensor's in mm"
-        )
+        focal_px, size = min(k.fx, k.fy), f"{k.width} x {k.height}"
+        return compose("focal-length-absurd", camera=camera.name, focal_px=focal_px, size=size)
     with np.errstate(all="ignore"):
         straight, distorted = _through_lens(camera)
         radius = np.linalg.norm(straight, axis=1)
@@ -49,9 +48,9 @@ def _lens_fault(camera: Camera) -> str | None:
     lost = float(np.mean(~np.isfinite(radius)))
     if lost <= LENS_LOST_MOST and (growth > LENS_GROWTH_LEAST).all() and (growth < LENS_GROWTH_MOST).all():
         return None
-    told = ", ".join(f"{name} = {value:g}" for name, value in _coefficients(camera).items())
-    what = f"no ray meets {lost:.0%} of its middle" if lost > LENS_LOST_MOST else "it bends it out of all shape"
-    return f"{camera.name}: the lens is absurd ({told}; {what}): calibrate it again"
+    held = [f"{name} = {value:g}" for name, value in _coefficients(camera).items()]
+    what = compose("lens-unmet", share=lost) if lost > LENS_LOST_MOST else compose("lens-shapeless")
+    return compose("lens-absurd", camera=camera.name, coefficients=held, what=what)
 
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
@@ -77,31 +76,22 @@ def _coefficients(camera: Camera) -> dict[str, float]:
     return dict(zip(COEFFICIENTS[lens.model], lens.coefficients, strict=True))
 
 
-def _spread_faults(rig: Rig) -> list[str]:
+def _spread_faults(rig: Rig) -> list[Message]:
     centres = np.stack([camera.centre_world for camera in rig])
     spread = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
     if spread < ONE_PLACE_MM:
-        return ["every camera stands at one place: nothing can be measured without a base line; calibrate the rig"]
+        return [compose("cameras-at-one-place")]
     if spread < LEAST_SPREAD_MM:
-        return [
-            f"the cameras stand within {spread:.3g} mm of each other: their translations look like metres, "
-            "and millimetres are wanted; multiply them by 1000, or, of a scene without a scale, by what a known length "
-            "in it tells"
-        ]
+        return [compose("cameras-near", spread_mm=f"{spread:.3g}")]
     frame = frame_mm(rig)
     unit = next((unit for unit in UNITS if frame * unit >= FRAME_LEAST_MM), None)
     if frame < FRAME_LEAST_MM and unit is not None:
-        return [
-            f"the pictures show {frame:.3g} mm where the cameras look, and no head fits: their translations look like "
-            f"{UNITS[unit]}, and millimetres are wanted; multiply them by {unit}"
-        ]
+        return [compose("cameras-show-little", frame_mm=f"{frame:.3g}", unit=UNITS[unit], factor=unit)]
     if min(frame, spread) > FRAME_MOST_MM:
         factor = 10 ** round(np.log10(frame / FRAME_USUAL_MM))
-        remedy = f"divide their translations by {factor}" if factor <= UNIT_MOST else "look for one that is wrong"
-        return [
-            f"the pictures show {frame / 1000:.3g} m where the cameras look, and a head would be lost there: "
-            f"translations are wanted in millimetres; {remedy}"
-        ]
+        wrong = factor > UNIT_MOST
+        remedy = compose("look-for-wrong-one") if wrong else compose("divide-translations", factor=factor)
+        return [compose("cameras-show-much", frame_m=f"{frame / 1000:.3g}", remedy=remedy)]
     return []
 
 
@@ -114,20 +104,17 @@ def frame_mm(rig: Rig) -> float:
     return float(np.median(sides))
 
 
-def _convention_fault(rig: Rig) -> str | None:
+def _convention_fault(rig: Rig) -> Message | None:
     """Poses that look at no common point as they are written, and all at one when read in another convention."""
     if _share_looking_at_one_point(rig) > DIVERGING_MOST:
         return None
     for other, read, remedy in readings(rig):
         if _share_looking_at_one_point(read) >= CONVERGING_LEAST:
-            return (
-                f"camera_from_world holds {other}: as written the cameras look at no common point, "
-                f"and read so they do; {remedy}"
-            )
+            return compose("pose-convention", held=other, remedy=remedy)
     return None
 
 
-def readings(rig: Rig) -> list[tuple[str, Rig, str]]:
+def readings(rig: Rig) -> list[tuple[Message, Rig, Message]]:
     """The rig with its poses read in other conventions: what they would hold, the rig so read, and the remedy."""
     return [
         (other, Rig(tuple(replace(c, camera_from_world=read(c.camera_from_world)) for c in rig)), remedy)
@@ -148,21 +135,21 @@ def _share_looking_at_one_point(rig: Rig) -> float:
 
 _GL = np.diag([1.0, -1.0, -1.0])
 _CONVENTIONS = {
-    "world_from_camera": (lambda pose: pose.inverse(), "write the inverse of each pose"),
-    "the camera's place in translation": (
+    compose("held-inverse"): (lambda pose: pose.inverse(), compose("write-inverse")),
+    compose("held-place"): (
         lambda pose: RigidTransform(pose.rotation, -pose.rotation @ pose.translation),
-        "write -rotation @ place",
+        compose("write-place"),
     ),
-    "the rotation transposed": (
+    compose("held-transposed"): (
         lambda pose: RigidTransform(pose.rotation.T, pose.translation),
-        "transpose each rotation",
+        compose("transpose-rotations"),
     ),
-    "camera axes with y up and z backwards": (
+    compose("held-axes-up"): (
         lambda pose: RigidTransform(_GL @ pose.rotation, _GL @ pose.translation),
-        "negate the second and third row of each pose (x right, y down, z forward)",
+        compose("negate-rows"),
     ),
-    "world_from_camera with y up and z backwards": (
+    compose("held-inverse-axes-up"): (
         lambda pose: RigidTransform(_GL @ pose.inverse().rotation, _GL @ pose.inverse().translation),
-        "write the inverse of each pose, its second and third row negated",
+        compose("write-inverse-negated"),
     ),
 }

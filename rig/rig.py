@@ -8,14 +8,15 @@ from jaxtyping import Float
 
 from rig.camera import Camera
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 
 
 class UnknownCamera(EigenheadError, KeyError):
     """A name that no camera of the rig has."""
 
     def __init__(self, name: str, names: tuple[str, ...]) -> None:
-        known = f"its cameras are {', '.join(names)}" if names else "it has no cameras at all"
-        super().__init__(f"the rig has no camera {name!r}; {known}")
+        known = compose("rig-cameras", cameras=names) if names else compose("rig-empty")
+        super().__init__(compose("rig-camera-unknown", camera=f"{name!r}", known=known))
 
     def __str__(self) -> str:
         return str(self.args[0])  # KeyError's own would put it in quotes

@@ -21,6 +21,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import document_from_rig, rig_from_document
 from rig.formats.features_json import document_from_features, features_from_document
 from rig.geometry import RigidTransform
+from rig.messages.message import Message
 from rig.rig import Rig
 from server.cli.doctor import OTHER_VARIABLES
 from server.settings import PREFIX, ServiceSettings
@@ -148,7 +149,7 @@ def test_reader_and_schema_refuse_the_same_cameras(rig: Rig, place: tuple[str | 
     ],
 )
 def test_reader_and_schema_refuse_the_same_features(rig: Rig, document: Any) -> None:
-    faults: list[str] = []
+    faults: list[Message] = []
     features_from_document(document, rig, faults)
     assert faults
     assert not schema("features").is_valid(document)

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.messages.message import Message, compose
 
 Kind = Literal["checkerboard", "charuco"]
 SQUARES_LEAST, SQUARES_MOST = 3, 60
@@ -119,36 +120,38 @@ def read_board(path: Path) -> Board:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path.name, [f"cannot be read as TOML ({error})"]) from error
+        raise InputError(path.name, [compose("no-toml", reason=str(error))]) from error
     return board_from_document(document, path.name)
 
 
 def board_from_document(document: Mapping[str, Any], subject: str = "board.toml") -> Board:
     """The board of decoded TOML. Raises InputError naming every fault."""
     known = set(Board.__dataclass_fields__)
-    faults = [f"unknown key {key!r}; known are {', '.join(sorted(known))}" for key in document if key not in known]
-    faults += [f"{key} is missing" for key in ("kind", "columns", "rows", "square_mm") if key not in document]
+    strange = [key for key in document if key not in known]
+    faults = [compose("board-key-unknown", key=f"{key!r}", known=sorted(known)) for key in strange]
+    faults += [
+        compose("key-missing-in", key=key) for key in ("kind", "columns", "rows", "square_mm") if key not in document
+    ]
     kind = document.get("kind")
     if kind not in ("checkerboard", "charuco", None):
-        faults.append(f"kind is {kind!r}, wanted 'checkerboard' or 'charuco'")
+        faults.append(compose("board-kind", kind=f"{kind!r}"))
     for key in ("columns", "rows"):
         value = document.get(key, SQUARES_LEAST)
         if isinstance(value, bool) or not isinstance(value, int) or not SQUARES_LEAST <= value <= SQUARES_MOST:
-            faults.append(
-                f"{key} is {value!r}, wanted a whole number of squares from {SQUARES_LEAST} to {SQUARES_MOST}"
-            )
+            given = f"{value!r}"
+            faults.append(compose("board-squares", key=key, value=given, least=SQUARES_LEAST, most=SQUARES_MOST))
     ranges = {"square_mm": (0.5, 1000.0), "marker_ratio": (0.3, 0.95)}
     ranges |= {key: (1.0, 1e5) for key in ("measured_width_mm", "measured_height_mm")}
     for key, (least, most) in ranges.items():
         value = document.get(key, least)
         if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-            faults.append(f"{key} is {value!r}, wanted a number from {least:g} to {most:g}")
+            faults.append(compose("board-number", key=key, value=f"{value!r}", least=least, most=most))
     for key in ("inverted", "legacy"):
         if not isinstance(document.get(key, False), bool):
-            faults.append(f"{key} is {document[key]!r}, wanted true or false")
+            faults.append(compose("no-switch", key=key, value=f"{document[key]!r}"))
     first = document.get("first_marker", 0)
     if isinstance(first, bool) or not isinstance(first, int) or not 0 <= first < 10_000:
-        faults.append(f"first_marker is {first!r}, wanted the number of the first marker, 0 or more")
+        faults.append(compose("board-first-marker", value=f"{first!r}"))
     faults += _dictionary_faults(document) if not faults and kind == "charuco" else []
     if faults:
         raise InputError(subject, faults)
@@ -156,13 +159,13 @@ def board_from_document(document: Mapping[str, Any], subject: str = "board.toml"
     return Board(**{**document, **floats})
 
 
-def _dictionary_faults(document: Mapping[str, Any]) -> list[str]:
+def _dictionary_faults(document: Mapping[str, Any]) -> list[Message]:
     name = document.get("dictionary", "DICT_4X4_1000")
     if not isinstance(name, str) or not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
-        return [f"dictionary is {name!r:.60}, wanted one of OpenCV's, such as 'DICT_4X4_1000'"]
+        return [compose("board-dictionary", name=f"{name!r:.60}")]
     held = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).bytesList)
     wanted = document.get("first_marker", 0) + document["columns"] * document["rows"] // 2
-    return [f"{name} holds {held} markers; the board needs {wanted}"] if held < wanted else []
+    return [compose("dictionary-small", dictionary=name, held=held, wanted=wanted)] if held < wanted else []
 
 
 def write_board(board: Board, path: Path) -> None:

@@ -21,7 +21,7 @@ from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.cameras_json import name_fault
 from rig.formats.picture_names import PLAIN_SUFFIXES
-from rig.messages.message import Message, compose, verbatim
+from rig.messages.message import Message, compose
 from rig.progress import Progress
 
 VERSION = 2  # of the detector: part of the cache's key
@@ -42,6 +42,18 @@ class View:
     found: Found
 
 
+@dataclass(frozen=True, slots=True)
+class PictureNote:
+    """Why the board was not found in a picture of a camera."""
+
+    camera: str
+    picture: str
+    reason: Message
+
+    def message(self) -> Message:
+        return compose("located", where=f"{self.camera}/{self.picture}", fault=self.reason)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
     """All finds. ``sizes``: (width, height) per camera, in the order of the cameras; ``missed``: (camera, shot) without
@@ -53,8 +65,8 @@ class Detections:
     shots: tuple[str, ...]
     views: tuple[View, ...]
     missed: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    notes: tuple[PictureNote, ...] = ()
+    remarks: tuple[Message, ...] = ()
 
     @property
     def corner_count(self) -> int:
@@ -64,21 +76,24 @@ class Detections:
 class WrongBoard(EigenheadError):
     """The pictures do not show the board that was described."""
 
-    def __init__(self, notes: Iterable[Message | str]) -> None:
-        pictures: dict[str, list[str]] = {}
-        for note in map(str, notes):
-            picture, colon, reason = note.partition(": ")
-            pictures.setdefault(reason if colon else note, []).append(picture if colon else "")
-        texts = [_of_pictures(names, reason) for reason, names in pictures.items()]
-        super().__init__(compose("wrong-board", notes=[verbatim(text) for text in texts]))
+    def __init__(self, reasons: Iterable[Message]) -> None:
+        super().__init__(compose("wrong-board", notes=tuple(reasons)))
 
 
-def _of_pictures(names: list[str], reason: str) -> str:
-    """A reason, said once for all cameras that have it."""
-    if not names[0]:
-        return reason
-    more = f" and {len(names) - 1} other cameras" if len(names) > 2 else f" and {names[1]}" if len(names) == 2 else ""
-    return f"{names[0]}{more}: {reason}"
+def reasons_of(notes: Iterable[PictureNote]) -> list[Message]:
+    """Each reason, said once for all cameras that have it."""
+    pictures: dict[Message, list[str]] = {}
+    for note in notes:
+        pictures.setdefault(note.reason, []).append(f"{note.camera}/{note.picture}")
+    return [compose("located", where=_some_pictures(names), fault=reason) for reason, names in pictures.items()]
+
+
+def _some_pictures(names: list[str]) -> str | Message:
+    if len(names) == 1:
+        return names[0]
+    if len(names) == 2:
+        return compose("both", first=names[0], second=names[1])
+    return compose("picture-and-others", picture=names[0], others=len(names) - 1)
 
 
 def ignore_progress(stage: str, fraction: float) -> None:
@@ -88,19 +103,19 @@ def ignore_progress(stage: str, fraction: float) -> None:
 def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
     """``IMAGES/<camera>/<shot>.<ext>`` as {camera: {shot: path}}. Raises InputError naming every fault."""
     if not folder.is_dir():
-        raise InputError(str(folder), ["is no folder; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)"])
-    faults, cameras = [], {}
+        raise InputError(str(folder), [compose("no-picture-folder")])
+    faults, cameras = list[Message](), {}
     for inner in sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
         paths = sorted(path for path in inner.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
         if not paths:
             continue
         fault = name_fault(inner.name)
         shots = {path.stem: path for path in paths}
-        faults += [f"camera {fault}"] if fault else []
-        faults += [f"{inner.name} holds two pictures of one shot"] if len(shots) < len(paths) else []
+        faults += [compose("camera-rename", fault=fault)] if fault else []
+        faults += [compose("camera-with-double-shot", camera=inner.name)] if len(shots) < len(paths) else []
         cameras[inner.name] = shots
     if not cameras:
-        faults.append("holds no pictures; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)")
+        faults.append(compose("no-pictures"))
     if faults:
         raise InputError(str(folder.name), faults)
     return cameras
@@ -117,7 +132,7 @@ def detect_folder(
     if board.kind == "charuco":
         detections = _with_measured_pattern(folder, pictures, detections, cache, workers, report)
     if detections.notes and not detections.views:
-        raise WrongBoard(detections.notes)
+        raise WrongBoard(reasons_of(detections.notes))
     return detections
 
 
@@ -141,7 +156,7 @@ def _with_measured_pattern(
     if found_share >= FEW_FOUND:
         layout = find_layout(markers, board)
         if layout is not None and abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
-            raise WrongBoard([explain_markers(markers, board) or ""])
+            raise WrongBoard([told] if (told := explain_markers(markers, board)) else [])
         return detections
     layout = find_layout(markers, board)
     measured = None if layout is None else board_of(layout, board)
@@ -152,7 +167,7 @@ def _with_measured_pattern(
         return detections
     keys = ["legacy = true"] if measured.legacy != board.legacy else []
     keys += [f"first_marker = {measured.first_marker}"] if measured.first_marker != board.first_marker else []
-    remark = f"the board was found with {' and '.join(keys)}: say so in board.toml"
+    remark = compose("board-found-with", keys=keys)
     return replace(again, remarks=(remark,))
 
 
@@ -166,7 +181,7 @@ def _detect_pictures(
 ) -> Detections:
     """One pass over all pictures for one board. Raises InputError on damaged input."""
     tasks = [(camera, shot, path) for camera, shots in pictures.items() for shot, path in shots.items()]
-    results: list[tuple[tuple[int, int], Found | None] | str] = []
+    results: list[tuple[tuple[int, int], Found | None] | Message] = []
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(_detect_file, path, board, cache) for _, _, path in tasks]
         try:
@@ -177,18 +192,25 @@ def _detect_pictures(
             pool.shutdown(cancel_futures=True)
             raise
     faults = [
-        f"{c}/{path.name} {result}"
+        compose("of-file", file=f"{c}/{path.name}", fault=result)
         for (c, _, path), result in zip(tasks, results, strict=True)
-        if isinstance(result, str)
+        if isinstance(result, Message)
     ]
     sizes: dict[str, tuple[int, int]] = {}
     views, missed = [], []
     for (camera, shot, path), result in zip(tasks, results, strict=True):
-        if isinstance(result, str):
+        if isinstance(result, Message):
             continue
         size, found = result
         if sizes.setdefault(camera, size) != size:
-            faults.append(f"{camera}/{path.name} is {size[0]} x {size[1]}, the camera's first is {sizes[camera]}")
+            faults.append(
+                compose(
+                    "pictures-of-two-sizes",
+                    picture=f"{camera}/{path.name}",
+                    size=f"{size[0]} x {size[1]}",
+                    first="{} x {}".format(*sizes[camera]),
+                )
+            )
         if found is None:
             missed.append((camera, shot))
         else:
@@ -200,15 +222,15 @@ def _detect_pictures(
     return Detections(board, sizes, shots, tuple(views), tuple(missed), tuple(notes))
 
 
-def _detect_file(path: Path, board: Board, cache: Path | None) -> tuple[tuple[int, int], Found | None] | str:
+def _detect_file(path: Path, board: Board, cache: Path | None) -> tuple[tuple[int, int], Found | None] | Message:
     """(size, find), or what is wrong with the file."""
     try:
         data = path.read_bytes()
     except OSError as error:
-        return f"cannot be read ({error.strerror or error})"
+        return compose("no-file-read", reason=str(error.strerror or error))
     grey = _decode(data)
     if grey is None:
-        return "is no picture that can be decoded"
+        return compose("picture-undecodable")
     size = (grey.shape[1], grey.shape[0])
     if cache is None:
         return size, detect(grey, board)
@@ -237,7 +259,7 @@ def _from_cache(path: Path) -> Found | None:
 
 def _explain_missing(
     pictures: dict[str, dict[str, Path]], sizes: dict[str, tuple[int, int]], views: list[View], board: Board
-) -> list[str]:
+) -> list[PictureNote]:
     """For each camera that never sees the board: what its pictures show instead, where that can be told."""
     notes = []
     seen = {view.camera for view in views}
@@ -247,6 +269,6 @@ def _explain_missing(
             grey = _decode(path.read_bytes())
             reason = explain(grey, board) if grey is not None else None
             if reason:
-                notes.append(f"{camera}/{path.name}: {reason}")
+                notes.append(PictureNote(camera, path.name, reason))
                 break
     return notes

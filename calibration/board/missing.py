@@ -18,19 +18,20 @@ from calibration.board.markers import (
     is_april_grid,
     other_dictionary,
 )
+from rig.messages.message import Message, compose
 
 
-def explain(grey: UInt8[np.ndarray, "h w"], board: Board) -> str | None:
+def explain(grey: UInt8[np.ndarray, "h w"], board: Board) -> Message | None:
     """Why ``detect`` finds nothing in a picture that does show a pattern; None if it shows none that is recognised."""
     inverse = replace(board, inverted=not board.inverted)
     mirrored = detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None
     inverted = detect(grey, inverse) is not None
     if mirrored and inverted:
-        return f"its colours are those of a mirrored or an inverted board: turn mirroring off, or set {_toml(inverse)}"
+        return compose("board-mirrored-or-inverted", setting=_toml(inverse))
     if mirrored:
-        return "the board or the picture is mirrored: turn off mirroring in the camera or its software, or print again"
+        return compose("board-mirrored")
     if inverted:
-        return f"the colours are inverted: set {_toml(inverse)} in board.toml"
+        return compose("board-inverted", setting=_toml(inverse))
     picture = 255 - grey if board.inverted else grey
     return _explain_charuco(picture, board) if board.kind == "charuco" else _explain_checkerboard(picture, board)
 
@@ -39,7 +40,11 @@ def _toml(board: Board) -> str:
     return f"inverted = {str(board.inverted).lower()}"
 
 
-def _explain_checkerboard(grey: np.ndarray, board: Board) -> str | None:
+def _size(board: Board) -> str:
+    return f"{board.columns} x {board.rows}"
+
+
+def _explain_checkerboard(grey: np.ndarray, board: Board) -> Message | None:
     near = [
         replace(board, columns=board.columns + more, rows=board.rows + higher)
         for more in range(-2, 3)
@@ -50,47 +55,41 @@ def _explain_checkerboard(grey: np.ndarray, board: Board) -> str | None:
     for other in sorted(near, key=lambda b: abs(b.columns - board.columns) + abs(b.rows - board.rows)):
         corners = classic_corners(small, other)
         if corners is not None and not pattern_continues(small, in_board_order(small, corners.astype(float), other)):
-            said = f"{board.columns} x {board.rows}"
-            return f"it shows {other.columns} x {other.rows} squares, board.toml says {said}: correct columns and rows"
+            return compose("board-of-other-size", shown=_size(other), said=_size(board))
     return None
 
 
-def _explain_charuco(grey: np.ndarray, board: Board) -> str | None:
+def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
     """What the markers in a picture say of the board, once it was not found by them."""
     markers = find_markers(grey, board.dictionary)
     mirrored = find_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)
     if len(mirrored) > len(markers) + 2:
-        return "the board or the picture is mirrored: turn off mirroring in the camera or its software, or print again"
+        return compose("board-mirrored")
     inverse = find_markers(255 - grey, board.dictionary)
     if len(inverse) > len(markers) + 2:
-        return f"the colours are inverted: set {_toml(replace(board, inverted=not board.inverted))} in board.toml"
+        return compose("board-inverted", setting=_toml(replace(board, inverted=not board.inverted)))
     if len(markers) < MARKERS_LEAST:
         other = other_dictionary([grey], board.dictionary)
         if other is None:
             return None
-        return f"its markers are of {other}, board.toml says {board.dictionary}: correct dictionary"
+        return compose("board-of-other-dictionary", shown=other, said=board.dictionary)
     return explain_markers([markers], board)
 
 
-def explain_markers(pictures: Sequence[Markers], board: Board) -> str | None:
+def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None:
     """What is wrong with the described board by the markers that pictures show; None where nothing is."""
     layout = find_layout(pictures, board)
     if layout is None:
         if any(map(is_april_grid, pictures)):
-            return "its markers stand in every cell, as on an AprilGrid, which is not read: print a board of ours"
-        return "it shows markers of the dictionary in an order that no ChArUco board has: is board.toml of this board?"
+            return compose("board-april-grid")
+        return compose("board-markers-disordered")
     if layout.columns != board.columns:
         last = max(max(markers) for markers in pictures if markers) - layout.first_marker + 1
         rows = -(-2 * last // layout.columns)
-        said = f"board.toml says {board.columns} x {board.rows}"
-        return f"it shows {layout.columns} squares in a row and {rows} rows or more, {said}: correct columns and rows"
+        return compose("board-of-other-columns", columns=layout.columns, rows=rows, said=_size(board))
     if abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
-        return (
-            f"its markers are {layout.ratio:.2f} times as wide as its squares, board.toml says "
-            f"{board.marker_ratio:g}: correct marker_ratio"
-        )
+        return compose("board-marker-ratio", ratio=layout.ratio, said=board.marker_ratio)
     beyond = max(max(markers) for markers in pictures if markers) - layout.first_marker
     if beyond >= board.marker_count:
-        said = f"{board.columns} x {board.rows} squares"
-        return f"it shows marker {beyond}, but {said} hold only {board.marker_count}: correct rows"
+        return compose("board-marker-beyond", marker=beyond, size=_size(board), held=board.marker_count)
     return None

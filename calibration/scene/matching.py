@@ -81,7 +81,7 @@ def quiet() -> Iterator[None]:
 def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, int]]:
     """Pictures as this project reads them, whatever COLMAP would make of their files; returns width and height."""
 
-    def one(job: tuple[str, str, Path]) -> tuple[tuple[int, int], str]:
+    def one(job: tuple[str, str, Path]) -> tuple[tuple[int, int], Message | None]:
         camera, shot, path = job
         where = f"{path.parent.name}/{path.name}"
         pixels, _, fault = decode_image_file(path, where, "grey")
@@ -90,12 +90,12 @@ def _write_grey(photographs: Photographs, folder: Path) -> dict[str, tuple[int, 
         target = folder / camera / f"{shot}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         write_image(target, pixels)
-        return (pixels.shape[1], pixels.shape[0]), ""
+        return (pixels.shape[1], pixels.shape[0]), None
 
     jobs = [(camera, shot, path) for camera, files in photographs.files.items() for shot, path in files.items()]
     with ThreadPoolExecutor(max_workers=4) as pool:
         done = list(pool.map(one, jobs))
-    faults: list[Message | str] = [fault for _, fault in done if fault]
+    faults: list[Message] = [fault for _, fault in done if fault]
     sizes: dict[str, tuple[int, int]] = {}
     for (camera, shot, _), (size, fault) in zip(jobs, done, strict=True):
         if not fault and sizes.setdefault(camera, size) != size:

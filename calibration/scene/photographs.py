@@ -17,7 +17,7 @@ from rig.formats.capture_folder import capture_root, size_fault
 from rig.formats.capture_masks import mask_subjects
 from rig.formats.images import decode_image_file, is_picture
 from rig.formats.shot_files import BESIDE_PICTURES, find_files
-from rig.messages.message import compose
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 ONE_SHOT = "shot"  # the name of the only one, where every camera has one picture
@@ -55,7 +55,7 @@ def find_photographs(folder: Path) -> Photographs:
     faults = [compose("camera-rename", fault=fault) for name in files if (fault := name_fault(name))]
     if len(files) < CAMERAS_LEAST:
         faults.append(compose("photographs-too-few", count=len(files), needed=CAMERAS_LEAST))
-    for name, paths in (folders or {"the folder": flat}).items():
+    for name, paths in [*folders.items()] or [(compose("the-folder"), flat)]:
         stems = [path.stem for path in paths]
         twice = sorted({stem for stem in stems if stems.count(stem) > 1})
         faults += [compose("photograph-repeated", folder=name, name=stem, count=stems.count(stem)) for stem in twice]
@@ -72,11 +72,12 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
     root = capture_root(folder)
     if photographs.shots != (ONE_SHOT,) or not (root / "masks").is_dir():
         return {}
-    planes, faults = {}, list[str]()
+    planes, faults = {}, list[Message]()
     for name, path in find_files(root, rig, [name for name in photographs.names if name not in rig]).masks.items():
         pixels, _, fault = decode_image_file(path, f"masks/{path.name}", "mask")
         k = rig[name].intrinsics
         if pixels is None:
+            assert fault is not None
             faults.append(fault)
         elif pixels.shape != (k.height, k.width):
             faults.append(size_fault(f"masks/{path.name}", (pixels.shape[1], pixels.shape[0]), k))

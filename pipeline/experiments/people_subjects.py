@@ -233,6 +233,7 @@ def _read_folder(folder: Path) -> CaptureWithTruth:
 def _read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     pixels, _, fault = decode_image_file(path, path.name, "mask")
     if pixels is None:
+        assert fault is not None
         raise InputError(path.name, [fault])
     return pixels > 127
 

@@ -28,7 +28,9 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
     try:
         return GphotoDriver(camera, importlib.import_module("gphoto2"))
     except ImportError as error:
-        raise DriverMissing(camera, f"python-gphoto2: {how_to_install('gphoto')}") from error
+        raise DriverMissing(
+            camera, compose("located", where="python-gphoto2", fault=how_to_install("gphoto"))
+        ) from error
 
 
 class GphotoDriver:

@@ -14,6 +14,8 @@ import struct
 import time
 from urllib.parse import unquote, urlsplit
 
+from rig.messages.message import Message, compose
+
 HEAD_MOST = 64 * 1024
 PART_MOST = 64 * 1024 * 1024
 _CHUNK = 256 * 1024
@@ -29,6 +31,10 @@ class StreamTimeout(Exception):
 
 class StreamBroken(Exception):
     """The stream ended, or is no motion JPEG."""
+
+    def __init__(self, message: Message) -> None:
+        self.message = message
+        super().__init__(message)
 
 
 class MjpegStream:
@@ -64,7 +70,7 @@ class MjpegStream:
             body = self._take_until(b"\r\n" + self._boundary, deadline_s, PART_MOST)
             self._buffer[:0] = self._boundary
         elif length > PART_MOST:
-            raise StreamBroken(f"a frame of {length} bytes")
+            raise StreamBroken(compose("stream-frame", bytes=str(length)))
         else:
             while len(self._buffer) < length:
                 self._receive(deadline_s, min(_CHUNK, length - len(self._buffer)))
@@ -78,7 +84,7 @@ class MjpegStream:
         while (at := self._buffer.find(mark, max(0, searched - len(mark)))) < 0:
             searched = len(self._buffer)
             if searched > most:
-                raise StreamBroken("it sends no motion JPEG")
+                raise StreamBroken(compose("stream-no-jpeg"))
             try:
                 self._receive(deadline_s, _CHUNK if most == PART_MOST else _HEAD_CHUNK)
             except StreamTimeout:
@@ -98,7 +104,7 @@ class MjpegStream:
         except TimeoutError as error:
             raise StreamTimeout from error
         if not data:
-            raise StreamBroken("the stream ended")
+            raise StreamBroken(compose("stream-ended"))
         self._buffer += data
 
     def _read(self, size: int) -> bytes:
@@ -150,12 +156,12 @@ def _connect(url: str, timeout_s: float) -> socket.socket:
 def _boundary(head: bytes) -> bytes:
     status = re.match(rb"HTTP/\d\.\d (\d{3})", head)
     if status is None:
-        raise StreamBroken("the address answers something else than HTTP")
+        raise StreamBroken(compose("stream-no-http"))
     if status.group(1) != b"200":
-        raise StreamBroken(f"the address answers with HTTP status {status.group(1).decode()}")
+        raise StreamBroken(compose("stream-http-status", status=status.group(1).decode()))
     kind = re.search(rb'(?im)^content-type:\s*multipart/x-mixed-replace\s*;\s*boundary="?([^"\r\n;]+)', head)
     if kind is None:
-        raise StreamBroken("the address serves no motion JPEG (multipart/x-mixed-replace)")
+        raise StreamBroken(compose("stream-other-kind"))
     name = kind.group(1).strip()
     # Some cameras put the two dashes into the name already.
     return name if name.startswith(b"--") else b"--" + name

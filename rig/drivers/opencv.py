@@ -185,4 +185,6 @@ def _is_taken(prop: int, wanted: float, found: float) -> bool:
 
 
 def _reason(error: Exception, otherwise: Message) -> Message | str:
+    if isinstance(error, StreamBroken):
+        return error.message
     return str(error).splitlines()[0] if str(error) else otherwise

@@ -26,7 +26,6 @@ from pathlib import Path, PurePosixPath
 
 from rig.errors import InputError
 from rig.formats.archive_names import (
-    ENCODED,
     decoded_name,
     is_dropped,
     name_clash,
@@ -34,6 +33,7 @@ from rig.formats.archive_names import (
     path_faults,
     unicode_path,
 )
+from rig.messages.message import Message, compose
 
 COPY_BYTES = 1 << 20
 UTF8_FLAG, DOS = 0x800, 0  # of zip: names are UTF-8; the system of MS-DOS
@@ -70,7 +70,7 @@ class _Member:
 
     name: str
     size: int
-    kind: str  # "file", "folder", or what is wrong with it
+    kind: str  # "file", "folder", or a word for what is not unpacked
     open: Callable[[], BufferedIOBase] | None = None
     guessed: bool = False
 
@@ -83,21 +83,21 @@ class _Member:
 
 @dataclass(slots=True)
 class _Faults:
-    """What is wrong with members, said once of all that have the same: sentences with a place for the member's name."""
+    """What is wrong with members, said once of all that have the same: messages that differ in ``member`` alone."""
 
-    by_text: dict[str, list[str]] = field(default_factory=dict)
+    by_cause: dict[tuple[object, ...], list[Message]] = field(default_factory=dict)
 
-    def add(self, shown: str, text: str) -> None:
-        self.by_text.setdefault(text, []).append(shown)
+    def add(self, fault: Message) -> None:
+        others = {name: value for name, value in fault.parameters.items() if name != "member"}
+        self.by_cause.setdefault((fault.code, *others.items()), []).append(fault)
 
-    def sentences(self) -> list[str]:
-        told: list[str] = []
-        for text, members in self.by_text.items():
-            if len(members) < SAME_LEAST:
-                told += [text.replace("{}", shown, 1) for shown in members]
+    def told(self) -> list[Message]:
+        told: list[Message] = []
+        for faults in self.by_cause.values():
+            if len(faults) < SAME_LEAST:
+                told += faults
             else:
-                same = f"the same is true of {len(members) - 1} more members"
-                told.append(f"{text.replace('{}', members[0], 1)}; {same}")
+                told.append(compose("same-of-members", fault=faults[0], count=len(faults) - 1))
         return _first(told)
 
 
@@ -114,7 +114,7 @@ def extract_archive(path: Path, folder: Path, limits: ArchiveLimits = ArchiveLim
     """
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
-        raise InputError(folder.name, ["is not empty; an archive is unpacked into a folder of its own"])
+        raise InputError(folder.name, [compose("archive-folder-not-empty")])
     try:
         with _opened(path) as members:
             return _extract(members, folder, limits, packed_bytes=path.stat().st_size)
@@ -162,9 +162,8 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
     kind = _format(path)
     if kind is None:
         foreign = _foreign_kind(path)
-        told = f"is packed by {foreign}, which is not read: pack the folder as .zip, .tar or .tar.gz"
-        plain = "is damaged or no .zip, .tar or .tar.gz (told by its first bytes)"
-        raise InputError("archive", [told if foreign else plain])
+        told = compose("archive-foreign", packer=foreign) if foreign else compose("archive-unknown")
+        raise InputError("archive", [told])
     try:
         if kind == "zip":
             _check_directory_size(path)
@@ -190,13 +189,13 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
         ValueError,
         RecursionError,
     ) as error:
-        raise InputError("archive", [f"is damaged or cut off ({_words(error)})"]) from error
+        raise InputError("archive", [compose("archive-damaged", reason=_words(error))]) from error
     except (NotImplementedError, RuntimeError) as error:  # what zipfile raises for methods and keys it does not have
-        raise InputError("archive", [f"cannot be unpacked ({_words(error)}); pack it with plain deflate"]) from error
+        raise InputError("archive", [compose("archive-not-unpacked", reason=_words(error))]) from error
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EACCES, errno.EROFS, errno.EMFILE):
             raise
-        raise InputError("archive", [f"is damaged or cut off ({_words(error)})"]) from error
+        raise InputError("archive", [compose("archive-damaged", reason=_words(error))]) from error
 
 
 class _TarInfo(tarfile.TarInfo):
@@ -204,9 +203,11 @@ class _TarInfo(tarfile.TarInfo):
 
     def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
         if self.type not in (*tarfile.SUPPORTED_TYPES, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE):
-            raise InputError("archive", [f"{self.name!r:.120} is of a kind ({self.type!r}) that is not unpacked"])
+            raise InputError(
+                "archive", [compose("member-of-kind", member=f"{self.name!r:.120}", kind=f"{self.type!r}")]
+            )
         if not self.isreg() and self.size > HEADER_BYTES_MOST:
-            raise InputError("archive", [f"{self.name!r:.120} has a header of {self.size:,} bytes"])
+            raise InputError("archive", [compose("member-header-large", member=f"{self.name!r:.120}", bytes=self.size)])
         return super()._proc_member(archive)  # type: ignore[misc]
 
 
@@ -215,7 +216,7 @@ def _check_directory_size(path: Path) -> None:
     with path.open("rb") as stream:
         end = zipfile._EndRecData(stream)  # type: ignore[attr-defined]
     if end is not None and end[5] > DIRECTORY_BYTES_MOST:
-        raise InputError("archive", [f"has a list of members {end[5]:,} bytes long: too many members"])
+        raise InputError("archive", [compose("archive-list-long", bytes=end[5])])
 
 
 def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
@@ -228,14 +229,14 @@ def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
     faults = _Faults()
     for (offset, size, shown), following in pairwise(starts):
         if offset + 30 + size > following[0]:
-            faults.add(shown, "{} overlaps the next member: a zip bomb")
+            faults.add(compose("member-overlaps", member=shown))
     for info, member in zip(infos, members, strict=True):
         if info.flag_bits & 0x1:
-            faults.add(member.shown, "{} is encrypted")
+            faults.add(compose("member-encrypted", member=member.shown))
         elif info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
-            faults.add(member.shown, f"{{}} is packed with method {info.compress_type}, which is not supported")
-    if faults.by_text:
-        raise InputError("archive", faults.sentences())
+            faults.add(compose("member-method", member=member.shown, method=info.compress_type))
+    if faults.by_cause:
+        raise InputError("archive", faults.told())
     return members
 
 
@@ -252,27 +253,35 @@ def _zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, *, windows: boo
     return _Member(name, info.file_size, kind, lambda: _buffered(archive.open(info)), guessed)
 
 
+_NO_FILES = {
+    "symbolic link": compose("symbolic-link"),
+    "hard link": compose("hard-link"),
+    "sparse file": compose("sparse-file"),
+    "device or pipe": compose("device-or-pipe"),
+}
+
+
 def _zip_kind(info: zipfile.ZipInfo) -> str:
     mode = info.external_attr >> 16
     if stat.S_ISLNK(mode):
-        return "is a symbolic link"
+        return "symbolic link"
     if mode and stat.S_IFMT(mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
-        return "is a device or pipe"
+        return "device or pipe"
     return "folder" if info.is_dir() or stat.S_ISDIR(mode) else "file"
 
 
 def _tar_members(archive: tarfile.TarFile) -> Iterator[_Member]:
     for info in archive:
         if info.issym():
-            kind = "is a symbolic link"
+            kind = "symbolic link"
         elif info.islnk():
-            kind = "is a hard link"
+            kind = "hard link"
         elif info.isdir():
             kind = "folder"
         elif info.isreg() and not info.issparse():
             kind = "file"
         else:
-            kind = "is a sparse file" if info.issparse() else "is a device or pipe"
+            kind = "sparse file" if info.issparse() else "device or pipe"
         name, guessed = decoded_name(info.name.encode("utf-8", "surrogateescape"))
         yield _Member(name, info.size, kind, lambda info=info: _buffered(archive.extractfile(info)), guessed)
 
@@ -287,28 +296,28 @@ def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, pa
     name is kept is known at the end, when all files lie in one folder or do not."""
     faults = _Faults()
     seen: dict[str, tuple[str, str]] = {}
-    odd: dict[tuple[str, ...], list[tuple[str, str]]] = {}
+    odd: dict[tuple[str, ...], list[Message]] = {}
     written: list[str] = []
     room = min(limits.total_bytes, max(limits.ratio_floor_bytes, int(limits.ratio * packed_bytes)))
     for number, member in enumerate(members, 1):
         room -= max(0, member.size)  # to pass over a tar's member means to unpack it
         if number > limits.members or room < 0 or member.size > limits.member_bytes:
-            faults.add("", _too_much(number, member, limits, packed_bytes))
+            faults.add(_too_much(number, member, limits, packed_bytes))
             break
         name = _judge(member, seen, odd, faults, limits)
-        if name is not None and not faults.by_text:
+        if name is not None and not faults.by_cause:
             if fault := _write(member, folder / name):
-                faults.add(member.shown, fault)
+                faults.add(fault)
             written.append(name)
     around = _common_folder(written)
     for parts, told in odd.items():
         if parts != around[: len(parts)]:
-            for shown, text in told:
-                faults.add(shown, text)
-    if not written and not faults.by_text:
-        faults.add("", "holds no files")
-    if faults.by_text:
-        raise InputError("archive", faults.sentences())
+            for fault in told:
+                faults.add(fault)
+    if not written and not faults.by_cause:
+        faults.add(compose("archive-empty"))
+    if faults.by_cause:
+        raise InputError("archive", faults.told())
     return tuple(written)
 
 
@@ -318,7 +327,7 @@ def _common_folder(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(same[0] for same in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
 
 
-def _write(member: _Member, path: Path) -> str | None:
+def _write(member: _Member, path: Path) -> Message | None:
     assert member.open is not None
     path.parent.mkdir(parents=True, exist_ok=True)
     size = 0
@@ -329,55 +338,53 @@ def _write(member: _Member, path: Path) -> str | None:
         target.flush()
         os.fsync(target.fileno())
     if size != member.size:
-        return f"{{}} does not hold the {member.size:,} bytes that its header says"
+        return compose("member-size-wrong", member=member.shown, bytes=member.size)
     return None
 
 
-def _too_much(number: int, member: _Member, limits: ArchiveLimits, packed_bytes: int) -> str:
+def _too_much(number: int, member: _Member, limits: ArchiveLimits, packed_bytes: int) -> Message:
     if number > limits.members:
-        return f"holds more than {limits.members} members"
+        return compose("archive-members-many", most=limits.members)
     if member.size > limits.member_bytes:
-        return f"{member.shown} is {member.size:,} bytes; at most {limits.member_bytes:,} are read"
-    return (
-        f"unpacks to more than is allowed: {limits.total_bytes:,} bytes, or {limits.ratio:g} times its own "
-        f"{packed_bytes:,} bytes"
-    )
+        return compose("member-large", member=member.shown, bytes=member.size, most=limits.member_bytes)
+    return compose("archive-large", bytes=limits.total_bytes, ratio=limits.ratio, packed_bytes=packed_bytes)
 
 
 def _judge(
     member: _Member,
     seen: dict[str, tuple[str, str]],
-    odd: dict[tuple[str, ...], list[tuple[str, str]]],
+    odd: dict[tuple[str, ...], list[Message]],
     faults: _Faults,
     limits: ArchiveLimits,
 ) -> str | None:
     """The relative name to write to (None: nothing to write). Adds what is wrong with the member to ``faults``, and to
     ``odd`` what is wrong with a part of its name, should that be kept."""
     if member.kind not in ("file", "folder"):
-        faults.add(member.shown, f"{{}} {member.kind}; only files and folders are unpacked")
+        faults.add(compose("member-no-file", member=member.shown, kind=_NO_FILES[member.kind]))
         return None
-    if wrong := path_faults(member.name, depth=limits.depth, name_length=limits.name_length):
-        for text in wrong:
-            faults.add(member.shown, text)
+    if wrong := path_faults(member.name, member.shown, depth=limits.depth, name_length=limits.name_length):
+        for fault in wrong:
+            faults.add(fault)
         return None
     parts = [part for part in PurePosixPath(member.name).parts if part != "."]
     if member.kind == "folder" or not parts or any(is_dropped(part) for part in parts):
         return None
     for depth, part in enumerate(parts, 1):
         here = tuple(parts[:depth])
-        for text in name_faults(part, name_length=limits.name_length) if here not in odd else ():
-            odd.setdefault(here, []).append((member.shown, ENCODED if member.guessed else text))
+        for fault in name_faults(part, member.shown, name_length=limits.name_length) if here not in odd else ():
+            garbled = compose("member-name-encoding", member=member.shown)
+            odd.setdefault(here, []).append(garbled if member.guessed else fault)
     for depth in range(1, len(parts) + 1):
-        fault = name_clash(parts[:depth], "file" if depth == len(parts) else "folder", seen)
+        fault = name_clash(parts[:depth], member.shown, "file" if depth == len(parts) else "folder", seen)
         if fault:
-            faults.add(member.shown, fault)
+            faults.add(fault)
             return None
     return "/".join(parts)
 
 
-def _first(faults: list[str]) -> list[str]:
+def _first(faults: list[Message]) -> list[Message]:
     more = len(faults) - FAULTS_MOST
-    return faults[:FAULTS_MOST] + ([f"and {more} more faults"] if more > 0 else [])
+    return faults[:FAULTS_MOST] + ([compose("faults-more", more=more)] if more > 0 else [])
 
 
 def _words(error: Exception) -> str:

@@ -11,10 +11,10 @@ import unicodedata
 import zlib
 
 from rig.formats.picture_names import JUNK
+from rig.messages.message import Message, compose
 
 UNICODE_PATH = 0x7075  # Info-ZIP's field of zip
 COMPONENT_BYTES_MOST = 255  # of a file's or folder's name, on every usual file system
-ENCODED = "{} has letters in an encoding that the archive does not tell: pack it with names in UTF-8, or rename it"
 DROPPED = frozenset(name.casefold() for name in JUNK)  # never written
 SCRIPTS = ("LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE", "COPTIC")  # alphabets whose letters look alike
 WINDOWS_NAMES = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
@@ -49,7 +49,7 @@ def is_dropped(part: str) -> bool:
     return part.startswith("._") or part.casefold() in DROPPED
 
 
-def name_clash(parts: list[str], kind: str, seen: dict[str, tuple[str, str]]) -> str | None:
+def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[str, str]]) -> Message | None:
     """A name that another member has already, or that some file system or reader takes for another's."""
     name = "/".join(parts)
     key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
@@ -59,39 +59,41 @@ def name_clash(parts: list[str], kind: str, seen: dict[str, tuple[str, str]]) ->
         return None
     if other == (name, "folder") and kind == "folder":
         return None
-    return "{} occurs twice" if other[0] == name else f"{{}} is the same name as {other[0]!r:.120} in other letters"
+    if other[0] == name:
+        return compose("member-twice", member=shown)
+    return compose("member-name-alike", member=shown, other=f"{other[0]!r:.120}")
 
 
-def path_faults(name: str, *, depth: int, name_length: int) -> list[str]:
-    """What no member may be called, kept or not."""
+def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[Message]:
+    """What no member may be called, kept or not; messages call it ``shown``."""
     if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
-        return ["{} has an invisible or control character in its name: rename it"]
+        return [compose("member-name-invisible", member=shown)]
     if "\\" in name or re.match(r"^[A-Za-z]:", name):
-        return ["{} has a backslash or a drive letter in its name: rename it"]
+        return [compose("member-name-backslash", member=shown)]
     if name.startswith("/"):
-        return ["{} is an absolute path"]
+        return [compose("member-absolute", member=shown)]
     parts = name.rstrip("/").split("/")
     if ".." in parts:
-        return ["{} leads out of the archive ('..')"]
+        return [compose("member-leads-out", member=shown)]
     faults = []
     if len(parts) > depth:
-        faults.append(f"{{}} lies {len(parts)} folders deep; at most {depth} are unpacked")
+        faults.append(compose("member-deep", member=shown, depth=len(parts), most=depth))
     if any(len(part.encode()) > COMPONENT_BYTES_MOST for part in parts):
-        faults.append(f"{{}} has a name longer than {name_length} bytes")
+        faults.append(compose("member-name-long", member=shown, most=name_length))
     return faults
 
 
-def name_faults(part: str, *, name_length: int) -> list[str]:
+def name_faults(part: str, shown: str, *, name_length: int) -> list[Message]:
     """What a file or folder that is kept may not be called."""
     faults = []
     if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
-        faults.append("{} has an invisible or control character in its name: rename it")
+        faults.append(compose("member-name-invisible", member=shown))
     if len(part.encode()) > name_length:
-        faults.append(f"{{}} has a name longer than {name_length} bytes")
+        faults.append(compose("member-name-long", member=shown, most=name_length))
     if WINDOWS_NAMES.match(part):
-        faults.append("{} has a name that Windows reserves for a device")
+        faults.append(compose("member-name-reserved", member=shown))
     if any(len(_scripts(word)) > 1 for word in re.findall(r"[^\W\d_]+", part)):
-        faults.append("{} mixes letters of several alphabets in its name: rename it")
+        faults.append(compose("member-name-mixed", member=shown))
     return faults
 
 

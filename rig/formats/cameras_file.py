@@ -41,10 +41,7 @@ WRITERS: dict[str, Callable[[Rig, Path], None]] = {
 }
 FORMATS = tuple(WRITERS)
 FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # of several files
-NO_RIG = (
-    "holds no cameras.json (nor a file of COLMAP, caliscope, aniposelib, Metashape, RealityCapture, nerfstudio or "
-    "OpenCV)"
-)
+NO_RIG = compose("no-rig-file")
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
 HEAD_BYTES = 1 << 16  # of an XMP file that other programs wrote to, the names of their formats come first
 
@@ -110,8 +107,8 @@ def read_cameras(path: Path) -> CamerasRead:
         return read_xmp(path.parent)
     readers = {".toml": read_toml, ".xml": read_metashape, ".csv": read_csv, ".yml": read_yaml, ".yaml": read_yaml}
     if path.suffix not in readers:
-        told = f"is no rig's file by its name's ending (.json, {', '.join(readers)}, .txt, .bin, .xmp)"
-        raise InputError(path.name, [f"{told}; known are those of {', '.join(FORMATS[:-1])}"])
+        endings = (".json", *readers, ".txt", ".bin", ".xmp")
+        raise InputError(path.name, [compose("no-rig-ending", endings=endings, formats=FORMATS[:-1])])
     return readers[path.suffix](path)
 
 
@@ -127,7 +124,7 @@ def rig_file_parts(path: Path) -> tuple[Path, ...]:
 def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
     """Writes a rig in a format of ``FORMATS``; COLMAP's, XMP and YAML are folders. Raises InputError for another."""
     if kind not in WRITERS:
-        raise InputError("format", [f"{kind!r} is none of {', '.join(FORMATS)}"])
+        raise InputError("format", [compose("none-of", value=f"{kind!r}", known=FORMATS)])
     WRITERS[kind](rig, path)
 
 

@@ -10,6 +10,7 @@ from rig.atomic_write import write_atomically
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
 from rig.geometry import RigidTransform, nearest_rotation
+from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS, LensModel, RecordedLens
 from rig.rig import Rig
 
@@ -50,7 +51,7 @@ def read_rig(path: Path) -> Rig:
     try:
         document = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path.name, [f"cannot be read as JSON ({error})"]) from error
+        raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
     return rig_from_document(document, path.name)
 
 
@@ -65,15 +66,15 @@ def document_from_rig(rig: Rig) -> CamerasDocument:
 def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     """The rig in a decoded ``cameras.json``. Raises InputError naming every fault."""
     if not isinstance(document, dict) or not isinstance(document.get("cameras"), list):
-        raise InputError(subject, ["is no object with a list 'cameras'"])
-    faults = []
+        raise InputError(subject, [compose("no-camera-list")])
+    faults: list[Message] = []
     if document.get("format") != FORMAT:
-        faults.append(f"format is {document.get('format')!r:.80}, wanted {FORMAT!r}")
+        faults.append(compose("format-is", format=f"{document.get('format')!r:.80}", wanted=f"{FORMAT!r}"))
     if document.get("unit", "mm") != "mm":
-        faults.append(f"unit is {document['unit']!r:.80}, wanted 'mm'")
+        faults.append(compose("unit-is", unit=f"{document['unit']!r:.80}"))
     entries = document["cameras"]
     if not CAMERAS_LEAST <= len(entries) <= CAMERAS_MOST:
-        faults.append(f"{len(entries)} cameras; between {CAMERAS_LEAST} and {CAMERAS_MOST} work")
+        faults.append(compose("cameras-few-or-many", count=len(entries), least=CAMERAS_LEAST, most=CAMERAS_MOST))
     cameras = [_read_camera(entry, f"cameras[{i}]", faults) for i, entry in enumerate(entries[:CAMERAS_MOST])]
     found = [camera for camera in cameras if camera is not None]
     names = [camera.name for camera in found]
@@ -83,30 +84,32 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     return Rig(tuple(found))
 
 
-def _repeated(names: list[str]) -> list[str]:
+def _repeated(names: list[str]) -> list[Message]:
     """One sentence for all names that several cameras have: a list written twice repeats every one of them."""
     repeated = [name for name in sorted(set(names)) if names.count(name) > 1]
     if not repeated:
         return []
-    first = f"camera {repeated[0]!r} occurs {names.count(repeated[0])} times"
-    return [first if len(repeated) == 1 else f"{first}, and {len(repeated) - 1} more names occur several times"]
+    camera, times, more = f"{repeated[0]!r}", names.count(repeated[0]), len(repeated) - 1
+    if more:
+        return [compose("cameras-repeated", camera=camera, times=times, count=more)]
+    return [compose("camera-repeated", camera=camera, times=times)]
 
 
-def _shared_serials(cameras: list[Camera]) -> list[str]:
+def _shared_serials(cameras: list[Camera]) -> list[Message]:
     owners: dict[str, list[str]] = {}
     for camera in cameras:
         if camera.serial is not None:
             owners.setdefault(camera.serial, []).append(camera.name)
-    told = "one body is one camera: correct or leave out their serials"
-    return [f"{' and '.join(own)} have the serial {serial!r}: {told}" for serial, own in owners.items() if len(own) > 1]
+    shared = {serial: own for serial, own in owners.items() if len(own) > 1}
+    return [compose("serial-shared", cameras=own, serial=f"{serial!r}") for serial, own in shared.items()]
 
 
-def name_fault(name: Any) -> str | None:
+def name_fault(name: Any) -> Message | None:
     """Why ``name`` cannot be a camera's name, which becomes a file name; None if it can."""
     if not isinstance(name, str) or not 0 < len(name) <= 64:
-        return f"{name!r:.80} is no name of 1 to 64 characters"
+        return compose("camera-name-length", name=f"{name!r:.80}", most=64)
     if not all(c.isascii() and (c.isalnum() or c in "-_.") for c in name) or name.startswith("."):
-        return f"{name!r} may hold only ASCII letters, digits, '-', '_' and '.', and may not start with '.'"
+        return compose("camera-name-signs", name=f"{name!r}")
     return None
 
 
@@ -137,25 +140,26 @@ def _lens_document(camera: Camera) -> dict[str, str | float]:
     return {"model": lens.model, **dict(zip(COEFFICIENTS[lens.model], lens.coefficients, strict=True))}
 
 
-def _read_lens(lens: Any, where: str, faults: list[str]) -> tuple[Distortion, RecordedLens | None]:
+def _read_lens(lens: Any, where: str, faults: list[Message]) -> tuple[Distortion, RecordedLens | None]:
     """Our own lens, or a pinhole and the lens that its pictures are undistorted from."""
     model = lens.get("model", "brown-conrady") if isinstance(lens, dict) else "brown-conrady"
     known: LensModel | None = next((name for name in COEFFICIENTS if name == model), None)
     if known is None and model != "brown-conrady":
-        faults.append(f"{where}.model is {model!r:.80}, wanted 'brown-conrady', {' or '.join(map(repr, COEFFICIENTS))}")
+        models = [f"{model!r}" for model in ("brown-conrady", *COEFFICIENTS)]
+        faults.append(compose("value-none-of", key=f"{where}.model", value=f"{model!r:.80}", known=models))
     keys = COEFFICIENTS[known] if known else ("k1", "k2", "p1", "p2", "k3")
     values = _read_numbers(lens, keys, where, faults, default=0.0)
     return (Distortion(), RecordedLens(known, tuple(values))) if known else (Distortion(*values), None)
 
 
-def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
+def _read_camera(entry: Any, where: str, faults: list[Message]) -> Camera | None:
     before = len(faults)
     if not isinstance(entry, dict):
-        faults.append(f"{where} is no object")
+        faults.append(compose("no-object", key=where))
         return None
     fault = name_fault(entry.get("name"))
     if fault:
-        faults.append(f"{where}.name {fault}")
+        faults.append(compose("of-key", key=f"{where}.name", fault=fault))
     else:
         where = entry["name"]
     width, height = (_read_size(entry.get(key), f"{where}.{key}", faults) for key in ("width", "height"))
@@ -169,14 +173,15 @@ def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
     if entry.get("covariance") is not None:
         covariance = _read_array(entry["covariance"], (6, 6), f"{where}.covariance", faults)
         if covariance is not None and not _is_covariance(covariance):
-            faults.append(f"{where}.covariance is not symmetric and positive semi-definite")
+            faults.append(compose("no-covariance", key=f"{where}.covariance"))
     if rotation is not None:
         faults += _rotation_faults(rotation, where)
     serial = entry.get("serial")
     if serial is not None and not (isinstance(serial, str) and 0 < len(serial) <= SERIAL_MOST):
-        faults.append(f"{where}.serial is {serial!r:.80}, wanted text of 1 to {SERIAL_MOST} characters")
+        told, value = f"{where}.serial", f"{serial!r:.80}"
+        faults.append(compose("no-text-of", key=told, value=value, most=SERIAL_MOST))
     if len(faults) == before and not (fx > 0 and fy > 0):
-        faults.append(f"{where}.intrinsics: fx and fy must be positive")
+        faults.append(compose("focal-lengths-positive", key=f"{where}.intrinsics"))
     if len(faults) > before or rotation is None or translation is None or not width or not height:
         return None
     intrinsics = Intrinsics(width, height, fx, fy, cx, cy, distortion)
@@ -184,13 +189,13 @@ def _read_camera(entry: Any, where: str, faults: list[str]) -> Camera | None:
     return Camera(entry["name"], intrinsics, pose, covariance, recorded, serial)
 
 
-def _rotation_faults(rotation: np.ndarray, where: str) -> list[str]:
+def _rotation_faults(rotation: np.ndarray, where: str) -> list[Message]:
+    key = f"{where}.camera_from_world.rotation"
     # Files with six digits are off by 1e-6; a mirrored or scaled matrix is off by far more than 1e-3.
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        return [f"{where}.camera_from_world.rotation is not orthonormal: give every digit of a rotation matrix"]
+        return [compose("rotation-not-orthonormal", key=key)]
     if np.linalg.det(rotation) < 0:
-        told = f"{where}.camera_from_world.rotation has determinant -1: a mirrored frame; negate one axis of the world"
-        return [f"{told} in every pose, so that it is right-handed"]
+        return [compose("rotation-mirrored", key=key)]
     return []
 
 
@@ -204,37 +209,37 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12  # NaN fails too
 
 
-def _read_size(value: Any, where: str, faults: list[str]) -> int:
+def _read_size(value: Any, where: str, faults: list[Message]) -> int:
     if not _is_number(value) or value != int(value) or not 16 <= value <= PIXELS_MOST:
-        faults.append(f"{where} is {value!r:.80}, wanted a whole number of pixels from 16 to {PIXELS_MOST}")
+        faults.append(compose("no-pixel-count", key=where, value=f"{value!r:.80}", most=PIXELS_MOST))
         return 0
     return int(value)
 
 
 def _read_numbers(
-    entry: Any, keys: tuple[str, ...], where: str, faults: list[str], default: float | None = None
+    entry: Any, keys: tuple[str, ...], where: str, faults: list[Message], default: float | None = None
 ) -> list[float]:
     if not isinstance(entry, dict):
-        faults.append(f"{where} is missing or no object: wanted are {', '.join(keys)} by name")
+        faults.append(compose("no-object-of", key=where, names=keys))
         return [0.0] * len(keys)
     values = [entry.get(key, default) for key in keys]
     for key, value in zip(keys, values, strict=True):
         if not _is_number(value):
-            faults.append(f"{where}.{key} is {value!r:.80}, wanted a finite number")
+            faults.append(compose("no-finite-number", key=f"{where}.{key}", value=f"{value!r:.80}"))
     return [float(value) if _is_number(value) else 0.0 for value in values]  # type: ignore[arg-type]
 
 
-def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[str]) -> np.ndarray | None:
+def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[Message]) -> np.ndarray | None:
     try:
         array = np.array(value, dtype=object)  # float would read "1" and true as numbers
     except ValueError:
         array = np.zeros(0)
     if array.shape != shape:
-        told = f"{where} is missing or not {' x '.join(map(str, shape))} numbers"
         vector = shape == (3, 3) and array.squeeze().shape == (3,)
-        faults.append(f"{told}: of a rotation vector write the matrix (cv2.Rodrigues)" if vector else told)
+        code = "rotation-vector" if vector else "no-numbers-of-shape"
+        faults.append(compose(code, key=where, shape=" x ".join(map(str, shape))))
         return None
     if not all(_is_number(entry) for entry in array.flat):
-        faults.append(f"{where} holds a value that is no finite number")
+        faults.append(compose("holds-no-finite-number", key=where))
         return None
     return array.astype(float)

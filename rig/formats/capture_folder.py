@@ -53,7 +53,7 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Pictures of more
     than ``pixels_most`` pixels come smaller, and so do their cameras (``rig.formats.work_size``). Raises InputError
     that names every fault in it."""
-    faults: list[str] = []
+    faults: list[Message] = []
     folder = capture_root(folder)
     rigs = [*rig_files(folder)]
     if not rigs:
@@ -62,7 +62,10 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     read = read_rig_of(rig_file)
     rig = read.rig
     check_folders(folder, rig)
-    faults += [f"{rig_file.name}: {fault}" for fault in rig_faults(rig, any_unit=has_known_length(folder))]
+    faults += [
+        compose("located", where=rig_file.name, fault=fault)
+        for fault in rig_faults(rig, any_unit=has_known_length(folder))
+    ]
     files = find_files(folder, rig, read.left_out)
     faults += files.faults
     capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most)
@@ -95,7 +98,7 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
         is_other = path.is_dir() and path.name not in known and not is_junk(path.name)
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
         if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
-            told.append(f"{path.name}/ is not read: pictures lie in images/, masks/ and background/")
+            told.append(compose("folder-unread", folder=path.name))
     return [compose("file-unread", remark=message) for message in told]
 
 
@@ -103,7 +106,7 @@ def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
     """Cameras of another program: files that do nothing here."""
     read, *others = (path.relative_to(folder).as_posix() for path in rigs)
     others += _other_models(folder, rigs[0])
-    told = [f"{other} is not read: the cameras come from {read}" for other in others]
+    told = [compose("cameras-unread", file=other, read=read) for other in others]
     return [compose("file-unread", remark=message) for message in told]
 
 
@@ -126,7 +129,7 @@ def has_known_length(folder: Path) -> bool:
 def capture_root(folder: Path) -> Path:
     """``folder``, or the single folder in it, and in that: an archive may hold enclosing folders."""
     if not folder.is_dir():
-        raise InputError(str(folder.name or folder), ["is no folder; give the capture folder that holds cameras.json"])
+        raise InputError(str(folder.name or folder), [compose("no-capture-folder")])
     for _ in range(ENCLOSING_MOST):
         entries = [entry for entry in folder.iterdir() if not is_junk(entry.name)]
         if len(entries) != 1 or not entries[0].is_dir() or entries[0].name == "sparse":
@@ -147,13 +150,19 @@ def check_folders(folder: Path, rig: Rig) -> None:
     for kind in kinds:
         alike = suggest(kind, others, min_likeness=ALIKE_LEAST)
         if alike and not (folder / kind).is_dir():
-            faults.append(f"{others[alike[0]]}/ is not read: call it {kind}/")
+            faults.append(compose("folder-misnamed", folder=others[alike[0]], name=kind))
     if faults:
         raise InputError("capture", faults)
 
 
 def read_shot(
-    folder: Path, rig: Rig, faults: list[str], files: ShotFiles | None = None, *, pixels_most: int | None = None
+    folder: Path,
+    rig: Rig,
+    faults: list[Message],
+    files: ShotFiles | None = None,
+    *,
+    pixels_most: int | None = None,
+    with_features: bool = True,
 ) -> Capture:
     """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``, but those
     of ``files``, which were found before."""
@@ -171,7 +180,8 @@ def read_shot(
     backgrounds: dict[str, list[np.ndarray]] = {}
     digests: dict[str, str] = {}
     for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
-        if fault or pixels is None:
+        if pixels is None:
+            assert fault is not None
             faults.append(fault)
             continue
         digests[path.relative_to(folder).as_posix()] = digest
@@ -182,7 +192,7 @@ def read_shot(
         else:
             backgrounds.setdefault(name, []).append(pixels)
     features: Features = {}
-    if (folder / "features.json").is_file():
+    if with_features and (folder / "features.json").is_file():
         data = (folder / "features.json").read_bytes()
         digests["features.json"] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
@@ -199,22 +209,20 @@ def read_shot(
     )
 
 
-def _sample_bits(jobs: Sequence[tuple[str, str, Path]], faults: list[str]) -> tuple[Mapping[str, int], list[Message]]:
+def _sample_bits(
+    jobs: Sequence[tuple[str, str, Path]], faults: list[Message]
+) -> tuple[Mapping[str, int], list[Message]]:
     """Bits that the files of each kind use of 16, and what is said of fewer; undeveloped mosaics are a fault."""
     kinds = ("images", "background")
     samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
     mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
     if mosaics:
-        faults.append(
-            f"the pictures in {' and '.join(mosaics)} are the mosaic of a colour sensor, undeveloped: have the "
-            "camera's software write colours"
-        )
+        faults.append(compose("pictures-are-mosaics", folders=mosaics))
     bits = {kind: samples[kind].bits or WHOLE_BITS for kind in kinds} | {"masks": WHOLE_BITS}
     remarks = []
     for used in sorted({bits[kind] for kind in kinds} - {WHOLE_BITS}):
-        folders = " and ".join(f"{kind}/" for kind in kinds if bits[kind] == used)
-        text = f"no pixel of {folders} is above {2**used - 1} of 65535: read as {used} bits"
-        remarks.append(compose("picture-levels", remark=f"{text}; shift them by {WHOLE_BITS - used} when writing"))
+        folders = [f"{kind}/" for kind in kinds if bits[kind] == used]
+        remarks.append(compose("picture-levels", folders=folders, most=2**used - 1, bits=used, shift=WHOLE_BITS - used))
     return bits, remarks
 
 
@@ -251,7 +259,7 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
 
 def _decode(
     folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
-) -> tuple[np.ndarray | None, str, str]:
+) -> tuple[np.ndarray | None, str, Message | None]:
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"
@@ -272,17 +280,16 @@ def _decode(
     return pixels, digest, fault
 
 
-def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> str:
-    """A sentence for a picture whose size (width, height) is not that of its camera."""
-    fault = f"{where} is {size[0]} x {size[1]} pixels, but its camera is {k.width} x {k.height}"
+def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
+    """What is said of a picture whose size (width, height) is not that of its camera."""
+    of_picture, of_camera = f"{size[0]} x {size[1]}", f"{k.width} x {k.height}"
+    fault = compose("picture-size-differs", picture=where, size=of_picture, wanted=of_camera)
     if size == (k.height, k.width):
         as_told, turned = (abs(k.cx - w / 2) + abs(k.cy - h / 2) for w, h in ((k.width, k.height), size))
         if turned < as_told:
-            return f"{fault}: its principal point is that of the picture; exchange the camera's width and height"
-        return f"{fault}: it was turned by 90 degrees; turn it back"
+            return compose("located", where=fault, fault=compose("size-exchanged"))
+        return compose("located", where=fault, fault=compose("picture-turned"))
     share = size[0] / k.width
     if abs(size[1] - share * k.height) <= 1.0:
-        return (
-            f"{fault}, and the shape is the same: give it in the size that was calibrated, or calibrate with this one"
-        )
+        return compose("picture-scaled", fault=fault)
     return fault

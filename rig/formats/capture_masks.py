@@ -28,7 +28,7 @@ class MaskSubjects:
 
 
 def mask_subjects(
-    planes: Mapping[str, tuple[str, Plane]], rig: Rig, faults: list[str], *, pixels_most: int | None = None
+    planes: Mapping[str, tuple[str, Plane]], rig: Rig, faults: list[Message], *, pixels_most: int | None = None
 ) -> MaskSubjects:
     """Reads the masks of one capture as ``work_rig`` sees them.
 
@@ -40,7 +40,7 @@ def mask_subjects(
     """
     readings = read_masks({name: plane for name, (_, plane) in planes.items()})
     files = {name: file for name, (file, _) in planes.items()}
-    faults += _by_text({files[name]: reading.fault for name, reading in readings.items() if reading.fault})
+    faults += _by_cause({files[name]: reading.fault for name, reading in readings.items()})
     usable = {name: reading for name, reading in readings.items() if not reading.fault}
     inverted = inverted_masks({name: reading.share > 127 for name, reading in usable.items()}, _middles(rig))
     masks, soft = {}, {}
@@ -49,15 +49,14 @@ def mask_subjects(
         masks[name] = share > 127
         masks[name].setflags(write=False)
         if not masks[name].any():
-            faults.append(f"{files[name]} is empty: no pixel belongs to the subject")
+            faults.append(compose("of-file", file=files[name], fault=compose("mask-empty")))
         elif reading.soft:
             soft[name] = share
             soft[name].setflags(write=False)
-    remarks = [
-        compose("mask-undecided", remark=text) for text in _by_text({files[n]: r.remark for n, r in usable.items()})
-    ]
+    told = _by_cause({files[name]: reading.remark for name, reading in usable.items()})
+    remarks = [compose("mask-undecided", remark=remark) for remark in told]
     if inverted:
-        remarks.append(compose("mask-inverted", remark=_inverted_text([files[name] for name in inverted], len(planes))))
+        remarks.append(compose("mask-inverted", remark=_inverted([files[name] for name in inverted], len(planes))))
     return MaskSubjects(masks, soft, tuple(remarks))
 
 
@@ -84,24 +83,22 @@ def _middles(rig: Rig) -> dict[str, np.ndarray]:
     return {name: pixel for name, pixel in pixels.items() if np.isfinite(pixel).all()}
 
 
-def _by_text(texts: Mapping[str, str]) -> list[str]:
-    """One sentence for all files of which the same is true."""
-    files: dict[str, list[str]] = {}
-    for file, text in texts.items():
-        if text:
-            files.setdefault(text, []).append(file)
-    return [f"{_listed(names)} {text}" for text, names in files.items()]
+def _by_cause(told: Mapping[str, Message | None]) -> list[Message]:
+    """One message for all files of which the same is true."""
+    files: dict[Message, list[str]] = {}
+    for file, message in told.items():
+        if message is not None:
+            files.setdefault(message, []).append(file)
+    return [compose("of-file", file=_of_masks(names), fault=message) for message, names in files.items()]
 
 
-def _listed(files: list[str]) -> str:
+def _of_masks(files: list[str]) -> str | Message:
     if len(files) == 1:
         return files[0]
-    return f"each of the {len(files)} masks {files[0]} to {files[-1]}"
+    return compose("each-of-masks", count=len(files), first=files[0], last=files[-1])
 
 
-def _inverted_text(files: list[str], count: int) -> str:
-    which = "all masks are" if len(files) == count > 1 else f"{', '.join(files)} {'is' if len(files) == 1 else 'are'}"
-    return (
-        f"{which} black where the subject is (white holds the borders of the pictures): turned for this result. "
-        "Write the subject white and all else black"
-    )
+def _inverted(files: list[str], count: int) -> Message:
+    if len(files) == count > 1:
+        return compose("masks-inverted-all")
+    return compose("masks-inverted-some", count=len(files), masks=files)

@@ -16,9 +16,10 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.formats.cameras_json import CAMERAS_MOST
-from rig.formats.foreign import camera_names, lens_entry, parsed
+from rig.formats.foreign import Malformed, camera_names, lens_entry, parsed
 from rig.formats.reading import CamerasRead, Reading, shown
 from rig.geometry import vector_from_rotation
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 # name: (number in the binary file, parameter names in their order).
@@ -64,7 +65,8 @@ def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
     for name, image in zip(names, images, strict=True):
         camera = cameras.get(image.camera)
         if camera is None:
-            faults.append(f"image {name!r} names camera {image.camera}, which cameras{suffix} lacks")
+            files = f"cameras{suffix}"
+            faults.append(compose("image-of-strange-camera", image=f"{name!r}", camera=image.camera, file=files))
             continue
         entries.append(_colmap_entry(name, image, camera, faults))
     return reading.finish(entries)
@@ -93,7 +95,7 @@ class _Records:
         """A count whose records can still fit in the file; a larger one is damage, found before it costs anything."""
         (count,) = self.take("Q")
         if count * least_bytes > len(self.data) - self.at:
-            raise ValueError(f"promises {count} records, more than the file can hold")
+            raise Malformed(compose("records-promised", records=str(count)))
         return count
 
     def skip(self, size: int) -> None:
@@ -102,7 +104,7 @@ class _Records:
     def text(self) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            raise ValueError("a name has no end")
+            raise Malformed(compose("name-without-end"))
         text = self.data[self.at : end].decode("utf-8")
         self.at = end + 1
         return text
@@ -134,7 +136,10 @@ def _binary_cameras(data: bytes) -> dict[int, ColmapCamera]:
         number, model, width, height = records.take("iiQQ")
         name = COLMAP_NAMES.get(model)
         if name is None:
-            raise ValueError(_model_fault(f"{REFUSED_MODELS.get(model, 'of')} number {model}", number))
+            known = REFUSED_MODELS.get(model)
+            of_number = compose("model-of-number", number=model)
+            named = compose("model-and-number", model=known, number=model) if known else of_number
+            raise Malformed(_model_fault(named, number))
         values = records.take(f"{len(COLMAP_MODELS[name][1])}d")
         cameras[number] = ColmapCamera(name, width, height, values)
     return cameras
@@ -157,10 +162,11 @@ def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
             continue
         number, name, width, height, *values = line.split()
         if name not in COLMAP_MODELS:
-            raise ValueError(_model_fault(shown(name), number))
+            raise Malformed(_model_fault(shown(name), number))
         wanted = len(COLMAP_MODELS[name][1])
         if len(values) != wanted:
-            raise ValueError(f"camera {number[:20]} has {len(values)} parameters; {name} has {wanted}")
+            held = len(values)
+            raise Malformed(compose("lens-parameters", camera=number[:20], held=held, model=name, wanted=wanted))
         numbers = tuple(float(value) for value in values)
         cameras[int(number)] = ColmapCamera(name, int(width), int(height), numbers)
     return cameras
@@ -178,7 +184,7 @@ def _text_images(data: bytes) -> list[ColmapImage]:
             continue
         words = line.split(maxsplit=9)
         if len(words) != 10:
-            raise ValueError(f"an image line has {len(words)} entries, wanted 10: {shown(line.strip())}")
+            raise Malformed(compose("image-line", held=len(words), line=shown(line.strip())))
         pose = [float(word) for word in words[1:8]]
         images.append(ColmapImage(pose, int(words[8]), words[9].strip()))
         after_image = True
@@ -208,16 +214,15 @@ def _text_lines(data: bytes) -> Iterator[str]:
 
 def _limited(count: int) -> int:
     if count > CAMERAS_MOST:
-        raise ValueError(f"{count} images; a rig has at most {CAMERAS_MOST} cameras, one image each")
+        raise Malformed(compose("images-many", images=str(count), most=CAMERAS_MOST))
     return count
 
 
-def _model_fault(model: str, number: Any) -> str:
-    remedy = "undistort the pictures, or calibrate with one of these"
-    return f"camera {number!s:.20} has the model {model}; known are {', '.join(COLMAP_MODELS)}: {remedy}"
+def _model_fault(model: str | Message, number: Any) -> Message:
+    return compose("lens-model-unread", camera=f"{number!s:.20}", model=model, known=[*COLMAP_MODELS])
 
 
-def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[str]) -> dict[str, object]:
+def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[Message]) -> dict[str, object]:
     parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
     focal = parameters.get("f", 0.0)
     w, x, y, z = _unit_quaternion(image.pose[:4])

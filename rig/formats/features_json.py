@@ -6,8 +6,10 @@ from typing import Any, TypedDict
 import numpy as np
 
 from rig.capture import Features
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
+FILE = "features.json"
 FEATURES_FORMAT = "eigenhead-features/1"
 POINTS_MOST = 200  # feature points in features.json
 
@@ -19,42 +21,50 @@ class FeaturesDocument(TypedDict):
     points: dict[str, dict[str, list[float]]]
 
 
-def features_from_bytes(data: bytes, rig: Rig, faults: list[str]) -> Features:
+def features_from_bytes(data: bytes, rig: Rig, faults: list[Message]) -> Features:
     """The points of a ``features.json``; appends every fault to ``faults``."""
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
-        faults.append(f"features.json cannot be read as JSON ({error})")
+        faults.append(compose("of-file", file=FILE, fault=compose("no-json", reason=str(error))))
         return {}
     return features_from_document(document, rig, faults)
 
 
-def features_from_document(document: Any, rig: Rig, faults: list[str]) -> Features:
+def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Features:
     """The points of a decoded ``features.json``; appends every fault to ``faults``."""
     if not isinstance(document, dict) or not isinstance(document.get("points"), dict):
-        faults.append("features.json is no object with an object 'points'")
+        faults.append(compose("of-file", file=FILE, fault=compose("features-no-points")))
         return {}
     if document.get("format") != FEATURES_FORMAT:
-        faults.append(f"features.json: format is {document.get('format')!r:.80}, wanted {FEATURES_FORMAT!r}")
+        given = f"{document.get('format')!r:.80}"
+        faults.append(
+            compose("located", where=FILE, fault=compose("format-is", format=given, wanted=f"{FEATURES_FORMAT!r}"))
+        )
     if len(document["points"]) > POINTS_MOST:
-        faults.append(f"features.json: {len(document['points'])} points, at most {POINTS_MOST} are read")
+        told = compose("features-many", count=len(document["points"]), most=POINTS_MOST)
+        faults.append(compose("located", where=FILE, fault=told))
         return {}
     features: dict[str, dict[str, np.ndarray]] = {}
     for landmark, views in document["points"].items():
         if not isinstance(views, dict):
-            faults.append(f"features.json: {landmark!r:.80} is no object of camera: [u, v]")
+            faults.append(_of_point(landmark, compose("feature-no-object")))
             continue
         for name, pixel in views.items():
             point = _pixel(pixel)
             if name not in rig:
-                faults.append(f"features.json: {landmark!r:.80} names camera {name!r:.80}, which the rig does not have")
+                faults.append(_of_point(landmark, compose("feature-strange-camera", camera=f"{name!r:.80}")))
             elif point is None:
-                faults.append(f"features.json: {landmark!r:.80} in {name}: {pixel!r:.80} is no pair of finite pixels")
+                faults.append(_of_point(landmark, compose("feature-no-pixels", camera=name, pixel=f"{pixel!r:.80}")))
             elif not _inside(point, rig[name].intrinsics.width, rig[name].intrinsics.height):
-                faults.append(f"features.json: {landmark!r:.80} in {name}: {pixel!r:.80} lies outside the image")
+                faults.append(_of_point(landmark, compose("feature-outside", camera=name, pixel=f"{pixel!r:.80}")))
             else:
                 features.setdefault(landmark, {})[name] = point
     return features
+
+
+def _of_point(landmark: str, fault: Message) -> Message:
+    return compose("located", where=FILE, fault=compose("of-file", file=f"{landmark!r:.80}", fault=fault))
 
 
 def document_from_features(features: Features) -> FeaturesDocument:

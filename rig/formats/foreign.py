@@ -12,6 +12,7 @@ import numpy as np
 from rig.errors import InputError
 from rig.formats.cameras_json import name_fault
 from rig.formats.picture_names import IMAGE_SUFFIXES, picture_stem
+from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS, LensModel
 
 T = TypeVar("T")
@@ -22,18 +23,27 @@ METRES_MOST = 30.0  # the widest head rig, in metres; in millimetres it would fi
 BYTES_MOST = 1 << 29  # a sparse model of a rig is a few megabytes; its 2D points may be many
 
 
+class Malformed(ValueError):
+    """What a parser of ours finds wrong with the bytes of a file."""
+
+    def __init__(self, message: Message) -> None:
+        self.message = message
+        super().__init__(message)
+
+
 def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
     """``parse`` of the file's bytes, with whatever damage it meets reported as InputError."""
     try:
         if path.stat().st_size > BYTES_MOST:
-            raise InputError(path.name, [f"is larger than {BYTES_MOST >> 20} MiB"])
+            raise InputError(path.name, [compose("file-large", most_mib=BYTES_MOST >> 20)])
         return parse(path.read_bytes())
     except OSError as error:
-        raise InputError(path.name, [f"cannot be read ({error.strerror or error})"]) from error
+        raise InputError(path.name, [compose("no-file-read", reason=str(error.strerror or error))]) from error
     except struct.error as error:
-        raise InputError(path.name, ["ends in the middle of a record: it is truncated or no COLMAP file"]) from error
+        raise InputError(path.name, [compose("record-cut-off")]) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(path.name, [f"cannot be understood ({str(error)[:400]})"]) from error
+        reason = error.message if isinstance(error, Malformed) else str(error)[:400]
+        raise InputError(path.name, [compose("file-not-understood", reason=reason)]) from error
 
 
 def camera_names(files: list[str]) -> list[str]:
@@ -51,7 +61,7 @@ def camera_names(files: list[str]) -> list[str]:
 
 
 def lens_entry(
-    parameters: Mapping[str, float], where: str, faults: list[str], *, fisheye: bool = False
+    parameters: Mapping[str, float], where: str, faults: list[Message], *, fisheye: bool = False
 ) -> dict[str, str | float]:
     """The ``distortion`` of ``eigenhead-cameras/1`` of coefficients in OpenCV's names; those that are missing are 0.
     The one place where a foreign lens gets its model: a coefficient that it does not have is a fault, unless 0."""
@@ -61,20 +71,20 @@ def lens_entry(
     keys = COEFFICIENTS[model] if model else ("k1", "k2", "p1", "p2", "k3")
     lost = [key for key, value in parameters.items() if LENS_KEY.fullmatch(key) and key not in keys and value]
     if lost:
-        kind = "a fisheye" if fisheye else "this lens"
-        those = "is not 0, and" if len(lost) == 1 else "are not 0, and"
-        faults.append(f"{where}: {', '.join(lost)} {those} {kind} has {', '.join(keys)} alone: calibrate without")
+        kind = compose("a-fisheye" if fisheye else "this-lens")
+        faults.append(compose("lens-coefficients-lost", camera=where, count=len(lost), lost=lost, lens=kind, held=keys))
     return {"model": model or "brown-conrady", **{key: parameters.get(key, 0.0) for key in keys}}
 
 
-def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[str]) -> np.ndarray:
+def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[Message]) -> np.ndarray:
     """``value`` as an array; on a fault, one of NaN of the wanted shape, so that the other faults are still found."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         array = np.zeros(())
     if array.ndim == 0 or (shape is not None and array.shape != shape):
-        faults.append(f"{where} is missing or no list of {' x '.join(map(str, shape)) + ' ' if shape else ''}numbers")
+        told = " x ".join(map(str, shape or ()))
+        faults.append(compose("no-list-of", key=where, shape=told) if told else compose("no-number-list", key=where))
         return np.full(shape or (3, 3), np.nan)
     return array
 
@@ -82,14 +92,14 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
 def xml_root(data: bytes) -> ElementTree.Element:
     """The root of an XML file without declarations of its own: entities may unfold to any size."""
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise ValueError("declares entities or a document type, which no exporter writes")
+        raise Malformed(compose("xml-declares"))
     try:
         return ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
-        raise ValueError(f"is no XML: {error}") from None
+        raise Malformed(compose("no-xml", reason=str(error))) from None
 
 
-def sized(folder: Path, name: str, faults: list[str]) -> tuple[int, int]:
+def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
     """Width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold them.
     Where there is none, a fault that says where to put it."""
     from rig.formats.images import picture_size  # decoders, which most formats do without
@@ -102,12 +112,14 @@ def sized(folder: Path, name: str, faults: list[str]) -> tuple[int, int]:
                 try:
                     return picture_size(path)
                 except InputError as error:
-                    faults.append(f"{path.name} {error.faults[0]}")
-    faults.append(f"{name}: its picture is wanted beside the file or in images/, which tells the size in pixels")
+                    faults.append(compose("of-file", file=path.name, fault=error.faults[0]))
+    faults.append(compose("picture-for-size", camera=name))
     return 1024, 1024
 
 
-def brown_conrady(radial: Sequence[float], radius: float, focal: float, where: str, faults: list[str]) -> list[float]:
+def brown_conrady(
+    radial: Sequence[float], radius: float, focal: float, where: str, faults: list[Message]
+) -> list[float]:
     """k1 k2 k3 of a radial polynomial k1 k2 k3 k4 ..., fitted over the picture where k4 is not zero.
 
     Args:
@@ -122,7 +134,7 @@ def brown_conrady(radial: Sequence[float], radius: float, focal: float, where: s
     found = np.linalg.lstsq(powers[:, :3], wanted, rcond=None)[0]
     miss_px = focal * np.abs(powers[:, :3] @ found - wanted).max()
     if not miss_px <= LENS_LOSS_PX:
-        faults.append(f"{where}.k4 bends the picture by {miss_px:.2f} px more than k1 k2 k3 can: calibrate without it")
+        faults.append(compose("k4-lost", key=f"{where}.k4", miss_px=miss_px))
     return found.tolist()
 
 

@@ -9,15 +9,17 @@ told, too. ``docs/foreign-cameras.md`` is made of this table; a test plants each
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
 
+from rig.messages.message import Message, compose
+
 Treatment = Literal["read", "refused", "told", "nothing"]
 
 
 class ForeignKey(NamedTuple):
-    """``why``: what it is read as, or why it is not. ``silent``: values at which a refused or told key says nothing,
-    beside a missing one; of lists, that all their elements have."""
+    """``why``: what it is read as, or why it is not; a message where a reader tells it. ``silent``: values
+    at which a refused or told key says nothing, beside a missing one; of lists, that all their elements have."""
 
     treatment: Treatment
-    why: str
+    why: str | Message
     silent: tuple[str | float | bool, ...] = ()
 
 
@@ -55,18 +57,18 @@ def _plain(value: object) -> str | float:
         return text
 
 
-def _keys(treatment: Treatment, why: str, *keys: str, silent: tuple[str | float | bool, ...] = ()) -> Table:
+def _keys(treatment: Treatment, why: str | Message, *keys: str, silent: tuple[str | float | bool, ...] = ()) -> Table:
     return {key: ForeignKey(treatment, why, silent) for key in keys}
 
 
-SINGLE = "a picture is taken as exposed at one time"
+SINGLE = compose("key-one-time")
 
 METASHAPE: Table = {
     **_keys("read", "the name: a picture's ending and folders are taken off", "camera@label"),
     **_keys("read", "`false` or `0`: the camera takes no part, and a warning says so", "camera@enabled"),
     **_keys("read", "the lens", "camera@sensor_id", "sensor@id"),
     **_keys("read", "its `transform` takes the camera to the world", "camera@component_id", "component@id"),
-    **_keys("refused", "slave of a rig: export its cameras as single sensors", "camera@master_id"),
+    **_keys("refused", compose("key-slave-camera"), "camera@master_id"),
     **_keys("nothing", "", "camera@id", "component@label", "component@active"),
     **_keys("read", "chunk_from_camera; a camera without one is not aligned and takes no part", "camera/transform"),
     **_keys("nothing", "rows and columns are the sensor's, as in the files", "camera/orientation"),
@@ -76,7 +78,7 @@ METASHAPE: Table = {
     **_keys("read", "the camera's name where labels repeat", "group@label"),
     **_keys("nothing", "", "group@id", "group@type", "group@enabled"),
     **_keys("read", "`frame`, `fisheye` and `equidistant_fisheye`; others are refused", "sensor@type"),
-    **_keys("refused", "slave of another sensor: export the cameras of a rig as single sensors", "sensor@master_id"),
+    **_keys("refused", compose("key-slave-sensor"), "sensor@master_id"),
     **_keys("read", "the size in pixels", "sensor/resolution", "calibration/resolution"),
     **_keys(
         "told", SINGLE, "sensor/rolling_shutter", "sensor/property[rolling_shutter]", silent=(0, "disabled", "none")
@@ -88,7 +90,7 @@ METASHAPE: Table = {
     **_keys("nothing", "", "sensor/property[normalize_sensitivity]", "sensor/vignetting", "sensor/photo_params"),
     **_keys("nothing", "", "sensor/black_level", "sensor/sensitivity", "sensor/fixed_calibration", "sensor/planes"),
     **_keys("read", "`adjusted` before `initial`", "calibration@class"),
-    **_keys("refused", "differs from its sensor's type", "calibration@type"),
+    **_keys("refused", compose("key-other-type"), "calibration@type"),
     **_keys("read", "the focal length, and what fx has more", "calibration/f", "calibration/b1"),
     **_keys("read", "the principal point, off the middle of the picture", "calibration/cx", "calibration/cy"),
     **_keys("read", "refused where it skews the picture by 0.02 px", "calibration/b2"),
@@ -98,10 +100,8 @@ METASHAPE: Table = {
     **_keys(
         "read", "fitted by k1 k2 k3; refused where they miss it by 0.02 px. Of a fisheye as it is", "calibration/k4"
     ),
-    **_keys("refused", "calibrate without it", "calibration/p3", "calibration/p4", silent=(0,)),
-    **_keys(
-        "refused", "PhotoScan's older layout: export again", "calibration/fx", "calibration/fy", "calibration/skew"
-    ),
+    **_keys("refused", compose("key-calibrate-without"), "calibration/p3", "calibration/p4", silent=(0,)),
+    **_keys("refused", compose("key-photoscan"), "calibration/fx", "calibration/fy", "calibration/skew"),
     **_keys("nothing", "", "calibration/date", "calibration/projection"),
     **_keys(
         "read", "world_from_chunk, of the component or the chunk: rotation, translation and scale", "chunk/transform"
@@ -125,7 +125,7 @@ REALITYCAPTURE: Table = {
     **_keys("read", "of a film whose longer side is 36 mm", "FocalLength35mm"),
     **_keys("read", "the principal point, off the middle, in longer sides", "PrincipalPointU", "PrincipalPointV"),
     **_keys("read", "fy / fx", "AspectRatio"),
-    **_keys("refused", "pixels are taken as rectangular: align without it", "Skew", silent=(0,)),
+    **_keys("refused", compose("key-skew"), "Skew", silent=(0,)),
     **_keys(
         "read",
         "`perspective` and `brown3` to `brown4t2`; `division` only where its coefficients are 0, others are refused",
@@ -134,12 +134,10 @@ REALITYCAPTURE: Table = {
     **_keys("read", "k1 k2 k3 k4 t1 t2; k4 as Metashape's", "DistortionCoeficients"),
     **_keys("read", "`0`: the camera takes no part, and a warning says so", "InMeshing"),
     **_keys("read", "two components stand in no known place to each other, and are refused", "ComponentId"),
-    **_keys("told", "the camera is used for colours all the same", "InTexturing", "InColoring", silent=(1,)),
-    **_keys("told", "lengths are taken as metres", "Coordinates", silent=("absolute",)),
-    **_keys("told", "the pose is a draft", "PosePrior", silent=("locked", "exact")),
-    **_keys(
-        "told", "places on the globe are not read", "Latitude", "Longitude", "Altitude", "GpsLatitude", "GpsLongitude"
-    ),
+    **_keys("told", compose("key-colours"), "InTexturing", "InColoring", silent=(1,)),
+    **_keys("told", compose("key-metres"), "Coordinates", silent=("absolute",)),
+    **_keys("told", compose("key-draft"), "PosePrior", silent=("locked", "exact")),
+    **_keys("told", compose("key-globe"), "Latitude", "Longitude", "Altitude", "GpsLatitude", "GpsLongitude"),
     **_keys("nothing", "", "Version", "CalibrationPrior", "CalibrationGroup", "DistortionGroup", "GravityDirection"),
     **_keys("nothing", "", "Rig", "RigInstance", "RigPoseIndex", "LensGroup"),
 }
@@ -179,26 +177,26 @@ TRANSFORMS: Table = {
     **_keys("read", "the lens", "k1", "k2", "k3"),
     **_keys("read", "refused of a fisheye, which has none", "p1", "p2"),
     **_keys("read", "of a fisheye; else refused: calibrate without it", "k4"),
-    **_keys("refused", "calibrate without it", "k5", "k6", silent=(0,)),
+    **_keys("refused", compose("key-calibrate-without"), "k5", "k6", silent=(0,)),
     **_keys("read", "a camera each; what stands in a frame goes before what stands at the top", "frames"),
     **_keys(
         "read", "the name: a picture's ending is taken off, and the folder is the name where names repeat", "file_path"
     ),
     **_keys("read", "world_from_camera, axes as OpenGL's", "transform_matrix"),
-    **_keys("refused", "a camera that moves while it exposes: give transform_matrix", "transform_matrix_start"),
-    **_keys("refused", "a camera that moves while it exposes: give transform_matrix", "transform_matrix_end"),
-    **_keys("refused", f"{SINGLE}: calibrate without it", "rolling_shutter", silent=(0,)),
-    **_keys("refused", "only one way of turning the world is known: export without it", "orientation_override"),
+    **_keys("refused", compose("key-moving"), "transform_matrix_start"),
+    **_keys("refused", compose("key-moving"), "transform_matrix_end"),
+    **_keys("refused", compose("key-rolling-shutter"), "rolling_shutter", silent=(0,)),
+    **_keys("refused", compose("key-orientation"), "orientation_override"),
     **_keys("read", "taken back from the translations", "applied_scale"),
     **_keys(
         "read",
         "a rotation says nothing (any world will do); with a scale or mirrored it is refused",
         "applied_transform",
     ),
-    **_keys("told", "masks are read from masks/", "mask_path"),
-    **_keys("told", "depths are not read", "depth_file_path", "depth_path", silent=()),
-    **_keys("told", "the whole picture is read", "crop"),
-    **_keys("told", "all frames are read", "train_filenames", "val_filenames", "test_filenames"),
+    **_keys("told", compose("key-masks"), "mask_path"),
+    **_keys("told", compose("key-depths"), "depth_file_path", "depth_path", silent=()),
+    **_keys("told", compose("key-crop"), "crop"),
+    **_keys("told", compose("key-all-frames"), "train_filenames", "val_filenames", "test_filenames"),
     **_keys("nothing", "of the radiance field's own box, not of the cameras", "aabb_scale", "scale", "offset", "aabb"),
     **_keys("nothing", "", "up", "from_na", "n_extra_learnable_dims", "sharpness", "ply_file_path", "colmap_im_id"),
     **_keys(
@@ -214,7 +212,7 @@ CALISCOPE: Table = {
     **_keys("read", "the name; without it `cam_` and the table's number", "name"),
     **_keys("read", "`true`: the camera takes no part, and a warning says so", "ignore"),
     **_keys("read", "`true`: `distortions` are Kannala-Brandt's", "fisheye"),
-    **_keys("refused", "turn its pictures and calibrate again", "rotation_count", silent=(0,)),
+    **_keys("refused", compose("key-turned"), "rotation_count", silent=(0,)),
     **_keys("read", "the size in pixels", "size"),
     **_keys("read", "the camera matrix; with skew it is refused", "matrix"),
     **_keys("read", "OpenCV's, at most 8 (of a fisheye 4); more are refused unless 0", "distortions"),
@@ -239,9 +237,9 @@ OPENCV_YAML: Table = {
     **_keys("read", "camera_from_world: a matrix", "Rot_<name>"),
     **_keys("read", "camera_from_world", "T_<name>"),
     **_keys("read", "the size in pixels; without it that of the picture", "W_<name>", "H_<name>"),
-    **_keys("refused", "write OpenCV's coefficients as dist_<name>", "D_<name>", "distCoeffs_<name>", silent=(0,)),
-    **_keys("refused", "an omnidirectional lens, which is not read", "xi_<name>", silent=(0,)),
-    **_keys("refused", "fisheyes are not told in this format: write cameras.json", "fisheye_<name>", silent=(0,)),
+    **_keys("refused", compose("key-dist-name"), "D_<name>", "distCoeffs_<name>", silent=(0,)),
+    **_keys("refused", compose("key-omnidirectional"), "xi_<name>", silent=(0,)),
+    **_keys("refused", compose("key-fisheye"), "fisheye_<name>", silent=(0,)),
 }
 
 FOREIGN_KEYS: Mapping[str, tuple[str, Table]] = {
@@ -258,7 +256,7 @@ FOREIGN_KEYS: Mapping[str, tuple[str, Table]] = {
 
 def markdown_table(table: Table) -> str:
     """Returns the table for ``docs/foreign-cameras.md``: a row for all keys of which the same is to be said."""
-    rows: dict[tuple[Treatment, str], list[str]] = {}
+    rows: dict[tuple[Treatment, str | Message], list[str]] = {}
     for key, rule in table.items():
         rows.setdefault((rule.treatment, rule.why), []).append(f"`{key}`")
     order: tuple[Treatment, ...] = ("read", "refused", "told", "nothing")

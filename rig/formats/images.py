@@ -25,6 +25,7 @@ from rig.formats.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXE
 from rig.formats.picture_samples import WHOLE_BITS
 from rig.formats.work_size import at_share, halvings
 from rig.image import ImageRgb
+from rig.messages.message import Message, compose
 
 # Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM")
@@ -84,6 +85,7 @@ def read_image(path: Path) -> ImageRgb:
     """An RGB image. Raises InputError."""
     pixels, _, fault = decode_image_file(path, path.name, "colour")
     if pixels is None:
+        assert fault is not None
         raise InputError(path.name, [fault])
     return pixels
 
@@ -104,9 +106,9 @@ def open_picture(path: Path) -> Image.Image:
 
 def decode_image_file(
     path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
-) -> tuple[np.ndarray | None, str, str]:
+) -> tuple[np.ndarray | None, str, Message | None]:
     """Pixels at ``share`` of their number across (a mask's are all there), the sha256 of the file, and the fault (then
-    no pixels) as a sentence.
+    no pixels).
 
     Pixels are RGB (``colour``), one channel (``grey``), or of a ``mask`` the one channel that holds it, in the file's
     own numbers (``rig.formats.mask_values``). ``bits``: that samples of 16 use (``rig.formats.picture_samples``)."""
@@ -115,27 +117,27 @@ def decode_image_file(
         with _faults_of(where):
             (width, height), profile = _header_size(data, suffix)
         if width * height > PIXELS_MOST:
-            raise InputError(where, [f"is {width} x {height} pixels; at most {PIXELS_MOST:,} are read"])
-        with _faults_of(where, "its pixels cannot be decoded"):
+            raise InputError(where, [compose("picture-large", width=width, height=height, most=PIXELS_MOST)])
+        with _faults_of(where, compose("picture-damaged")):
             pixels = _decoded(data, suffix, kind, halved=halvings(share, (width, height)), bits=bits)
         pixels = _plane(pixels, where) if kind == "mask" else at_share(pixels, (width, height), share)
     except InputError as error:
-        return None, "", f"{where} {error.faults[0]}"
+        return None, "", compose("of-file", file=where, fault=error.faults[0])
     if data.startswith(PNG) and PNG_END not in data:  # OpenCV fills up what is cut off
-        return None, "", f"{where} is damaged: its pixels cannot be decoded"
+        return None, "", compose("of-file", file=where, fault=compose("picture-damaged"))
     if profile and kind == "colour":
         pixels = _in_srgb(pixels, profile)
-    return pixels, hashlib.sha256(data).hexdigest(), ""
+    return pixels, hashlib.sha256(data).hexdigest(), None
 
 
 @contextmanager
-def _faults_of(where: str, told: str = "") -> Iterator[None]:
+def _faults_of(where: str, told: Message | None = None) -> Iterator[None]:
     """What decoders raise for a damaged file, as InputError."""
-    said = f"is damaged: {told}" if told else "is damaged or no PNG, JPEG, TIFF, WebP, BMP, PPM, RAW or HEIC picture"
+    said = told or compose("no-picture")
     try:
         yield
     except Image.DecompressionBombError as error:
-        raise InputError(where, [f"claims to be huge; at most {PIXELS_MOST:,} pixels are read"]) from error
+        raise InputError(where, [compose("picture-huge", most=PIXELS_MOST)]) from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, cv2.error) as error:
         raise InputError(where, [said]) from error
 
@@ -196,7 +198,7 @@ def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
 
 def _plane(pixels: np.ndarray, where: str) -> Plane:
     plane = mask_plane(pixels)
-    if isinstance(plane, str):
+    if isinstance(plane, Message):
         raise InputError(where, [plane])
     return plane
 
@@ -217,7 +219,7 @@ def heif_header(data: bytes) -> Any:
     try:
         import pi_heif
     except ModuleNotFoundError:
-        raise InputError("picture", [f"is HEIC, which needs an optional part: {how_to_install('heic')}"]) from None
+        raise InputError("picture", [compose("heic-not-installed", remedy=how_to_install("heic"))]) from None
     return pi_heif.open_heif(BytesIO(data))
 
 

@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Num, UInt8
 
+from rig.messages.message import Message, compose
+
 Pixels = Num[np.ndarray, "h w *channels"]
 Plane = Num[np.ndarray, "h w"]
 Share = UInt8[np.ndarray, "h w"]
@@ -45,11 +47,11 @@ class MaskReading:
 
     share: Share
     soft: bool = False
-    fault: str = ""
-    remark: str = ""
+    fault: Message | None = None
+    remark: Message | None = None
 
 
-def mask_plane(pixels: Pixels) -> Plane | str:
+def mask_plane(pixels: Pixels) -> Plane | Message:
     """The one channel of decoded pixels (BGR order) that holds the mask, or why there is none.
 
     That is the alpha of a cut-out; of two colours the channel in which they differ most; of a picture that was cut out
@@ -65,7 +67,7 @@ def mask_plane(pixels: Pixels) -> Plane | str:
     return _plane_of_colours(channels)
 
 
-def _plane_of_colours(channels: Num[np.ndarray, "h w c"]) -> Plane | str:
+def _plane_of_colours(channels: Num[np.ndarray, "h w c"]) -> Plane | Message:
     span = max(float(channels.max()), 1.0)
     coarse = (channels.astype(np.float32) * (15.0 / span) + 0.5).astype(np.int32)
     codes, counts = np.unique(coarse @ (1, 16, 256), return_counts=True)
@@ -76,12 +78,10 @@ def _plane_of_colours(channels: Num[np.ndarray, "h w c"]) -> Plane | str:
     packed = channels.reshape(-1, channels.shape[2]).astype(np.float64) @ (1.0, 2.0**16, 2.0**32)
     exact, numbers = np.unique(packed, return_counts=True)
     if len(exact) <= COLOURS_FEW:
-        return (
-            f"holds {len(exact)} colours, as a picture of labels does; wanted: white where the subject is, else black"
-        )
+        return compose("mask-of-colours", count=len(exact))
     if numbers.max() >= CUT_OUT_LEAST * packed.size:
         return (packed != exact[np.argmax(numbers)]).reshape(channels.shape[:2]).astype(np.uint8)
-    return "is a photograph and no mask; wanted: white where the subject is, else black, or a cut-out with alpha"
+    return compose("mask-is-photograph")
 
 
 def read_masks(planes: Mapping[str, Plane]) -> dict[str, MaskReading]:
@@ -106,7 +106,7 @@ def _read(plane: Plane, common: tuple[float, float]) -> MaskReading:
         return MaskReading(_nothing(plane), fault=_constant_fault(low, common))
     levels = _levels(plane, (low, high))
     if not _fills_areas(plane, levels, high - low):
-        return MaskReading(_nothing(plane), fault=_SPREAD)
+        return MaskReading(_nothing(plane), fault=compose("mask-spread"))
     if len(levels) > 2:
         return _read_trimap(plane, levels)
     share = _share_between(plane, levels[0], levels[1])
@@ -114,7 +114,7 @@ def _read(plane: Plane, common: tuple[float, float]) -> MaskReading:
     white = share > 127
     smaller = min(np.count_nonzero(white), np.count_nonzero(~white))
     if between > BETWEEN_MOST * max(smaller, 1):
-        return MaskReading(_nothing(plane), fault=_SPREAD)
+        return MaskReading(_nothing(plane), fault=compose("mask-spread"))
     return MaskReading(share, soft=bool(between > SOFT_PER_PX * max(_outline_px(white), 1)))
 
 
@@ -122,16 +122,10 @@ def _nothing(plane: Plane) -> Share:
     return np.zeros(plane.shape, np.uint8)
 
 
-_SPREAD = (
-    "holds values all over its range, as a depth map or a photograph does; wanted: white where the subject is, else "
-    "black"
-)
-
-
-def _constant_fault(value: float, common: tuple[float, float]) -> str:
+def _constant_fault(value: float, common: tuple[float, float]) -> Message:
     if value == 0 or value < 0.5 * (common[0] + common[1]):
-        return "is empty: no pixel belongs to the subject"
-    return f"is {value:g} all over: it has no outline; wanted: white where the subject is, else black"
+        return compose("mask-empty")
+    return compose("mask-constant", value=value)
 
 
 def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
@@ -174,13 +168,8 @@ def _share_between(plane: Plane, black: float, white: float) -> Share:
 
 def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
     """A trimap's undecided band is narrow and lies between black and white: the outline is in its middle."""
-    listed = ", ".join(f"{level:g}" for level in levels[:VALUES_NAMED]) + (
-        ", ..." if len(levels) > VALUES_NAMED else ""
-    )
-    labels = (
-        f"holds areas of {len(levels)} values ({listed}), as a picture of labels does; wanted: white where the subject "
-        "is, else black"
-    )
+    named = [f"{level:g}" for level in levels[:VALUES_NAMED]] + ["..."] * (len(levels) > VALUES_NAMED)
+    labels = compose("mask-of-labels", count=len(levels), values=named)
     if len(levels) > 3:
         return MaskReading(_nothing(plane), fault=labels)
     share = _share_between(plane, levels[0], levels[2])
@@ -190,7 +179,7 @@ def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
     if width > BAND_MOST_PX or not _separates(black, white):
         return MaskReading(_nothing(plane), fault=labels)
     middle = away_black / np.maximum(away_black + away_white, np.float32(1e-3))
-    remark = f"leaves a band of {2 * width:.0f} px undecided: the outline was taken in its middle"
+    remark = compose("mask-band", width_px=2 * width)
     return MaskReading((255.0 * middle + 0.5).astype(np.uint8), soft=True, remark=remark)
 
 

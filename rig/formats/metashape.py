@@ -26,7 +26,8 @@ from rig.formats.foreign import (
     xml_root,
 )
 from rig.formats.foreign_keys import METASHAPE
-from rig.formats.reading import CamerasRead, Reading, listed, shown
+from rig.formats.reading import CamerasRead, Reading, shown, some_of
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 KEYS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -53,16 +54,15 @@ def read_metashape(path: Path) -> CamerasRead:
         if _takes_part(name, camera, reading):
             sensor = sensors.get(camera.get("sensor_id"))
             if sensor is None and camera.get("master_id") is None:
-                told = f"{name}: its sensor {shown(camera.get('sensor_id'), 20)} is missing: export with all sensors"
-                reading.faults.append(told)
+                missing = shown(camera.get("sensor_id"), 20)
+                reading.faults.append(compose("sensor-missing", camera=name, sensor=missing))
             _judge(camera, "camera", name, reading)
             if sensor is not None:
                 entries.append(_read_camera(name, camera, sensor, chunk, parts, reading))
                 used.add(camera.get("component_id"))
     alone = [part for key in used if (part := parts.get(key)) is not None and part.find("transform") is None]
     if len(used) > 1 and alone:
-        told = "stand in no known place to each other: align all cameras together, or switch off those of the others"
-        reading.faults.append(f"cameras of {len(used)} components {told}")
+        reading.faults.append(compose("components-apart", components=len(used)))
     return reading.finish(entries)
 
 
@@ -70,12 +70,11 @@ def _chunk(root: ElementTree.Element, reading: Reading) -> ElementTree.Element:
     """The one chunk that has aligned cameras. Raises InputError."""
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     if not chunks:
-        raise InputError(reading.subject, ["holds no <chunk>: wanted Metashape's Export Cameras, Agisoft XML"])
+        raise InputError(reading.subject, [compose("no-chunk")])
     aligned = [chunk for chunk in chunks if chunk.find("cameras//camera/transform") is not None]
     if len(aligned) > 1:
-        labels = listed([shown(chunk.get("label") or "") for chunk in aligned])
-        told = f"holds {len(aligned)} chunks with aligned cameras ({labels}): export the one of this rig alone"
-        raise InputError(reading.subject, [told])
+        labels = some_of([shown(chunk.get("label") or "") for chunk in aligned])
+        raise InputError(reading.subject, [compose("chunks-many", chunks=len(aligned), labels=labels)])
     return (aligned or chunks)[0]
 
 
@@ -97,11 +96,11 @@ def _names(cameras: Sequence[tuple[str, ElementTree.Element]]) -> list[str]:
 def _takes_part(name: str, camera: ElementTree.Element, reading: Reading) -> bool:
     switch = SWITCHES.get((camera.get("enabled") or "true").strip().lower())
     if switch is None:
-        reading.faults.append(f"{name}.enabled is {shown(camera.get('enabled'))}, wanted true or false")
+        reading.faults.append(compose("no-switch", key=f"{name}.enabled", value=shown(camera.get("enabled"))))
     elif not switch:
-        reading.leave_out(name, 'switched off (enabled="false")')
+        reading.leave_out(name, compose("left-switched-off", key='enabled="false"'))
     elif camera.find("transform") is None and camera.get("master_id") is None:
-        reading.leave_out(name, "not aligned")
+        reading.leave_out(name, compose("left-not-aligned"))
     return name not in reading.left_out
 
 
@@ -142,7 +141,7 @@ def write_metashape(rig: Rig, path: Path) -> None:
     """Writes the export that ``read_metashape`` reads. Raises InputError for a lens that Metashape does not have."""
     rational = [camera.name for camera in rig if camera.recorded is not None and camera.recorded.model == "rational"]
     if rational:
-        raise InputError("metashape", [f"has no lens with k4 k5 k6 as a quotient, as {', '.join(rational)} have"])
+        raise InputError("metashape", [compose("metashape-without-rational", cameras=rational)])
     document = ElementTree.Element("document", version="1.2.0")
     chunk = ElementTree.SubElement(document, "chunk", label="rig", enabled="true")
     sensors = ElementTree.SubElement(chunk, "sensors", next_id=str(len(rig)))
@@ -180,7 +179,7 @@ def _entry(name: str, sensor: ElementTree.Element, matrix: np.ndarray, world: Si
     }
 
 
-def _similarity(node: ElementTree.Element, faults: list[str]) -> Similarity:
+def _similarity(node: ElementTree.Element, faults: list[Message]) -> Similarity:
     """The chunk's transform to the world, metres made mm; without one, its free scale is taken as millimetres."""
     found = node.find("transform")
     if found is None or not len(found):
@@ -203,7 +202,7 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
         values[key] = 0.0 if node is None else float(_numbers(node, 1, f"{name}.{key}", faults)[0])
     kind = sensor.get("type") or found.get("type") or "frame"
     if kind not in TYPES:
-        faults.append(f"{name} is a {shown(kind)} camera; read are {', '.join(TYPES)}")
+        faults.append(compose("camera-type", camera=name, kind=shown(kind), known=[*TYPES]))
     given = dict(found.attrib)
     if given.get("type") == kind:
         del given["type"]
@@ -212,7 +211,7 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
     size = found.find("resolution")
     if size is not None and (_whole(size, "width"), _whole(size, "height")) != (entry["width"], entry["height"]):
         of_lens = f"{shown(size.get('width'), 20)} x {shown(size.get('height'), 20)}".replace("'", "")
-        faults.append(f"{name}: its lens was calibrated at {of_lens} pixels, its sensor has another size: export again")
+        faults.append(compose("lens-of-other-size", camera=name, size=of_lens))
     width, height = (entry[key] if isinstance(entry[key], int) else 0 for key in ("width", "height"))
     assert isinstance(width, int)
     assert isinstance(height, int)
@@ -230,12 +229,14 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
     entry["distortion"] = lens_entry(held, name, faults)
 
 
-def _name_lost(values: dict[str, float], size: tuple[int, int], name: str, faults: list[str], *, fisheye: bool) -> None:
+def _name_lost(
+    values: dict[str, float], size: tuple[int, int], name: str, faults: list[Message], *, fisheye: bool
+) -> None:
     """Names what of a lens neither Brown-Conrady nor Kannala-Brandt hold and a pixel would show, and forgets the rest
     of it."""
     skewed_px = abs(values["b2"]) * size[1] / 2 / values["f"] if values["f"] > 0 else 0.0
     if skewed_px > LENS_LOSS_PX:
-        faults.append(f"{name}.b2 skews the picture by {skewed_px:.2f} px: calibrate without it")
+        faults.append(compose("picture-skewed", key=f"{name}.b2", skewed_px=skewed_px))
     if fisheye and values["f"] > 0:
         reach = np.hypot(*size) / 2 / values["f"]  # of the corner, in radians
         if 3 * max(abs(values["p1"]), abs(values["p2"])) * reach**2 * values["f"] <= LENS_LOSS_PX:
@@ -259,14 +260,14 @@ def _write_sensor(sensors: ElementTree.Element, number: int, camera: Camera) -> 
         ElementTree.SubElement(calibration, key).text = repr(float(value))
 
 
-def _numbers(node: ElementTree.Element | None, count: int, where: str, faults: list[str]) -> np.ndarray:
+def _numbers(node: ElementTree.Element | None, count: int, where: str, faults: list[Message]) -> np.ndarray:
     words = (node.text or "").split() if node is not None else []
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
         values = np.zeros(0)
     if len(values) != count:
-        faults.append(f"{where} is missing or not {count} number{'s' * (count > 1)}")
+        faults.append(compose("no-numbers", key=where, count=count))
         return np.full(count, np.nan)
     return values
 

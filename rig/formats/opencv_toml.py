@@ -17,6 +17,7 @@ from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, lens_entry, number_a
 from rig.formats.foreign_keys import ANIPOSELIB, CALISCOPE
 from rig.formats.reading import CamerasRead, Reading, shown
 from rig.geometry import rotation_from_vector, vector_from_rotation
+from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 
@@ -37,13 +38,13 @@ def read_toml(path: Path) -> CamerasRead:
     entries = []
     for name, table in pairs:
         if not isinstance(table, dict):
-            reading.faults.append(f"{name} is no table")
+            reading.faults.append(compose("no-table", key=name))
             continue
         own = table["name"] if isinstance(table.get("name"), str) else name
         if "ignore" in keys and _switch(table, "ignore", own, reading.faults):
-            reading.leave_out(own, "switched off (ignore = true)")
+            reading.leave_out(own, compose("left-switched-off", key="ignore = true"))
         elif keys is CALISCOPE and not {"rotation", "translation"} & table.keys():
-            reading.leave_out(own, "without a pose")
+            reading.leave_out(own, compose("left-without-pose"))
         else:
             reading.judge(keys, table, own)
             entries.append(_toml_entry(own, table, millimetres, reading.faults))
@@ -82,15 +83,15 @@ def write_aniposelib(rig: Rig, path: Path) -> None:
     write_atomically(path, "\n".join(blocks).encode())
 
 
-def _switch(table: Mapping[str, Any], key: str, name: str, faults: list[str]) -> bool:
+def _switch(table: Mapping[str, Any], key: str, name: str, faults: list[Message]) -> bool:
     """What is true or false; absent is false."""
     value = table.get(key, False)
     if not isinstance(value, bool) and value not in (0, 1):
-        faults.append(f"{name}.{key} is {shown(value)}, wanted true or false")
+        faults.append(compose("no-switch", key=f"{name}.{key}", value=shown(value)))
     return value is True or value == 1
 
 
-def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults: list[str]) -> dict[str, object]:
+def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults: list[Message]) -> dict[str, object]:
     fisheye = _switch(table, "fisheye", name, faults)
     matrix = number_array(table.get("matrix"), (3, 3), f"{name}.matrix", faults)
     rotation = number_array(table.get("rotation"), None, f"{name}.rotation", faults)
@@ -100,9 +101,10 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
         rotation = rotation_from_vector(rotation) if np.isfinite(rotation).all() else np.full((3, 3), np.nan)
     names = COEFFICIENTS["kannala-brandt" if fisheye else "rational"]
     if lens.ndim != 1 or not 1 <= len(lens) <= 14 or lens[len(names) :].any():
-        faults.append(f"{name}.distortions must be at most {len(names)} coefficients ({' '.join(names)})")
+        told = f"{name}.distortions"
+        faults.append(compose("coefficients-at-most", key=told, most=len(names), names=" ".join(names)))
     if matrix.shape == (3, 3) and abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
-        faults.append(f"{name}.matrix has skew, which is not supported")
+        faults.append(compose("matrix-skewed", key=f"{name}.matrix"))
     size = table.get("size")
     width, height = size if isinstance(size, list) and len(size) == 2 else (None, None)
     return {
@@ -125,7 +127,7 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
     if isinstance(unit, str) and unit in UNITS:
         return UNITS[unit]
     if unit is not None:
-        reading.faults.append(f"metadata.unit is {shown(unit)}; read are {', '.join(UNITS)}")
+        reading.faults.append(compose("value-not-read", key="metadata.unit", value=shown(unit), known=[*UNITS]))
     lengths = [
         np.abs(number_array(table.get("translation"), (3,), "", [])).max()
         for _, table in pairs

@@ -15,10 +15,11 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, lens_entry, number_array, parsed, sized
+from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, Malformed, lens_entry, number_array, parsed, sized
 from rig.formats.foreign_keys import OPENCV_YAML
-from rig.formats.reading import CamerasRead, Reading, listed
+from rig.formats.reading import CamerasRead, Reading, some_of
 from rig.geometry import rotation_from_vector
+from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 FILES = ("intri.yml", "extri.yml")
 POSE_KEY = re.compile(r"(R|Rot|T)_")
-WANTED = "K_<name>, dist_<name>, R_<name> and T_<name> of each camera"
 
 
 def read_yaml(path: Path) -> CamerasRead:
@@ -37,23 +37,23 @@ def read_yaml(path: Path) -> CamerasRead:
     lenses, poses = (parsed(part, _matrices) for part in parts)
     held = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
     if not held:
-        raise InputError(path.name, [f"holds no camera; wanted are {WANTED}"])
+        raise InputError(path.name, [compose("yaml-without-camera")])
     reading = Reading(path.name)
     faults = reading.faults
     names = _taking_part(held, [*lenses["names"]] if isinstance(lenses.get("names"), list) else None, reading)
     _judge(lenses | poses, held, reading)
     lacking = [key for key in poses if (m := POSE_KEY.match(key)) and key[m.end() :] not in held]
     if lacking:
-        faults.append(f"{listed(lacking)}: there is no K_<name> of that name")
+        faults.append(compose("yaml-pose-alone", keys=some_of(lacking)))
     entries: list[dict[str, Any]] = []
     for name in names:
         matrix = number_array(lenses[f"K_{name}"], (3, 3), f"K_{name}", faults)
         lens = number_array(lenses.get(f"dist_{name}", np.zeros(5)), None, f"dist_{name}", faults).ravel()
         keys = COEFFICIENTS["rational"]
         if lens[len(keys) :].any():
-            faults.append(f"dist_{name} has more than the {len(keys)} coefficients {' '.join(keys)}")
+            faults.append(compose("coefficients-many", key=f"dist_{name}", most=len(keys), names=" ".join(keys)))
         if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
-            faults.append(f"K_{name} has skew, which is not supported")
+            faults.append(compose("matrix-skewed", key=f"K_{name}"))
         turned = poses.get(f"Rot_{name}")
         if turned is None and (given := poses.get(f"R_{name}")) is not None:
             turned = rotation_from_vector(given.ravel()) if given.size == 3 else given
@@ -90,10 +90,10 @@ def _taking_part(held: list[str], given: list[str] | None, reading: Reading) -> 
         return held
     lacking = [name for name in given if name not in held]
     if lacking:
-        reading.faults.append(f"names has {listed(lacking)}, of which there is no K_<name>")
+        reading.faults.append(compose("yaml-names-lacking", cameras=some_of(lacking)))
     for name in held:
         if name not in given:
-            reading.leave_out(name, "not among names")
+            reading.leave_out(name, compose("left-not-named"))
     return [name for name in held if name in given]
 
 
@@ -107,21 +107,21 @@ def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) 
             reading.judge(OPENCV_YAML, {general: plain}, name)
 
 
-def _check_alike(poses: Mapping[str, Any], name: str, faults: list[str]) -> None:
+def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> None:
     """Both ways of writing a rotation may stand there; one that was changed alone is a fault."""
     vector, matrix = poses.get(f"R_{name}"), poses.get(f"Rot_{name}")
     if vector is None or matrix is None or vector.size not in (3, 9) or matrix.shape != (3, 3):
         return
     other = rotation_from_vector(vector.ravel()) if vector.size == 3 else vector.reshape(3, 3)
     if not np.abs(other - matrix).max() < 1e-3:
-        faults.append(f"R_{name} and Rot_{name} are not the same rotation: leave the right one")
+        faults.append(compose("rotations-differ", one=f"R_{name}", other=f"Rot_{name}"))
 
 
 def write_yaml(rig: Rig, folder: Path) -> None:
     """Writes ``intri.yml`` and ``extri.yml`` into a folder. Raises InputError for a fisheye, which they do not tell."""
     fisheyes = [c.name for c in rig if c.recorded is not None and c.recorded.model == "kannala-brandt"]
     if fisheyes:
-        raise InputError("opencv-yaml", [f"does not tell a fisheye from others, as {', '.join(fisheyes)} are"])
+        raise InputError("opencv-yaml", [compose("yaml-fisheye", cameras=fisheyes)])
 
     import cv2  # here and below: other formats do without its 0.1 s
 
@@ -178,4 +178,4 @@ def _matrices(data: bytes) -> dict[str, Any]:
         return found
     except (cv2.error, SystemError, TypeError) as error:
         said = " ".join(str(error).split())[:120]
-        raise ValueError(f"is no YAML of OpenCV's: {said}") from None
+        raise Malformed(compose("no-opencv-yaml", reason=said)) from None

@@ -13,6 +13,7 @@ from jaxtyping import Bool
 
 from rig.camera import Camera
 from rig.errors import InputError
+from rig.messages.message import compose
 from rig.rig import Rig
 
 OUTLINES_FORMAT = "eigenhead-outlines/1"
@@ -24,14 +25,16 @@ def read_outlines(path: Path, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         if document["format"] != OUTLINES_FORMAT:
-            raise InputError(path.name, [f"format is {document['format']!r}, not {OUTLINES_FORMAT!r}"])
+            raise InputError(
+                path.name, [compose("format-is", format=f"{document['format']!r:.80}", wanted=f"{OUTLINES_FORMAT!r}")]
+            )
         polygons = {
             str(name): [np.asarray(one, float).reshape(-1, 2) for one in drawn]
             for name, drawn in document["outlines"].items()
         }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(path.name, [f"cannot be read ({error})"]) from error
-    faults = [f"an outline of {n} has a number that is none" for n, p in polygons.items() if not _finite(p)]
+        raise InputError(path.name, [compose("no-file-read", reason=str(error))]) from error
+    faults = [compose("outline-number", camera=n) for n, p in polygons.items() if not _finite(p)]
     if faults:
         raise InputError(path.name, faults)
     return {camera.name: _filled(polygons[camera.name], camera) for camera in rig if camera.name in polygons}

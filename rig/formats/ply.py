@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 PLY_VERTEX = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
@@ -85,17 +86,17 @@ def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
     try:
         header, end, body = path.read_bytes().partition(b"end_header\n")
     except OSError as error:
-        raise InputError(path.name, [f"cannot be read ({error.strerror or error})"]) from error
+        raise InputError(path.name, [compose("no-file-read", reason=str(error.strerror or error))]) from error
     lines = header.decode("ascii", "replace").splitlines()
     counts = [int(line.split()[2]) for line in lines if re.fullmatch(r"element (vertex|face) \d{1,9}", line)]
     names = [line.split()[-1] for line in lines if line.startswith("property") and "list" not in line]
     ours = end and "format binary_little_endian 1.0" in lines and names == list(PLY_VERTEX.names or ())
     if not ours or len(counts) != 2:
-        raise InputError(path.name, ["is no head.ply of ours"])
+        raise InputError(path.name, [compose("no-head-ply")])
     face = PLY_TEXTURED_FACE if "property list uchar float texcoord" in lines else PLY_FACE
     wanted = counts[0] * PLY_VERTEX.itemsize + counts[1] * face.itemsize
     if len(body) != wanted:
-        raise InputError(path.name, [f"has {len(body)} bytes of vertices and faces where {wanted} are said"])
+        raise InputError(path.name, [compose("ply-bytes", held=len(body), wanted=wanted)])
     vertices = np.frombuffer(body, PLY_VERTEX, counts[0])
     faces = np.frombuffer(body, face, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
     places = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from rig.errors import InputError
+from rig.messages.message import Message, compose
 
 MOST_VERTICES = 200_000  # eight times a film's head: 4 minutes and 2 GB to register; what is larger is a scan
 MOST_CORNERS = 8 * MOST_VERTICES
@@ -51,7 +52,8 @@ def read_polygons(path: Path) -> PolygonMesh:
     try:
         size = path.stat().st_size
         if size > MOST_BYTES:
-            raise InputError(path.name, [f"is {size >> 20} MB large, {MOST_BYTES >> 20} are the most: decimate it"])
+            large = compose("mesh-file-large", size_mb=size >> 20, most_mb=MOST_BYTES >> 20)
+            raise InputError(path.name, [large])
         reading = _Reading()
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             for number, line in _whole_lines(file):
@@ -59,7 +61,7 @@ def read_polygons(path: Path) -> PolygonMesh:
                 if reading.too_large():
                     break
     except OSError as error:
-        raise InputError(path.name, [f"cannot be read ({error.strerror or error})"]) from None
+        raise InputError(path.name, [compose("no-file-read", reason=str(error.strerror or error))]) from None
     return reading.finished(path.name)
 
 
@@ -87,7 +89,7 @@ class _Reading:
     corners: list[int] = field(default_factory=list)
     corner_uv: list[int] = field(default_factory=list)
     statements: list[tuple[int, str]] = field(default_factory=list)
-    faults: list[str] = field(default_factory=list)
+    faults: list[Message] = field(default_factory=list)
 
     def take(self, number: int, line: str) -> None:
         word, _, rest = line.strip().partition(" ")
@@ -107,7 +109,7 @@ class _Reading:
             found = ()
         if len(found) == count and all(map(math.isfinite, found)):
             return found
-        self.faults.append(f"line {number}: {line.strip()!r:.60} is not {count} finite numbers")
+        self.faults.append(compose("line-no-numbers", line=number, text=f"{line.strip()!r:.60}", wanted=count))
         return (0.0,) * count
 
     def _face(self, number: int, line: str, words: list[str]) -> None:
@@ -116,7 +118,7 @@ class _Reading:
         except ValueError:
             named = []
         if len(named) < 3:
-            self.faults.append(f"line {number}: {line.strip()!r:.60} is no polygon of 3 or more corners")
+            self.faults.append(compose("line-no-polygon", line=number, text=f"{line.strip()!r:.60}"))
             return
         for corner in named:
             self.corners.append(self._row(number, corner[0], len(self.vertices)))
@@ -128,7 +130,7 @@ class _Reading:
         """OBJ counts from 1, and backwards from -1. What lies ahead in the file is checked at its end."""
         row = -1 if given is None else given - 1 if given > 0 else count + given
         if not given or row < 0:
-            self.faults.append(f"line {number}: a corner names {given}, which is no row of the file")
+            self.faults.append(compose("line-strange-row", line=number, row=f"{given}"))
             return 0
         return row
 
@@ -139,20 +141,23 @@ class _Reading:
         """The arrays. Raises InputError."""
         faults = self.faults[:FAULTS_TOLD]
         if len(self.faults) > FAULTS_TOLD:
-            faults.append(f"and {len(self.faults) - FAULTS_TOLD} lines more")
+            faults.append(compose("lines-more", more=len(self.faults) - FAULTS_TOLD))
         if self.too_large():
-            most = f"{MOST_VERTICES:,} vertices or {MOST_CORNERS:,} corners"
-            raise InputError(name, [*faults, f"has more than {most}, which is no template: decimate it"])
+            large = compose("mesh-large", vertices=MOST_VERTICES, corners=MOST_CORNERS)
+            raise InputError(name, [*faults, large])
         if not self.vertices:
-            faults.append("holds no vertices")
+            faults.append(compose("no-vertices"))
         if not self.sizes:
-            faults.append("holds no faces")
+            faults.append(compose("no-faces"))
         corners, corner_uv = np.array(self.corners, np.int32), np.array(self.corner_uv, np.int32)
-        for what, rows, count in (("vertex", corners, len(self.vertices)), ("texture", corner_uv, len(self.uv))):
+        for code, rows, count in (
+            ("face-beyond-vertices", corners, len(self.vertices)),
+            ("face-beyond-texture", corner_uv, len(self.uv)),
+        ):
             if rows.size and rows.max() >= count and count:
-                faults.append(f"a face names {what} {rows.max() + 1}, and there are {count}")
+                faults.append(compose(code, row=rows.max() + 1, held=count))
         if rows_without(corner_uv) and not self.uv:
-            faults.append("faces name texture coordinates, and there are none")
+            faults.append(compose("faces-without-texture"))
         if faults:
             raise InputError(name, faults)
         uv = np.array(self.uv, float).reshape(-1, 2)

@@ -22,7 +22,7 @@ class CamerasRead:
 
     rig: Rig
     remarks: tuple[Message, ...] = ()
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, Message] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -30,8 +30,8 @@ class Reading:
     """Collects while the file named ``subject`` is read."""
 
     subject: str
-    faults: list[str] = field(default_factory=list)
-    left_out: dict[str, str] = field(default_factory=dict)
+    faults: list[Message] = field(default_factory=list)
+    left_out: dict[str, Message] = field(default_factory=dict)
     _meant: dict[tuple[str, ForeignKey], list[tuple[str, object]]] = field(default_factory=dict)
     _unknown: dict[str, None] = field(default_factory=dict)
 
@@ -45,7 +45,7 @@ class Reading:
             elif rule.treatment in ("refused", "told") and value is not None and not says_nothing(value, rule):
                 self._meant.setdefault((place + key, rule), []).append((whose, value))
 
-    def leave_out(self, name: str, why: str) -> None:
+    def leave_out(self, name: str, why: Message) -> None:
         """Notes a camera that takes no part, for the reason ``why``."""
         self.left_out[name] = why
 
@@ -53,15 +53,16 @@ class Reading:
         """The rig of ``eigenhead-cameras/1`` entries. Raises InputError naming every fault."""
         told: list[Message] = []
         for (key, rule), cases in self._meant.items():
-            sentence = f"{_whose([name for name, _ in cases], key)} is {shown(cases[0][1])}: {rule.why}"
+            whose, value = _whose([name for name, _ in cases], key), shown(cases[0][1])
+            sentence = compose("key-is", whose=whose, value=value, why=rule.why)
             if rule.treatment == "refused":
                 self.faults.append(sentence)
             else:
-                told.append(compose("unknown-key", remark=f"{self.subject}: {sentence}; it is not used"))
+                told.append(compose("unknown-key", remark=compose("key-not-used", file=self.subject, told=sentence)))
         if self._unknown:
-            keys = listed([shown(key) for key in self._unknown])
-            what = "key is" if len(self._unknown) == 1 else "keys are"
-            told.append(compose("unknown-key", remark=f"{self.subject}: the {what} not known and not read: {keys}"))
+            keys = some_of([shown(key) for key in self._unknown])
+            remark = compose("keys-unknown", file=self.subject, count=len(self._unknown), keys=keys)
+            told.append(compose("unknown-key", remark=remark))
         told += [compose("view-left-out", remark=sentence) for sentence in self._left_out()]
         names = [str(entry.get("name")) for entry in entries]
         try:
@@ -73,11 +74,14 @@ class Reading:
             raise InputError(self.subject, say_once(self.faults, names))
         return CamerasRead(rig, tuple(told), MappingProxyType(dict(self.left_out)))
 
-    def _left_out(self) -> list[str]:
-        reasons: dict[str, list[str]] = {}
+    def _left_out(self) -> list[Message]:
+        reasons: dict[Message, list[str]] = {}
         for name, why in self.left_out.items():
             reasons.setdefault(why, []).append(name)
-        return [f"{listed(names)} {why} in {self.subject}: taking no part" for why, names in reasons.items()]
+        return [
+            compose("cameras-left-out", cameras=some_of(names), why=why, file=self.subject)
+            for why, names in reasons.items()
+        ]
 
 
 def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Message]:
@@ -106,12 +110,6 @@ def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Mes
     return compose("names-and-more", names=names[:most], more=more) if more > 0 else names
 
 
-def listed(names: Sequence[str], most: int = NAMED_MOST) -> str:
-    """A few names, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
-
-
 def shown(value: object, most: int = VALUE_MOST) -> str:
     """A value as Python writes it, cut within its quotation marks and not through them."""
     if isinstance(value, str):
@@ -120,9 +118,9 @@ def shown(value: object, most: int = VALUE_MOST) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def _whose(names: Sequence[str], key: str) -> str:
+def _whose(names: Sequence[str], key: str) -> str | Message:
     """A key and the cameras that have it, or the key alone where it is the whole file's."""
     own = [name for name in names if name]
     if len(own) == 1:
         return key.replace("<name>", own[0]) if "<name>" in key else f"{own[0]}.{key}"
-    return f"{len(own)} cameras ({listed(own)}): {key}" if own else key
+    return compose("key-of-cameras", cameras=len(own), names=some_of(own), key=key) if own else key

@@ -24,6 +24,7 @@ from rig.formats.foreign import brown_conrady, camera_names, corner_radius, lens
 from rig.formats.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
 from rig.formats.picture_names import picture_stem
 from rig.formats.reading import CamerasRead, Reading, shown
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
@@ -59,20 +60,19 @@ def read_xmp(folder: Path) -> CamerasRead:
         try:
             values = _xmp_values(path)
         except InputError as error:
-            reading.faults += [f"{path.name} {fault}" for fault in error.faults]
+            reading.faults += [compose("of-file", file=path.name, fault=fault) for fault in error.faults]
             continue
         name = picture_stem(path.stem)  # RealityScan also writes cam00.png.xmp
         if not {"Rotation", "Position"} & values.keys():
-            reading.leave_out(name, "not aligned (no Rotation, no Position)")
+            reading.leave_out(name, compose("left-not-aligned-keys", keys=("Rotation", "Position")))
         elif values.get("InMeshing", "1").strip().lower() in ("0", "false"):
-            reading.leave_out(name, 'switched off (InMeshing="0")')
+            reading.leave_out(name, compose("left-switched-off", key='InMeshing="0"'))
         else:
             reading.judge(REALITYCAPTURE, values, name)
             components |= {values["ComponentId"]} if "ComponentId" in values else set()
             entries.append(_xmp_entry(folder, name, values, reading.faults))
     if len(components) > 1:
-        told = "stand in no known place to each other: align all together, or export the largest component alone"
-        reading.faults.append(f"cameras of {len(components)} components {told}")
+        reading.faults.append(compose("components-unaligned", components=len(components)))
     return reading.finish(entries)
 
 
@@ -96,7 +96,7 @@ def read_csv(path: Path) -> CamerasRead:
     """The rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
     rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(data.decode("utf-8-sig")))))
     if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
-        raise InputError(path.name, [f"is no CSV of internal and external camera parameters: {','.join(COLUMNS)}"])
+        raise InputError(path.name, [compose("no-camera-csv", columns=",".join(COLUMNS))])
     reading = Reading(path.name)
     faults = reading.faults
     entries = []
@@ -120,7 +120,7 @@ def write_csv(rig: Rig, path: Path) -> None:
     for camera in _held(rig, "realitycapture-csv"):
         k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
         if abs(k.fx / k.fy - 1) * side > 0.02:
-            raise InputError("realitycapture-csv", [f"has one focal length, {camera.name} two: fx and fy differ"])
+            raise InputError("realitycapture-csv", [compose("focal-lengths-differ", camera=camera.name)])
         world_from_camera = camera.camera_from_world.rotation.T @ DOWN
         pitch = np.arcsin(np.clip(world_from_camera[2, 1], -1.0, 1.0))
         heading = np.arctan2(world_from_camera[0, 1], world_from_camera[1, 1])
@@ -147,22 +147,22 @@ def _xmp_values(path: Path) -> dict[str, str]:
     """``xcr`` values by name, whether written as attributes or as elements."""
     described = parsed(path, xml_root).find(f".//{RDF}Description")
     if described is None:
-        raise InputError(path.name, ["holds no rdf:Description"])
+        raise InputError(path.name, [compose("no-rdf-description")])
     values = {key.removeprefix(XCR): text for key, text in described.attrib.items() if key.startswith(XCR)}
     return values | {node.tag.removeprefix(XCR): node.text or "" for node in described if node.tag.startswith(XCR)}
 
 
-def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[str]) -> dict[str, object]:
+def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[Message]) -> dict[str, object]:
     def numbers(key: str, count: int, default: str = "") -> list[float]:
         found = [_number(word, f"{name}.{key}", faults) for word in values.get(key, default).split()]
         if len(found) != count:
-            faults.append(f"{name}.{key} is missing or not {count} numbers")
+            faults.append(compose("no-numbers", key=f"{name}.{key}", count=count))
         return found if len(found) == count else [np.nan] * count
 
     model = values.get("DistortionModel", "perspective")
     bent = any(word.strip("0.-+") for word in values.get("DistortionCoeficients", "").split())
     if model not in MODELS and (bent or model != NO_LENS):
-        faults.append(f"{name}: its DistortionModel is {shown(model)}; read are {', '.join(MODELS)}")
+        faults.append(compose("distortion-model", camera=name, model=shown(model), known=MODELS))
     size = sized(folder, name, faults)
     side = max(size)
     focal = numbers("FocalLength35mm", 1)[0] / FILM_MM * side
@@ -182,7 +182,7 @@ def _entry(
     lens: Mapping[str, float],
     rotation: np.ndarray,
     position_m: np.ndarray,
-    faults: list[str],
+    faults: list[Message],
 ) -> dict[str, object]:
     centre = offset[0] + 0.5 * size[0], offset[1] + 0.5 * size[1]
     radial = [lens[key] for key in ("k1", "k2", "k3", "k4")]
@@ -203,7 +203,7 @@ def _entry(
 def _held(rig: Rig, kind: str) -> Rig:
     foreign = [camera.name for camera in rig if camera.recorded is not None]
     if foreign:
-        raise InputError(kind, [f"has no lens like that of {', '.join(foreign)}; write colmap or eigenhead"])
+        raise InputError(kind, [compose("format-without-lens", cameras=foreign)])
     return rig
 
 
@@ -215,9 +215,9 @@ def _words(values: np.ndarray) -> str:
     return " ".join(map(repr, values.tolist()))
 
 
-def _number(word: str | None, where: str, faults: list[str]) -> float:
+def _number(word: str | None, where: str, faults: list[Message]) -> float:
     try:
         return float(word or "")
     except ValueError:
-        faults.append(f"{where} is {shown(word)}, wanted a number")
+        faults.append(compose("no-number", key=where, value=shown(word)))
         return np.nan

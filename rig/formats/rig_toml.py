@@ -19,6 +19,7 @@ from typing import Any, Literal
 from rig.errors import InputError
 from rig.formats.cameras_json import name_fault
 from rig.formats.shot_files import PLATES_MOST
+from rig.messages.message import Message, compose
 from rig.text import suggest
 
 FORMAT = "eigenhead-rig/1"
@@ -141,17 +142,15 @@ def read_rig_config(path: Path) -> RigConfig:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
-        raise InputError(
-            str(path), [f"cannot be read ({error.strerror}); start from deploy/rig.example.toml"]
-        ) from error
+        raise InputError(str(path), [compose("no-rig-toml", reason=str(error.strerror))]) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(path.name, [f"is no TOML: {error}"]) from error
+        raise InputError(path.name, [compose("no-toml", reason=str(error))]) from error
     return rig_config_from_document(document, path.parent, path.name)
 
 
 def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject: str = "rig.toml") -> RigConfig:
     """A rig from parsed TOML. Raises InputError that names every fault."""
-    faults: list[str] = []
+    faults: list[Message] = []
     config = _read_table(RigConfig, document, "", faults)
     if config is not None:
         faults.extend(_rig_faults(config))
@@ -176,124 +175,127 @@ def adjusted(
     return changed
 
 
-def _rig_faults(config: RigConfig) -> list[str]:
-    faults: list[str] = []
+def _rig_faults(config: RigConfig) -> list[Message]:
+    faults: list[Message] = []
     if not config.cameras:
-        faults.append("cameras: none; add one [[cameras]] table each")
+        faults.append(compose("rig-without-cameras"))
     if config.front is not None and config.front not in config.names:
-        faults.append(f"front: {config.front!r} is no camera of this rig{_nearest(config.front, config.names)}")
+        faults.append(_hinted(compose("front-unknown", camera=f"{config.front!r}"), config.front, config.names))
     for what in ("name", "identity", "channel"):
         faults.extend(_doubles(config, what))
     for camera in config.cameras:
-        faults.extend(f"cameras.{camera.name}: {fault}" for fault in _camera_faults(camera, config.trigger))
+        of_camera = _camera_faults(camera, config.trigger)
+        faults.extend(compose("located", where=f"cameras.{camera.name}", fault=fault) for fault in of_camera)
     if config.trigger is not None:
-        faults.extend(f"trigger: {fault}" for fault in _trigger_faults(config.trigger))
-    faults.extend(
-        f"lights.outputs: {output} is no output; 0 to 3" for output in config.lights.outputs if output not in range(4)
-    )
+        of_trigger = _trigger_faults(config.trigger)
+        faults.extend(compose("located", where="trigger", fault=fault) for fault in of_trigger)
+    strange = [output for output in config.lights.outputs if output not in range(4)]
+    faults.extend(compose("lights-output-unknown", output=output) for output in strange)
     if not 0 <= config.lights.settle_s <= 60:
-        faults.append(f"lights.settle_s: {config.lights.settle_s} is not between 0 and 60")
-    faults.extend(f"shot.{fault}" for fault in _shot_faults(config.shot))
+        faults.append(_outside("lights.settle_s", config.lights.settle_s, 0, 60))
+    faults.extend(_shot_faults(config.shot))
     return faults
 
 
-def _doubles(config: RigConfig, what: str) -> list[str]:
+def _doubles(config: RigConfig, what: str) -> list[Message]:
     users: dict[Any, list[str]] = {}
     for camera in config.cameras:
         if what == "identity" and camera.driver in ("replay", "simulated"):
             continue  # one file holds all of them
         users.setdefault(getattr(camera, what), []).append(camera.name)
     return [
-        f"cameras: {what} {value!r} is used by {len(names)} cameras ({', '.join(names)})"
+        compose("used-by-several", what=what, value=f"{value!r}", users=len(names), cameras=names)
         for value, names in users.items()
         if len(names) > 1 and value is not None
     ]
 
 
-def _camera_faults(camera: CameraConfig, trigger: TriggerConfig | None) -> list[str]:
-    faults: list[str] = []
+def _camera_faults(camera: CameraConfig, trigger: TriggerConfig | None) -> list[Message]:
+    faults: list[Message] = []
     fault = name_fault(camera.name)
     if fault:
-        faults.append(f"name: {fault}")
+        faults.append(compose("located", where="name", fault=fault))
     if not camera.identity.strip():
-        faults.append("identity: empty")
+        faults.append(compose("identity-empty"))
     if _INDEXED_CAMERA.fullmatch(camera.identity.strip()):
-        faults.append(
-            f"identity: {camera.identity!r} is an index, which may be another camera after a reboot; "
-            "give its serial number, its path under /dev/v4l/by-id or by-path, or its address"
-        )
+        faults.append(compose("identity-by-index", identity=f"{camera.identity!r}"))
     if camera.channel is not None and camera.channel not in range(12):
-        faults.append(f"channel: {camera.channel} is no output of the trigger box; 0 to 11")
+        faults.append(compose("channel-unknown", channel=camera.channel))
     if camera.channel is not None and trigger is None:
-        faults.append("channel: there is no [trigger] table")
+        faults.append(compose("channel-without-trigger"))
     for key, (least, most) in _CAMERA_BOUNDS.items():
         value = getattr(camera, key)
         if value is not None and not least <= value <= most:
-            faults.append(f"{key}: {value} is not between {least} and {most}")
+            faults.append(_outside(key, value, least, most))
     return faults
 
 
-def _trigger_faults(trigger: TriggerConfig) -> list[str]:
-    faults: list[str] = []
+def _trigger_faults(trigger: TriggerConfig) -> list[Message]:
+    faults: list[Message] = []
     if _INDEXED_PORT.fullmatch(trigger.port.strip()):
-        faults.append(
-            f"port: {trigger.port!r} is an index, which may be another device after a reboot; "
-            "give its path under /dev/serial/by-id"
-        )
+        faults.append(compose("port-by-index", port=f"{trigger.port!r}"))
     if not 1 <= trigger.pulse_us <= 500_000:
-        faults.append(f"pulse_us: {trigger.pulse_us} is not between 1 and 500000")
+        faults.append(_outside("pulse_us", trigger.pulse_us, 1, 500_000))
     if not 300 <= trigger.baud <= 4_000_000:
-        faults.append(f"baud: {trigger.baud} is not between 300 and 4000000")
+        faults.append(_outside("baud", trigger.baud, 300, 4_000_000))
     if not 0.1 <= trigger.window_s <= 60:
-        faults.append(f"window_s: {trigger.window_s} is not between 0.1 and 60")
+        faults.append(_outside("window_s", trigger.window_s, 0.1, 60))
     return faults
 
 
-def _shot_faults(shot: ShotConfig) -> list[str]:
+def _outside(key: str, value: float, least: float, most: float) -> Message:
+    return compose("value-outside", key=key, value=f"{value}", least=f"{least}", most=f"{most}")
+
+
+def _shot_faults(shot: ShotConfig) -> list[Message]:
     least = {"warm_up_frames": 1, "plates": 1, "plates_over_s": 0}
     values = {field.name: getattr(shot, field.name) for field in dataclasses.fields(shot)}
-    faults = [
-        f"{name}: {value} is too small; {f'at least {least[name]}' if name in least else 'more than 0'}"
-        for name, value in values.items()
-        if (value < least[name] if name in least else value <= 0)
-    ]
-    return faults + [
-        f"{name}: {values[name]} is too large; at most {most}"
-        for name, most in _SHOT_MOST.items()
-        if values[name] > most
-    ]
+    faults: list[Message] = []
+    for name, value in values.items():
+        if name in least and value < least[name]:
+            faults.append(compose("value-small", key=f"shot.{name}", value=f"{value}", least=least[name]))
+        elif name not in least and value <= 0:
+            faults.append(compose("value-not-positive", key=f"shot.{name}", value=f"{value}"))
+    for name, most in _SHOT_MOST.items():
+        if values[name] > most:
+            faults.append(compose("value-large", key=f"shot.{name}", value=f"{values[name]}", most=most))
+    return faults
 
 
-def _read_table(kind: type, table: Any, where: str, faults: list[str]) -> Any:
+def _read_table(kind: type, table: Any, where: str, faults: list[Message]) -> Any:
     """A dataclass from a table; None, with the faults noted, where a value is missing or of a wrong type."""
     if not isinstance(table, Mapping):
-        faults.append(f"{where or 'document'}: is no table")
+        faults.append(compose("located", where=where or "document", fault=compose("is-no-table")))
         return None
     fields = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("key", True)}
     hints = typing.get_type_hints(kind)
     prefix = f"{where}." if where else ""
     before = len(faults)
-    faults.extend(f"{prefix}{key}: no such key{_nearest(key, fields)}" for key in table if key not in fields)
+    unknown = [key for key in table if key not in fields]
+    faults.extend(_hinted(compose("toml-key-unknown", key=f"{prefix}{key}"), key, fields) for key in unknown)
     values: dict[str, object] = {}
     for name, field in fields.items():
         if name in table:
             values[name] = _read_value(hints[name], table[name], prefix + name, faults)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            faults.append(f"{prefix}{name}: missing{_allowed(hints[name])}")
+            known = _allowed(hints[name])
+            missing = compose("key-missing", key=f"{prefix}{name}")
+            faults.append(compose("one-of", fault=missing, known=known) if known else missing)
     return kind(**values) if len(faults) == before else None
 
 
-def _read_value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
+def _read_value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         if value not in arguments or isinstance(value, bool):
-            faults.append(f"{where}: {value!r} is not allowed{_allowed(hint)}{_nearest(value, arguments)}")
+            told = compose("value-not-allowed", key=where, value=f"{value!r}")
+            faults.append(_hinted(compose("one-of", fault=told, known=_allowed(hint)), value, arguments))
         return value
     if origin in (types.UnionType, typing.Union):
         return _read_value(arguments[0], value, where, faults)
     if origin is tuple:
         if not isinstance(value, list):
-            faults.append(f"{where}: is no list")
+            faults.append(compose("located", where=where, fault=compose("is-no-list")))
             return ()
         return tuple(_read_value(arguments[0], v, _item(where, v, i), faults) for i, v in enumerate(value))
     if dataclasses.is_dataclass(hint):
@@ -301,13 +303,18 @@ def _read_value(hint: Any, value: Any, where: str, faults: list[str]) -> Any:
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        faults.append(f"{where}: {value!r} is no {_WORDS.get(hint, hint)}")
+        faults.append(compose("value-is-no", key=where, value=f"{value!r}", kind=_KINDS.get(hint, str(hint))))
     elif isinstance(value, float) and not math.isfinite(value):
-        faults.append(f"{where}: {value} is no finite number")
+        faults.append(compose("value-not-finite", key=where, value=f"{value}"))
     return value
 
 
-_WORDS = {str: "text", int: "whole number", float: "number", bool: "true or false"}
+_KINDS = {
+    str: compose("kind-text"),
+    int: compose("kind-whole-number"),
+    float: compose("kind-number"),
+    bool: compose("kind-switch"),
+}
 
 
 def _item(where: str, value: Any, index: int) -> str:
@@ -315,10 +322,11 @@ def _item(where: str, value: Any, index: int) -> str:
     return f"{where}.{name}" if isinstance(name, str) else f"{where}[{index}]"
 
 
-def _allowed(hint: Any) -> str:
-    return f"; one of {', '.join(map(str, typing.get_args(hint)))}" if typing.get_origin(hint) is Literal else ""
+def _allowed(hint: Any) -> tuple[str, ...]:
+    return tuple(map(str, typing.get_args(hint))) if typing.get_origin(hint) is Literal else ()
 
 
-def _nearest(word: Any, known: Iterable[Any]) -> str:
+def _hinted(fault: Message, word: Any, known: Iterable[Any]) -> Message:
+    """The fault and what the word may have meant, if anything is like it."""
     near = suggest(str(word), map(str, known), min_likeness=0.5)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    return compose("did-you-mean", fault=fault, nearest=f"{near[0]!r}") if near else fault

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from rig.errors import InputError
 from rig.formats.cameras_json import PIXELS_MOST
+from rig.messages.message import Message, compose
 from rig.text import printable
 
 KINDS = ("points", "tag", "cameras")
@@ -54,7 +55,7 @@ def read_scale(path: Path, cameras: Collection[str]) -> KnownLength:
     try:
         document = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path.name, [f"cannot be read as JSON ({error})"]) from error
+        raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
     return scale_from_document(document, cameras, path.name)
 
 
@@ -62,11 +63,11 @@ def scale_from_document(document: Any, cameras: Collection[str], subject: str = 
     """The length in a decoded ``scale.json``. Raises InputError naming every fault."""
     given = [kind for kind in KINDS if isinstance(document, dict) and kind in document]
     if len(given) != 1:
-        told = f"holds {' and '.join(given)}" if given else "holds none of them"
-        raise InputError(subject, [f"wants one of {', '.join(KINDS)}, {told}"])
-    faults: list[str] = []
+        several = compose("scale-kinds", kinds=KINDS, held=given)
+        raise InputError(subject, [several if given else compose("scale-kind", kinds=KINDS)])
+    faults: list[Message] = []
     unknown = sorted(set(document) - {given[0], "distance_mm"} - {"format"})
-    faults += [f"{key!r:.80} is no key of it" for key in unknown]
+    faults += [compose("no-key-of-it", key=f"{key!r:.80}") for key in unknown]
     readers = {"points": _points, "tag": _tag, "cameras": _cameras}
     known = readers[given[0]](document, cameras, faults)
     if faults or known is None:
@@ -74,45 +75,45 @@ def scale_from_document(document: Any, cameras: Collection[str], subject: str = 
     return known
 
 
-def _points(document: dict[str, Any], cameras: Collection[str], faults: list[str]) -> PointDistance | None:
+def _points(document: dict[str, Any], cameras: Collection[str], faults: list[Message]) -> PointDistance | None:
     distance = _length(document, "distance_mm", faults)
     points = document["points"]
     if not isinstance(points, dict) or len(points) != 2:
-        faults.append("points: wants an object of two points, each an object of camera: [x, y]")
+        faults.append(compose("scale-points"))
         return None
     ends = [_pixels(views, f"points.{printable(name):.80}", cameras, faults) for name, views in points.items()]
     first, second = ends
     shared = [name for name in first if name in second]
     # One alone may lie behind the other in one picture, in two it cannot.
     if len(shared) > 1 and all(np.array_equal(first[name], second[name]) for name in shared):
-        told = " and ".join(f"{printable(name):.80}" for name in points)
-        faults.append(f"points: {told} are one place in {' and '.join(shared)}: pick two places")
+        named = [f"{printable(name):.80}" for name in points]
+        faults.append(compose("scale-points-equal", points=named, cameras=shared))
     return PointDistance(first, second, distance)
 
 
-def _pixels(views: Any, where: str, cameras: Collection[str], faults: list[str]) -> dict[str, np.ndarray]:
+def _pixels(views: Any, where: str, cameras: Collection[str], faults: list[Message]) -> dict[str, np.ndarray]:
     if not isinstance(views, dict) or len(views) < 2:
-        faults.append(f"{where}: a point must be picked in two cameras or more")
+        faults.append(compose("scale-point-views", point=where))
         return {}
     for name, pixel in views.items():
         if name not in cameras:
-            faults.append(f"{where} names {name!r:.80}, of which there is no photograph")
+            faults.append(compose("no-photograph-of", key=where, camera=f"{name!r:.80}"))
         if not (isinstance(pixel, list) and len(pixel) == 2 and all(map(_is_place, pixel))):
-            faults.append(
-                f"{where}.{printable(name):.80} is {pixel!r:.80}, wanted [x, y] in pixels, 0 to {PIXELS_MOST}"
-            )
+            key = f"{where}.{printable(name):.80}"
+            faults.append(compose("no-pixel-pair", key=key, value=f"{pixel!r:.80}", most=PIXELS_MOST))
     return {} if faults else {name: np.array(pixel, float) for name, pixel in views.items()}
 
 
-def _tag(document: dict[str, Any], cameras: Collection[str], faults: list[str]) -> TagSize | None:
+def _tag(document: dict[str, Any], cameras: Collection[str], faults: list[Message]) -> TagSize | None:
     tag = document["tag"]
     if not isinstance(tag, dict):
-        faults.append("tag: wants an object with dictionary and size_mm")
+        faults.append(compose("scale-tag"))
         return None
-    faults += [f"{'tag.' + key!r:.80} is no key of it" for key in sorted(set(tag) - {"dictionary", "size_mm"})]
+    unknown = sorted(set(tag) - {"dictionary", "size_mm"})
+    faults += [compose("no-key-of-it", key=f"{'tag.' + key!r:.80}") for key in unknown]
     name = tag.get("dictionary")
     if not isinstance(name, str) or name not in dictionaries():
-        faults.append(f"tag.dictionary is {name!r:.80}, wanted one of OpenCV's, such as 'DICT_4X4_50'")
+        faults.append(compose("tag-dictionary", name=f"{name!r:.80}"))
     return TagSize(str(name), _length(tag, "size_mm", faults, "tag."))
 
 
@@ -123,20 +124,21 @@ def dictionaries() -> dict[str, int]:
     return {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 
 
-def _cameras(document: dict[str, Any], cameras: Collection[str], faults: list[str]) -> CameraDistance | None:
+def _cameras(document: dict[str, Any], cameras: Collection[str], faults: list[Message]) -> CameraDistance | None:
     distance = _length(document, "distance_mm", faults)
     names = document["cameras"]
     if not isinstance(names, list) or len(names) != 2 or names[0] == names[1]:
-        faults.append("cameras: wants the names of two cameras")
+        faults.append(compose("scale-cameras"))
         return None
-    faults += [f"cameras names {name!r:.80}, of which there is no photograph" for name in names if name not in cameras]
+    strange = [name for name in names if name not in cameras]
+    faults += [compose("no-photograph-of", key="cameras", camera=f"{name!r:.80}") for name in strange]
     return CameraDistance((names[0], names[1]), distance)
 
 
-def _length(document: dict[str, Any], key: str, faults: list[str], where: str = "") -> float:
+def _length(document: dict[str, Any], key: str, faults: list[Message], where: str = "") -> float:
     value: Any = document.get(key)
     if not _is_number(value) or not 0.1 <= value <= 1e5:
-        faults.append(f"{where}{key} is {value!r:.80}, wanted a length in millimetres, 0.1 to 100000")
+        faults.append(compose("no-length", key=f"{where}{key}", value=f"{value!r:.80}"))
         return 1.0
     return float(value)
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from rig.formats.cameras_json import SERIAL_MOST
 from rig.formats.images import HEIC_SUFFIXES, IMAGE_FORMATS, RAW_SUFFIXES, heif_header, is_picture
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 BODY_SERIAL, DNG_SERIAL, EXIF_IFD = 0xA431, 0xC62F, 0x8769
@@ -63,7 +64,7 @@ def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
     return Rig(tuple(replace(camera, serial=own.get(camera.name, camera.serial)) for camera in rig))
 
 
-def pictures_by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, Path]:
+def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:
     """The pictures of ``folder`` that no camera has for a name, each under the camera that took it.
 
     Nothing is looked at where every camera has a picture of its name; appends a fault for each picture that cannot be
@@ -82,14 +83,14 @@ def pictures_by_serial(folder: Path, rig: Rig, faults: list[str]) -> dict[str, P
     for path, serial in serials.items():
         where = f"{folder.name}/{path.name}"
         if serial is None:
-            faults.append(f"{where} is no camera's name, and its EXIF has no serial number: name it after its camera")
+            faults.append(compose("picture-without-serial", picture=where))
         elif serial not in bodies:
-            known = ", ".join(bodies)
-            told = f"{where} was taken by the body {serial}, and cameras without a picture are {known}"
-            faults.append(f"{told}: write its camera's serial into cameras.json, or name it after its camera")
+            faults.append(compose("picture-of-strange-body", picture=where, serial=serial, cameras=[*bodies]))
         elif bodies[serial] in found:
             other = found[bodies[serial]].name
-            faults.append(f"{where} and {other} were both taken by the body {serial} ({bodies[serial]}): leave one")
+            faults.append(
+                compose("pictures-of-one-body", picture=where, other=other, serial=serial, camera=bodies[serial])
+            )
         else:
             found[bodies[serial]] = path
     return found

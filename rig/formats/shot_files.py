@@ -12,25 +12,25 @@ from pathlib import Path
 
 from rig.formats.images import is_picture
 from rig.formats.picture_names import UNREAD_PICTURES, is_junk, match_names, picture_stem
-from rig.formats.reading import listed
+from rig.formats.reading import some_of
 from rig.formats.serials import pictures_by_serial
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera
 BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
-READ_AS = "PNG, JPEG, TIFF, WebP, BMP or PPM"
 
 
 @dataclass(frozen=True, slots=True)
 class ShotFiles:
-    """``strays``: pictures of no camera, relative to the capture's folder; ``faults``: sentences about files that are
+    """``strays``: pictures of no camera, relative to the capture's folder; ``faults``: of files that are
     missing or cannot be told apart."""
 
     images: Mapping[str, Path]
     masks: Mapping[str, Path]
     plates: Mapping[str, tuple[Path, ...]]
     strays: tuple[str, ...]
-    faults: tuple[str, ...]
+    faults: tuple[Message, ...]
 
     def of_camera(self, name: str) -> list[tuple[str, Path]]:
         """Kind (the folder's name) and path of each file of a camera."""
@@ -41,7 +41,7 @@ class ShotFiles:
 
 def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFiles:
     """The files of one shot. ``left_out``: cameras that take no part, whose files are nobody's and no strays."""
-    names, faults = [*rig.names, *left_out], list[str]()
+    names, faults = [*rig.names, *left_out], list[Message]()
     places = {"images": picture_folder(folder), **{kind: folder / kind for kind in BESIDE_PICTURES}}
     owned = {kind: _owned(place, names, kind, rig, faults) for kind, place in places.items()}
     images = {name: path for name in rig.names if (path := _one(owned["images"].get(name, []), folder, faults))}
@@ -73,14 +73,12 @@ def listed_pictures(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if is_picture(path))
 
 
-def stray_sentence(strays: Sequence[str], rig: Rig) -> str:
+def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
     """What is said of pictures that belong to no camera."""
-    if len(strays) == 1:
-        return f"{strays[0]} has no camera: the rig has {', '.join(rig.names)}"
-    return f"{listed(strays)} have no camera: the rig has {', '.join(rig.names)}"
+    return compose("pictures-strange", count=len(strays), pictures=some_of(strays), cameras=rig.names)
 
 
-def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[str]) -> dict[str, list[Path]]:
+def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[Message]) -> dict[str, list[Path]]:
     """Files and folders of each camera in one of the capture's folders."""
     if not place.is_dir():
         return {}
@@ -113,18 +111,17 @@ def _folders(place: Path) -> list[Path]:
     return sorted(path for path in place.iterdir() if path.is_dir() and not is_junk(path.name))
 
 
-def _one(paths: Sequence[Path], root: Path, faults: list[str]) -> Path | None:
+def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | None:
     """A camera's one picture or mask: the file, or that in its folder."""
     files = [path for path in paths if path.is_file()]
     if len(files) > 1:
         where = files[0].parent.relative_to(root).as_posix()
-        faults.append(f"{where}/ holds {' and '.join(path.name for path in files)}: which one is meant?")
+        faults.append(compose("pictures-of-one-camera", folder=where, pictures=[path.name for path in files]))
     if files:
         return files[0]
     inside = _flat(paths)
     if len(inside) > 1:
-        told = f"{paths[0].name}/ holds {len(inside)} pictures; a capture is one shot: leave one of them"
-        faults.append(f"{told}, and give all to calibrate --from scene")
+        faults.append(compose("pictures-in-camera-folder", folder=paths[0].name, count=len(inside)))
     return inside[0] if inside else None
 
 
@@ -155,13 +152,13 @@ def _missing(
     plates: Mapping[str, tuple[Path, ...]],
     places: Mapping[str, Path],
     strays: Mapping[str, Sequence[Path]],
-) -> tuple[list[str], bool]:
+) -> tuple[list[Message], bool]:
     """What cameras lack, and whether a sentence names strays for it: where no camera has a file of its name and
     there are others, that is one cause."""
     inside = "" if places["images"] == folder else "images/"
-    faults, alone, named = list[str](), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES), False
+    faults, alone, named = list[Message](), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES), False
     lacking = [name for name in rig.names if name not in images]
-    if cause := _cause(rig, lacking, strays["images"], inside or "the folder", "picture"):
+    if cause := _cause(rig, lacking, strays["images"], inside or compose("the-folder"), compose("a-picture")):
         faults.append(cause)
         named = True
     else:
@@ -171,14 +168,14 @@ def _missing(
                 named = True
                 where = other.relative_to(folder).as_posix()
                 kind = UNREAD_PICTURES[other.suffix.lower()]
-                faults.append(f"{where} is not read: of {kind} files nothing is; save it as {READ_AS}")
+                faults.append(compose("picture-kind-unread", picture=where, kind=kind))
             else:
-                faults.append(f"{inside}{name}.png is missing (or .jpg, .tif, .webp, .bmp, RAW, HEIC)")
+                faults.append(compose("picture-missing", picture=f"{inside}{name}.png"))
     lacking = [] if alone else [name for name in rig.names if name not in plates and name not in masks]
-    cause = _cause(rig, lacking, strays["masks"], "masks/", "mask")
-    cause = cause or _cause(rig, lacking, strays["background"], "background/", "clean plate")
+    cause = _cause(rig, lacking, strays["masks"], "masks/", compose("a-mask"))
+    cause = cause or _cause(rig, lacking, strays["background"], "background/", compose("a-clean-plate"))
     for name in () if cause else lacking:
-        faults.append(f"background/{name}.png is missing: a clean plate, or masks/{name}.png, is needed")
+        faults.append(compose("plate-missing", camera=name))
     return [*faults, *([cause] if cause else [])], named or bool(cause)
 
 
@@ -186,26 +183,26 @@ def _of_other_kind(name: str, strays: Sequence[Path]) -> Path | None:
     return next((p for p in strays if picture_stem(p.name) == name and p.suffix.lower() in UNREAD_PICTURES), None)
 
 
-def _cause(rig: Rig, lacking: Sequence[str], strays: Sequence[Path], place: str, what: str) -> str | None:
+def _cause(
+    rig: Rig, lacking: Sequence[str], strays: Sequence[Path], place: str | Message, what: Message
+) -> Message | None:
     """One sentence, where all cameras lack a file and as many others are there."""
     strangers = [path for path in strays if is_picture(path)]
     if not len(lacking) == len(rig) > 1 or len(strangers) < max(len(lacking), 2):
         return None
-    cameras = f"{rig.names[0]} to {rig.names[-1]}"
+    cameras = compose("first-to-last", first=rig.names[0], last=rig.names[-1])
     parents = sorted({path.parent.name for path in strangers})
     if len(parents) > 1 and len({path.name for path in strangers}) < len(strangers):
-        told = f"no camera has a {what} in {place}: it holds the folders {listed(parents)}, and the cameras are called"
-        return f"{told} {cameras}; a capture is one shot: leave the files of one of them in {place}"
-    found = f"{strangers[0].name} to {strangers[-1].name}"
-    doubt = _doubt(strangers, rig)
-    told = f"no camera has a {what} in {place}: the cameras are called {cameras}, the {what}s {found}"
-    return f"{told}; {doubt or 'rename either'}"
+        return compose("shots-in-folders", what=what, place=place, folders=some_of(parents), cameras=cameras)
+    found = compose("first-to-last", first=strangers[0].name, last=strangers[-1].name)
+    doubt = _doubt(strangers, rig) or compose("rename-either")
+    return compose("names-differ", what=what, place=place, cameras=cameras, found=found, remedy=doubt)
 
 
-def _doubt(strangers: Sequence[Path], rig: Rig) -> str | None:
+def _doubt(strangers: Sequence[Path], rig: Rig) -> Message | None:
     """Why names that do hold the cameras' cannot be told: there are several of each."""
     several = match_names([path.name for path in strangers], rig.names, several=True)
     if len(several) < len(rig) or all(len(own) == 1 for own in several.values()):
         return None
     own = several[rig.names[0]]
-    return f"{rig.names[0]} has {len(own)} ({listed(own, 2)}): a capture is one shot, leave one of each camera"
+    return compose("several-of-each", camera=rig.names[0], count=len(own), files=some_of(own, 2))

@@ -20,6 +20,7 @@ from rig.errors import InputError
 from rig.formats.foreign import METRES_MOST, camera_names, lens_entry, number_array, parsed, sized
 from rig.formats.foreign_keys import TRANSFORMS
 from rig.formats.reading import CamerasRead, Reading, shown
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from OpenGL's
@@ -33,7 +34,7 @@ def read_transforms(path: Path) -> CamerasRead:
     document = parsed(path, json.loads)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(path.name, ["is no object with a list 'frames' of objects"])
+        raise InputError(path.name, [compose("no-frame-list")])
     reading = Reading(path.name)
     faults = reading.faults
     reading.judge(TRANSFORMS, {key: value for key, value in document.items() if key not in PER_CAMERA}, "")
@@ -48,7 +49,7 @@ def read_transforms(path: Path) -> CamerasRead:
     _check_applied(document.get("applied_transform"), faults)
     applied = _number(document.get("applied_scale", 1.0), "applied_scale", faults)
     if applied <= 0:
-        faults.append(f"applied_scale is {applied:g}, wanted a positive number")
+        faults.append(compose("no-positive-number", key="applied_scale", value=f"{applied:g}"))
     scale = 1.0 / applied if applied > 0 else 1.0
     reach = scale * max((np.abs(matrix[:3, 3]).max() for matrix in matrices), default=0.0)
     millimetres = scale * (1000.0 if reach < METRES_MOST else 1.0)
@@ -77,12 +78,12 @@ def _lens(camera: Camera) -> dict[str, object]:
     if lens is None:
         return entry | {"k1": d.k1, "k2": d.k2, "k3": d.k3, "p1": d.p1, "p2": d.p2}
     if lens.model == "rational":
-        raise InputError("nerfstudio", [f"has no lens like that of {camera.name}; write colmap or eigenhead"])
+        raise InputError("nerfstudio", [compose("format-without-lens", cameras=[camera.name])])
     return entry | {"camera_model": "OPENCV_FISHEYE", **dict(zip(LENS[:4], lens.coefficients, strict=True))}
 
 
 def _entry(
-    folder: Path, name: str, values: dict[str, Any], matrix: np.ndarray, millimetres: float, faults: list[str]
+    folder: Path, name: str, values: dict[str, Any], matrix: np.ndarray, millimetres: float, faults: list[Message]
 ) -> dict[str, object]:
     fisheye = _is_fisheye(values, name, faults)
     size = values.get("w"), values.get("h")
@@ -95,7 +96,7 @@ def _entry(
     cy = _number(values.get("cy", 0.5 * height), f"{name}.cy", faults)
     lens = {key: _number(values.get(key, 0.0), f"{name}.{key}", faults) for key in LENS}
     if not fisheye and lens["k4"]:
-        faults.append(f"{name}.k4 is not 0 and the camera no OPENCV_FISHEYE: calibrate without k4")
+        faults.append(compose("k4-of-no-fisheye", key=f"{name}.k4"))
         lens["k4"] = 0.0
     pose = (matrix[:3, :3] @ OPENGL).T
     return {
@@ -111,22 +112,21 @@ def _entry(
     }
 
 
-def _is_fisheye(values: dict[str, Any], name: str, faults: list[str]) -> bool:
+def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> bool:
     """Whether the lens is Kannala-Brandt's: nerfstudio says so by ``camera_model``, instant-ngp by ``is_fisheye``."""
     model, flag = values.get("camera_model"), values.get("is_fisheye", False)
     if not (model is None or (isinstance(model, str) and model in MODELS)):
-        faults.append(f"{name}.camera_model is {shown(model)}; read are {', '.join(MODELS)}")
+        faults.append(compose("value-not-read", key=f"{name}.camera_model", value=shown(model), known=[*MODELS]))
         return False
     if not isinstance(flag, bool) and flag not in (0, 1):
-        faults.append(f"{name}.is_fisheye is {shown(flag)}, wanted true or false")
+        faults.append(compose("no-switch", key=f"{name}.is_fisheye", value=shown(flag)))
         return False
     if flag and model is not None and not MODELS[model]:
-        told = "the two say different lenses: take the wrong one out"
-        faults.append(f"{name}.is_fisheye is true, and camera_model is {model}: {told}")
+        faults.append(compose("fisheye-or-not", key=f"{name}.is_fisheye", model=model))
     return bool(flag) or (model is not None and MODELS[model])
 
 
-def _check_applied(value: object, faults: list[str]) -> None:
+def _check_applied(value: object, faults: list[Message]) -> None:
     """Any world will do, so that a rotation that was applied to it need not be taken back; a scale would change
     lengths, and a mirror what is left and right."""
     if value is None:
@@ -136,28 +136,28 @@ def _check_applied(value: object, faults: list[str]) -> None:
     except (TypeError, ValueError, IndexError):
         matrix = np.zeros(0)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        faults.append(f"applied_transform is {shown(value)}, wanted 3 x 4 numbers")
+        faults.append(compose("applied-transform-shape", value=shown(value)))
     elif np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-3 or np.linalg.det(matrix) < 0:
-        faults.append("applied_transform scales or mirrors the world: export without it")
+        faults.append(compose("applied-transform-scales"))
 
 
 def _focal(
-    values: dict[str, Any], axis: str, pixels: float, default: float | None, name: str, faults: list[str]
+    values: dict[str, Any], axis: str, pixels: float, default: float | None, name: str, faults: list[Message]
 ) -> float:
     if (focal := values.get(f"fl_{axis}")) is not None:
         return _number(focal, f"{name}.fl_{axis}", faults)
     angle = values.get(f"camera_angle_{axis}")
     if angle is None:
         if default is None:
-            faults.append(f"{name} has neither fl_{axis} nor camera_angle_{axis}")
+            faults.append(compose("focal-length-missing", camera=name, axis=axis))
         return math.nan if default is None else default
     angle = _number(angle, f"{name}.camera_angle_{axis}", faults)
     return 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
 
 
-def _number(value: object, where: str, faults: list[str]) -> float:
+def _number(value: object, where: str, faults: list[Message]) -> float:
     # NaN fails the comparison, and so does a whole number too large for a float
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12:
         return value
-    faults.append(f"{where} is {shown(value)}, wanted a finite number")
+    faults.append(compose("no-finite-number", key=where, value=shown(value)))
     return math.nan

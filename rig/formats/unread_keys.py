@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rig.formats.cameras_json import FORMAT
+from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 
 READ = {
@@ -23,8 +24,8 @@ LENS_MODELS: dict[str, set[str]] = {
 TOLD_MOST = 8
 
 
-def unread_keys(path: Path) -> tuple[str, ...]:
-    """A sentence for every key of a rig file that is not read; nothing for the files of other programs, which have keys
+def unread_keys(path: Path) -> tuple[Message, ...]:
+    """A message for every key of a rig file that is not read; nothing for the files of other programs, which have keys
     of their own, and for a file that cannot be read at all, which its reader refuses."""
     if path.suffix != ".json" or path.name == "transforms.json":
         return ()
@@ -35,17 +36,16 @@ def unread_keys(path: Path) -> tuple[str, ...]:
     return unread_keys_of(document, path.name)
 
 
-def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[str, ...]:
+def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
     """The same of a decoded file of this format. What many cameras have alike is said once, with their number."""
     counts = Counter(_unread(document))
     told = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:
         where = repr(f"{place}.{key}" if place else key)  # its signs may be none that a terminal shows
-        whose = f" of {times} cameras" if times > 1 else ""
-        told.append(f"{subject}: the key {where:.80}{whose} is not read: it is misspelt, or no key of this format")
+        told.append(compose("key-unread", count=times, key=f"{where:.80}"))
     if len(counts) > TOLD_MOST:
-        told.append(f"{subject}: {len(counts) - TOLD_MOST} more keys are not read")
-    return tuple(told)
+        told.append(compose("keys-unread-more", more=len(counts) - TOLD_MOST))
+    return tuple(compose("located", where=subject, fault=fault) for fault in told)
 
 
 def _unread(document: Any) -> Iterator[tuple[str, str]]:

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from rig.errors import EigenheadError, how_to_install
 from rig.formats.glb import ROUGHNESS
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 ALIGNED = 64  # bytes: where a file of the package begins (https://openusd.org/release/spec_usdz.html)
 HEADER = 30  # bytes of a zip entry's header before its name
@@ -24,7 +25,7 @@ class NoUsd(EigenheadError):
     """The extra is not installed."""
 
     def __init__(self) -> None:
-        super().__init__(f"head.usdz needs usd-core: {how_to_install('usd')}; or leave usdz out of the formats")
+        super().__init__(compose("usd-not-installed", remedy=how_to_install("usd")))
 
 
 def check_usd() -> None:

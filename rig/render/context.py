@@ -19,6 +19,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 import moderngl
 
 from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
 
 SHADERS = Path(__file__).with_name("shaders")
 CLIP_PLANES = range(0x3000, 0x3006)  # GL_CLIP_DISTANCE0 and on, as many as shaders/camera.glsl writes
@@ -37,17 +38,14 @@ class EglUnavailable(EigenheadError):
     """No OpenGL context could be made on this machine."""
 
     def __init__(self, reason: str) -> None:
-        super().__init__(
-            f"cannot start OpenGL on EGL ({reason}); on Debian and Ubuntu this installs a software driver, which needs "
-            "no graphics card: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
-        )
+        super().__init__(compose("no-opengl", reason=reason))
 
 
 class WrongThread(EigenheadError):
     """A renderer was used outside the thread or process that made it, or after it was closed."""
 
-    def __init__(self, why: str) -> None:
-        super().__init__(f"a renderer belongs to one thread of one process: {why}; create another one there")
+    def __init__(self, why: Message) -> None:
+        super().__init__(compose("renderer-of-other-thread", why=why))
 
 
 class Owned(contextlib.ExitStack):
@@ -79,9 +77,9 @@ class GlContext:
     def current(self) -> Iterator[moderngl.Context]:
         """Makes the context current for a while. Raises WrongThread."""
         if self._closed:
-            raise WrongThread("it was closed")
+            raise WrongThread(compose("renderer-closed"))
         if (os.getpid(), threading.get_ident()) != self._owner:
-            raise WrongThread("it was made elsewhere")
+            raise WrongThread(compose("renderer-elsewhere"))
         with self.gl:
             yield self.gl
 

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from rig.camera import lens_image
 from rig.errors import InputError
+from rig.messages.message import compose
 from rig.render.context import GlContext, Owned
 from rig.render.tile_packing import (
     BLOCK_PX,
@@ -117,7 +118,7 @@ class SilhouetteSet:
     def xor_costs(self, vertices_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " k"]:
         """``sum w |S - Sm|`` per camera, in the rig's order. ``set_inputs`` comes first."""
         if not self._empty_sums:
-            raise InputError("xor_costs", ["no input silhouettes; call set_inputs first"])
+            raise InputError("xor_costs", [compose("no-input-silhouettes")])
         costs = np.zeros(len(self.rig))
         with self._context.current():
             boxes = self._draw(vertices_world)
@@ -135,7 +136,8 @@ class SilhouetteSet:
     def _draw(self, vertices: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, "k 4"]:
         """Draws every page's masks; returns the boxes that the model can reach, per camera, in blocks of its tile."""
         if len(vertices) < self._vertices_needed:
-            raise InputError("vertices", [f"{len(vertices)} of them, but the triangles use {self._vertices_needed}"])
+            few = compose("vertices-few", held=len(vertices), wanted=self._vertices_needed)
+            raise InputError("vertices", [few])
         if not self._vertices_needed:
             boxes, in_front = np.zeros((len(self.rig), 4), int), True
         else:
@@ -216,9 +218,10 @@ def check_images(rig: Rig, images: Mapping[str, np.ndarray], kind: str) -> None:
     for camera in rig:
         wanted = (camera.intrinsics.height, camera.intrinsics.width)
         if camera.name not in images:
-            faults.append(f"no {kind} for camera {camera.name}")
+            faults.append(compose("camera-without-image", what=kind, camera=camera.name))
         elif images[camera.name].shape[:2] != wanted:
-            faults.append(f"{kind} of camera {camera.name} is {images[camera.name].shape}, wanted {wanted}")
+            shape = str(images[camera.name].shape)
+            faults.append(compose("image-shape", what=kind, camera=camera.name, shape=shape, wanted=f"{wanted}"))
     if faults:
         raise InputError("silhouettes", faults)
 

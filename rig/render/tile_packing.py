@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from rig.camera import Camera
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 
 BLOCK_PX = 8  # tiles begin and end on multiples of this, so that a block of the reduction lies in one tile
 PAGE_PX = 8192  # a page's longest side where the driver would allow more: 64 MB of mask
@@ -20,9 +21,7 @@ class ImageTooLarge(EigenheadError):
     """An image does not fit into the largest texture of the driver."""
 
     def __init__(self, name: str, width: int, height: int, limit: int) -> None:
-        super().__init__(
-            f"camera {name}: {width} x {height} pixels, but this OpenGL driver draws at most {limit} a side"
-        )
+        super().__init__(compose("image-beyond-driver", camera=name, width=width, height=height, most=limit))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

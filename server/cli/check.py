@@ -122,9 +122,10 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
     faults = []
     for number, path in enumerate(files):
         report("check", number / len(files))
-        faults.append(decode_image_file(path, path.relative_to(root).as_posix(), "grey")[2])
-    if any(faults):
-        raise InputError("photographs", filter(None, faults))
+        fault = decode_image_file(path, path.relative_to(root).as_posix(), "grey")[2]
+        faults += [] if fault is None else [fault]
+    if faults:
+        raise InputError("photographs", faults)
 
 
 def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:

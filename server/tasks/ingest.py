@@ -179,9 +179,8 @@ def check_capture(
     read = read_rig_of(rig_file)
     rig = read.rig
     check_folders(root, rig)
-    faults: list[Message | str] = [
-        f"{rig_file.name}: {fault}" for fault in rig_faults(rig, any_unit=has_known_length(root))
-    ]
+    judged = rig_faults(rig, any_unit=has_known_length(root))
+    faults = [compose("located", where=rig_file.name, fault=fault) for fault in judged]
     files = find_files(root, rig, read.left_out)
     faults += files.faults
     faults += [stray_sentence(files.strays, rig)] if files.strays and not strays_pass else []
@@ -190,15 +189,15 @@ def check_capture(
     views: dict[str, ViewCheck] = {}
     for number, camera in enumerate(rig):
         report("check", number / len(rig))
-        of_sizes, of_files = _size_faults(root, files, camera, image_pixels), list[str]()
+        of_sizes, of_files = _size_faults(root, files, camera, image_pixels), list[Message]()
         if not of_sizes:
-            shot = read_shot(root, rig.subset([camera.name]), of_files, files)
+            shot = read_shot(root, rig.subset([camera.name]), of_files, files, with_features=False)
             digests |= shot.digests
             empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
             views |= _view_of(shot, camera.name, measured)
-        faults += [*of_sizes, *(fault for fault in of_files if not fault.startswith("features.json"))]  # judged below
+        faults += [*of_sizes, *of_files]
     if (root / "features.json").is_file():
-        of_file: list[str] = []
+        of_file: list[Message] = []
         features = features_from_bytes((root / "features.json").read_bytes(), rig, of_file)
         faults += [*of_file, *feature_faults(features, rig)]
     if len(empty) == len(rig):
@@ -243,23 +242,23 @@ def check_features(bench: Bench, report: Progress, *, folder: str, points: Point
         raise InputError("capture", [NO_RIG])
     data = json.dumps({"format": FEATURES_FORMAT, "points": points}, indent=1).encode()
     # Points come one after the other: whether they suffice is asked when the job starts.
-    of_file: list[str] = []
+    of_file: list[Message] = []
     unknown = unknown_landmarks(features_from_bytes(data, read_cameras(rig_file).rig, of_file))
     if of_file or unknown:
         raise InputError("features.json", [*of_file, *unknown])
     return data
 
 
-def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[Message | str]:
+def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[Message]:
     """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
-    faults: list[Message | str] = []
+    faults: list[Message] = []
     wanted = (camera.intrinsics.width, camera.intrinsics.height)
     for _, path in files.of_camera(camera.name):
         name = path.relative_to(root).as_posix()
         try:
             width, height = picture_size(path)
         except InputError as error:
-            faults += [f"{name} {fault}" for fault in error.faults]
+            faults += [compose("of-file", file=name, fault=fault) for fault in error.faults]
             continue
         if width * height > image_pixels:
             faults.append(compose("picture-too-large", file=name, width=width, height=height, most=image_pixels))

@@ -38,7 +38,7 @@ from rig.formats.reading import say_once
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import find_files, picture_folder
 from rig.formats.work_size import WORK_PIXELS, work_rig
-from rig.messages.message import compose, documents_of, read_message
+from rig.messages.message import Message, compose, documents_of, read_message
 from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
@@ -76,7 +76,7 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
     root = capture_root(folder)
     kept.mkdir(parents=True, exist_ok=True)
     warnings = calibrate_photographs(root, kept, front=front, report=report)
-    rig, faults = read_rig(kept / CAMERAS), list[str]()
+    rig, faults = read_rig(kept / CAMERAS), list[Message]()
     files = find_files(root, rig, [name for name in find_photographs(root).names if name not in rig])
     faults += files.faults
     capture = read_shot(root, rig, faults, files, pixels_most=WORK_PIXELS)

@@ -26,7 +26,6 @@ NOT_OURS = {
     "SystemExit",
     "BadParameter",
     "PydanticCustomError",
-    "StreamBroken",
     "AravisError",
 }
 

@@ -21,6 +21,7 @@ from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.cameras_json import write_rig
 from rig.image import ImageRgb
+from rig.messages.message import compose
 from rig.studio.devices.sources import ImageSource, SceneImages
 from rig.studio.devices.streams import Film, StreamServer
 from rig.studio.devices.trigger_box import LIGHTS, BoxLogic, Release, SimulatedTriggerBox
@@ -68,7 +69,7 @@ def device_fault_from_text(text: str) -> DeviceFault:
     """``kind[:camera][=amount]``. Raises InputError; ``StudioDevices.inject`` judges whether a studio can do it."""
     kind, camera, amount = fault_parts(text)
     if kind not in KINDS:
-        raise InputError("fault", [f"{kind!r} is none of {', '.join(KINDS)}"])
+        raise InputError("fault", [compose("none-of", value=f"{kind!r}", known=KINDS)])
     return DeviceFault(kind, camera, amount)
 
 
@@ -150,10 +151,12 @@ class StudioDevices:
         """Something goes wrong from now on. Raises InputError for what this studio cannot do."""
         faults = []
         if fault.kind not in KINDS:
-            faults.append(f"kind: {fault.kind!r} is none of {', '.join(KINDS)}")
+            strange = compose("none-of", value=f"{fault.kind!r}", known=KINDS)
+            faults.append(compose("located", where="kind", fault=strange))
         needs_camera = fault.kind not in ("late-trigger", "lights-off", "unplugged")
         if fault.camera not in (*self.names, None) or (fault.camera is None and needs_camera):
-            faults.append(f"camera: {fault.camera!r} is none of {', '.join(self.names)}")
+            strange = compose("none-of", value=f"{fault.camera!r}", known=self.names)
+            faults.append(compose("located", where="camera", fault=strange))
         if faults:
             raise InputError("fault", faults)
         with self._busy:

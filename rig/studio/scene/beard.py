@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from rig.errors import InputError
 from rig.mesh import Mesh, vertex_normals
+from rig.messages.message import compose
 from rig.studio.scene.anatomy import Anatomy, Landmarks
 from rig.studio.scene.curls import curled
 from rig.studio.scene.hair import Hair, HairStyle, grow_strands
@@ -18,7 +19,7 @@ def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Gener
     Raises InputError for a head without landmarks.
     """
     if not body.landmarks:
-        raise InputError("beard", ["a beard is laid out from landmarks, which this head does not have"])
+        raise InputError("beard", [compose("beard-without-landmarks")])
     share = beard_share(head.vertices, body)
     faces = head.faces[(share[head.faces] > 0.0).any(axis=1)]
     normals = vertex_normals(head.vertices, head.faces)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from rig.errors import InputError
+from rig.messages.message import compose
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.subject import Colour, Look
 
@@ -49,7 +50,7 @@ without panes: the pipeline asks studios for that."""
 def restyled(look: Look, names: Sequence[str]) -> Look:
     """The look with the named changes, one after the other: ``curly,beard``. Raises InputError."""
     if unknown := [name for name in names if name not in HAIRSTYLES]:
-        raise InputError("hair", [f"{name} is not one of {', '.join(HAIRSTYLES)}" for name in unknown])
+        raise InputError("hair", [compose("none-of", value=name, known=[*HAIRSTYLES]) for name in unknown])
     for name in names:
         look = HAIRSTYLES[name](look)
     return look

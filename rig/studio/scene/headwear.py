@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 
 from rig.errors import InputError
 from rig.mesh import face_normals
+from rig.messages.message import compose
 from rig.studio.scene.anatomy import Anatomy
 from rig.studio.scene.grids import grid_faces
 from rig.studio.scene.hair import COLUMNS, LOWEST_DEG, ROWS, outer_radius
@@ -73,7 +74,7 @@ def glasses(head: Float[np.ndarray, "v 3"], body: Anatomy) -> AnySurface:
     """
     marks = body.landmarks
     if not marks:
-        raise InputError("glasses", ["glasses are laid out from landmarks, which this head does not have"])
+        raise InputError("glasses", [compose("glasses-without-landmarks")])
     plane_z = max(float(marks["glabella"][2]) + 2.0, float(marks["endocanthion_left"][2]) + 16.0)
     pieces, inner = [], {}
     for side, sign in (("right", -1.0), ("left", 1.0)):

@@ -18,6 +18,7 @@ from rig.colour_space import srgb_from_linear
 from rig.errors import InputError
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.backdrop import backdrop, chair
@@ -198,7 +199,8 @@ def click(scene: Scene, rng: np.random.Generator) -> dict[str, dict[str, Float[n
 
 def _settled(fault: Fault, rig: Rig, rng: np.random.Generator) -> Fault:
     if fault.camera is not None and fault.camera not in rig:
-        raise InputError("fault", [f"{fault.kind}: the rig has no camera {fault.camera}, only {', '.join(rig.names)}"])
+        strange = compose("rig-camera-unknown", camera=fault.camera, known=compose("rig-cameras", cameras=rig.names))
+        raise InputError("fault", [compose("located", where=fault.kind, fault=strange)])
     drawn = rig.names[rng.integers(len(rig))]
     alone = fault.kind in ("frozen", "dark", "bumped", "swapped", "chair", "wrong-mask", "blurred")
     return replace(fault, camera=drawn) if alone and fault.camera is None else fault

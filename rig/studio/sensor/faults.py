@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from rig.errors import InputError
+from rig.messages.message import compose
 
 KINDS = {
     "frozen": "the camera's stream stands still: its picture is the last one before the subject came",
@@ -30,7 +31,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise InputError("fault", [f"{self.kind!r} is none of {', '.join(sorted(KINDS))}"])
+            raise InputError("fault", [compose("none-of", value=f"{self.kind!r}", known=sorted(KINDS))])
 
     @property
     def strength(self) -> float:
@@ -49,4 +50,4 @@ def fault_parts(text: str) -> tuple[str, str | None, float | None]:
     try:
         return kind, camera or None, float(amount) if amount else None
     except ValueError as error:
-        raise InputError("fault", [f"{text!r}: {amount!r} is no number; wanted kind[:camera][=amount]"]) from error
+        raise InputError("fault", [compose("fault-amount", text=f"{text!r}", amount=f"{amount!r}")]) from error

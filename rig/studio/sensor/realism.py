@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from rig.errors import InputError
+from rig.messages.message import compose
 from rig.studio.sensor.preset import Preset
 
 Change = Callable[[Preset], Preset]
@@ -30,7 +31,7 @@ cameras write it."""
 def made_real(preset: Preset, names: Sequence[str]) -> Preset:
     """Returns the preset with the named changes. Raises InputError."""
     if unknown := [name for name in names if name not in REALISM]:
-        raise InputError("realism", [f"{name} is not one of {', '.join(REALISM)}" for name in unknown])
+        raise InputError("realism", [compose("none-of", value=name, known=[*REALISM]) for name in unknown])
     for name in names:
         preset = REALISM[name](preset)
     return preset

@@ -64,7 +64,7 @@ def test_a_mirrored_picture_is_refused_and_named(board: Board) -> None:
     assert detect(mirrored, board) is None
     reason = explain(mirrored, board)
     assert reason is not None
-    assert "mirror" in reason
+    assert "mirror" in reason.text
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_a_wrong_square_count_is_refused_and_named(board: Board, columns: int, s
     assert detect(grey, wrong) is None
     reason = explain(grey, wrong)
     assert reason is not None
-    assert said in reason
+    assert said in reason.text
 
 
 def test_inverted_colours_are_named() -> None:

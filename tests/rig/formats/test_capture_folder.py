@@ -17,7 +17,7 @@ from rig.formats.capture_folder import capture_root, read_capture, size_fault, w
 from rig.formats.features_json import features_from_bytes
 from rig.formats.images import read_image, write_image
 from rig.geometry import look_at
-from rig.messages.message import texts_of
+from rig.messages.message import Message, texts_of
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from tests.support.shared_data import shared
@@ -158,7 +158,7 @@ def feature(views: Any) -> Callable[[Path], None]:
         ),
         (damage("images/b.png", png(picture())[:-40]), "images/b.png is damaged: its pixels cannot be decoded"),
         (damage("images/b.png", png(picture()[:20])), "images/b.png is 64 x 20 pixels, but its camera is 64 x 48"),
-        (damage("images/b.jpg", png(picture())), "images/ holds b.jpg and b.png: which one is meant?"),
+        (damage("images/b.jpg", png(picture())), "images/ holds b.jpg, b.png: which one is meant?"),
         (damage("background/b/001.png", b""), "background/b/001.png is damaged"),
         (damage("masks/c.png", png(np.zeros((HEIGHT, WIDTH), np.uint8))), "masks/c.png is empty"),
         (damage("features.json", b"{"), "features.json cannot be read as JSON"),
@@ -250,8 +250,8 @@ def test_a_folder_that_nobody_would_read_is_named(folder: Path, called: str, mea
 )
 def test_a_picture_of_another_size_is_told_with_its_remedy(change: dict[str, float], remedy: str) -> None:
     fault = size_fault("images/a.png", (WIDTH, HEIGHT), replace(small_rig()["a"].intrinsics, **change))
-    assert fault.startswith(f"images/a.png is {WIDTH} x {HEIGHT} pixels")
-    assert remedy in fault
+    assert fault.text.startswith(f"images/a.png is {WIDTH} x {HEIGHT} pixels")
+    assert remedy in fault.text
 
 
 def test_all_faults_are_named_at_once(folder: Path) -> None:
@@ -287,10 +287,10 @@ def test_a_picture_too_large_is_refused_before_it_is_decoded(folder: Path) -> No
 
 
 def test_too_many_points_are_refused() -> None:
-    faults: list[str] = []
+    faults: list[Message] = []
     document = {"format": "eigenhead-features/1", "points": {f"p{i}": {} for i in range(201)}}
     assert features_from_bytes(json.dumps(document).encode(), small_rig(), faults) == {}
-    assert "201 points, at most 200" in faults[0]
+    assert "201 points, at most 200" in faults[0].text
 
 
 def test_the_shared_capture_is_read() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rig.formats.mask_values import mask_plane, read_masks
+from rig.messages.message import Message
 
 HEIGHT, WIDTH = 240, 320
 ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
@@ -51,7 +52,7 @@ def test_every_form_of_a_mask_is_cut_at_half_of_its_own_range(pixels: np.ndarray
     plane = mask_plane(pixels)
     assert isinstance(plane, np.ndarray), plane
     reading = read_masks({"cam00": plane})["cam00"]
-    assert (reading.fault, reading.remark) == ("", "")
+    assert (reading.fault, reading.remark) == (None, None)
     assert not reading.soft
     assert np.count_nonzero((reading.share > 127) != INSIDE) <= 4
 
@@ -75,16 +76,16 @@ NAMED: dict[str, tuple[np.ndarray, str]] = {
 @pytest.mark.parametrize(("pixels", "words"), [pytest.param(*value, id=key) for key, value in NAMED.items()])
 def test_what_is_no_mask_is_named(pixels: np.ndarray, words: str) -> None:
     plane = mask_plane(pixels.astype(np.uint8))
-    fault = plane if isinstance(plane, str) else read_masks({"cam00": plane})["cam00"].fault
-    assert words in fault
+    fault = plane if isinstance(plane, Message) else read_masks({"cam00": plane})["cam00"].fault
+    assert words in str(fault)
 
 
 def test_noise_of_an_empty_mask_is_not_stretched_to_a_subject() -> None:
     noise = (NOISE[..., 0] > 200).astype(np.uint8) * 3 + (NOISE[..., 1] > 128).astype(np.uint8)
     readings = read_masks({"cam00": MASK, "cam01": noise})
-    assert readings["cam00"].fault == ""
-    assert readings["cam01"].fault.startswith("is empty")
-    assert read_masks({"cam00": MASK, "cam01": MASK // 255})["cam01"].fault == ""  # 0 and 1 beside 0 and 255
+    assert readings["cam00"].fault is None
+    assert str(readings["cam01"].fault).startswith("is empty")
+    assert read_masks({"cam00": MASK, "cam01": MASK // 255})["cam01"].fault is None  # 0 and 1 beside 0 and 255
 
 
 def test_a_trimap_is_cut_in_the_middle_of_its_band() -> None:
@@ -92,7 +93,7 @@ def test_a_trimap_is_cut_in_the_middle_of_its_band() -> None:
     trimap = np.where(distance < -8, 255, np.where(distance > 8, 0, 128)).astype(np.uint8)
     reading = read_masks({"cam00": trimap})["cam00"]
     assert reading.soft
-    assert "undecided" in reading.remark
+    assert "undecided" in str(reading.remark)
     assert np.abs(distance[(reading.share > 127) != (distance < 0)]).max(initial=0.0) < 1.0
 
 

@@ -4,8 +4,8 @@ import pytest
 
 from rig.errors import InputError
 from rig.formats.foreign_keys import ForeignKey
-from rig.formats.reading import Reading, listed, say_once, shown
-from rig.messages.message import texts_of
+from rig.formats.reading import Reading, say_once, shown, some_of
+from rig.messages.message import compose, texts_of
 
 TABLE = {
     "shutter": ForeignKey("refused", "calibrate without it", (0,)),
@@ -50,11 +50,11 @@ def test_what_cameras_have_alike_is_said_once() -> None:
 def test_cameras_that_take_no_part_are_named_where_too_few_are_left() -> None:
     reading = Reading("rig.xml")
     for name in ("a", "b"):
-        reading.leave_out(name, "not aligned")
+        reading.leave_out(name, compose("left-not-aligned"))
     with pytest.raises(InputError, match=r"a, b not aligned in rig\.xml: taking no part"):
         reading.finish([])
 
 
 def test_a_list_names_a_few() -> None:
-    assert listed(["a", "b"]) == "a, b"
-    assert listed(list("abcdef")) == "a, b, c, d and 2 more"
+    assert some_of(["a", "b"]) == ["a", "b"]
+    assert str(some_of(list("abcdef"))) == "a, b, c, d and 2 more"

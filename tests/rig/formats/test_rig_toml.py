@@ -143,7 +143,7 @@ def test_files_that_are_no_rig(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"start from deploy/rig\.example\.toml"):
         read_rig_config(tmp_path / "rig.toml")
     (tmp_path / "rig.toml").write_text("format = ")
-    with pytest.raises(InputError, match="is no TOML"):
+    with pytest.raises(InputError, match="cannot be read as TOML"):
         read_rig_config(tmp_path / "rig.toml")
 
 

@@ -32,7 +32,7 @@ def test_a_tag_and_a_pair_of_cameras_are_read() -> None:
     ("document", "faults"),
     [
         ([], ["wants one of points, tag, cameras, holds none of them"]),
-        ({"tag": {}, "cameras": []}, ["holds tag and cameras"]),
+        ({"tag": {}, "cameras": []}, ["holds tag, cameras"]),
         ({"points": {"a": POINT}, "distance_mm": 1}, ["two points"]),
         ({"points": {"a": POINT, "b": {"cam00": [1, 2]}}, "distance_mm": 1}, ["points.b", "two cameras or more"]),
         ({"points": {"a": POINT, "b": {"cam00": [1, 2], "cam9": [1, 2]}}, "distance_mm": 1}, ["points.b", "'cam9'"]),
@@ -40,7 +40,7 @@ def test_a_tag_and_a_pair_of_cameras_are_read() -> None:
             {"points": {"a": {**POINT, "cam00": ["x", 1]}, "b": {**POINT, "cam01": 3}}, "distance_mm": -4},
             ["distance_mm is -4", "points.a.cam00 is ['x', 1]", "points.b.cam01 is 3"],
         ),
-        ({"points": {"a": POINT, "b": POINT}, "distance_mm": 62}, ["a and b are one place in cam00 and cam01"]),
+        ({"points": {"a": POINT, "b": POINT}, "distance_mm": 62}, ["a, b are one place in cam00, cam01"]),
         (
             {"points": {"a": {**POINT, "cam00": [1e8, 2]}, "b": {**POINT, "cam01": [3, -40]}}, "distance_mm": 62},
             ["points.a.cam00 is [100000000.0, 2], wanted [x, y] in pixels, 0 to 20000", "points.b.cam01 is [3, -40]"],

@@ -17,7 +17,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import document_from_rig, rig_from_document
 from rig.formats.features_json import features_from_document
 from rig.geometry import RigidTransform
-from rig.messages.message import texts_of
+from rig.messages.message import Message, texts_of
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 
@@ -93,9 +93,9 @@ def faults_of_cameras(document: Any) -> list[str]:
 
 
 def faults_of_features(document: Any) -> list[str]:
-    faults: list[str] = []
+    faults: list[Message] = []
     features_from_document(document, RIG, faults)
-    return faults
+    return texts_of(faults)
 
 
 def agree(name: str, document: Any, faults: list[str]) -> None:

@@ -110,7 +110,7 @@ def test_what_cannot_be_filed_is_named(tmp_path: Path) -> None:
     assert checked(folder, {}, report=lambda *_: None)["faults"]
     document = (folder / "cameras.json").read_text()
     (folder / "cameras.json").write_text(document.replace('"0017"', '"0007"'))
-    with pytest.raises(InputError, match="cam00 and cam01 have the serial '0007': one body is one camera"):
+    with pytest.raises(InputError, match="cam00, cam01 have the serial '0007': one body is one camera"):
         read_capture(folder)
 
 

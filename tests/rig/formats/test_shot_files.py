@@ -145,7 +145,7 @@ def test_masks_that_nobody_can_file_are_one_sentence_with_the_remedy(folder: Pat
         path.rename(path.with_name(f"DSC_{number + 100}.png"))
     fault = only_fault(folder)
     assert fault == (
-        "no camera has a mask in masks/: the cameras are called cam00 to cam04, the masks DSC_100.png to DSC_104.png; "
+        "no camera has a mask in masks/: the cameras are called cam00 to cam04, the files DSC_100.png to DSC_104.png; "
         "rename either"
     )
 
