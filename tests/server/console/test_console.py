@@ -17,7 +17,7 @@ from rig.errors import InputError
 from rig.formats.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
-from rig.messages.message import verbatim
+from rig.messages.message import compose, verbatim
 from rig.rig import Rig
 from server.console import comparison, coverage, guides
 from server.console.identity import cookie_secret, is_foreign, is_rebound
@@ -238,15 +238,15 @@ def test_coverage_names_the_next_thing_to_do() -> None:
     everywhere = [[x, y] for x in np.linspace(0.02, 0.98, 9) for y in np.linspace(0.02, 0.98, 7)]
     corner = [[0.1, 0.1], [0.12, 0.2], [0.2, 0.12]]
     lines = coverage.summary(["a", "b", "c"], [])
-    assert "Hold the board" in coverage.advice(lines).text
+    assert coverage.advice(lines) == compose("board-hold")
     lines = coverage.summary(["a", "b", "c"], [{"a": everywhere, "b": corner, "c": []}])
     assert [line["covered"] for line in lines] == [1.0, round(1 / 12, 3), 0.0]
-    assert coverage.advice(lines).parameters["cameras"] == ("c",)
+    assert coverage.advice(lines) == compose("board-turn-to", cameras=["c"])
     lines = coverage.summary(["a", "b"], [{"a": everywhere, "b": corner}] * 6)
     assert [line["enough"] for line in lines] == [True, False]
-    assert coverage.advice(lines).text.startswith("Least covered: b")
+    assert coverage.advice(lines) == compose("board-cover", cameras=["b"])
     lines = coverage.summary(["a"], [{"a": everywhere}] * 6)
-    assert coverage.advice(lines).text == "Every camera is covered. Calibrate."
+    assert coverage.advice(lines) == compose("board-covered")
 
 
 def test_a_jobs_log_has_one_line_a_stage() -> None:

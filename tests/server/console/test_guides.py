@@ -8,7 +8,7 @@ import pytest
 from pipeline.alignment.feature_points import locate_features
 from pipeline.eigenheads.landmarks import NAMES
 from pipeline.settings import CLICK_NOISE_PX
-from rig.messages.message import texts_of
+from rig.messages.message import compose, texts_of
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from server.console import guides
@@ -61,8 +61,8 @@ def test_a_pick_that_contradicts_the_others_is_named_as_a_job_would(rig: Rig) ->
         "stomion": {"cam00": points["stomion"]["cam00"], "cam05": points["stomion"]["cam05"] + [0.0, 90.0]},
     }
     told = own.helps(wrong, {}, [])["contradictions"]
-    assert told["nasion"]["message"] == "feature nasion in cam04 contradicts the other views: that view is left out"
-    assert told["stomion"]["message"] == "feature stomion is left out: its views contradict each other"
+    assert told["nasion"] == compose("feature-view-contradicts", name="nasion", camera="cam04").document()
+    assert told["stomion"] == compose("feature-contradictory", name="stomion").document()
     assert sorted(one["message"] for one in told.values()) == sorted(
         texts_of(locate_features(wrong, rig, noise_px=CLICK_NOISE_PX).remarks)
     )
