@@ -45,7 +45,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     texturing = run(texture_head, context, views, head, refined)
     bust = run(fuse_bust, context, views, depth, refined, texturing.capture)
     pose = run(check_pose, context, faces, alignment, head, refined)
-    evidence = run(judge_head, context, views, alignment, head, refined, texturing)
+    evidence = run(judge_head, context, views, alignment, head, refined, texturing, pose)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(

@@ -150,6 +150,7 @@ class DenseSettings:
     pixel_mm: float = 0.4  # on the subject; finer photographs are reduced to it, for their noise is below 0.1 mm there
     reach_mm: float = 90.0  # behind the hull's front where the fitted head bounds nothing: hair is 60 mm thick at most
     behind_head_mm: float = 6.0  # the surface may lie that far behind the fitted head: its own error beside the face
+    before_head_mm: float = 60.0  # what stands before the fitted head: hair, a beard, a cap's brim
     labels: int = 41  # places along a ray in the first sweep: 2 mm apart in the deepest room, a pixel of quarter size
     contrast_levels: float = 30.0  # a pixel that differs by this from its window's middle weighs half
     angle_least_deg: float = 8.0  # between the views of a pair: nearer ones say little about depth

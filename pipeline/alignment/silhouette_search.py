@@ -26,6 +26,7 @@ from pipeline.fitting.photo.depth_search import pixels_per_mm
 from pipeline.fitting.problem import ContourProblem, Stage, State, first_evidence, make_problem, start_state
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import Settings
+from rig.camera import Camera
 from rig.errors import EigenheadError
 from rig.geometry import Similarity, nearest_rotation, rotation_from_vector
 from rig.messages.message import compose
@@ -100,6 +101,17 @@ def search_alignment(
     least, best = min(judged, key=lambda pair: pair[0])
     others = [cost for cost, pose in judged if turn_between_deg(pose, best) > OTHER_POSE_DEG]
     return FoundPose(best, min(others) / least - 1.0 if others and least > 0 else None)
+
+
+def moved_to_hull(
+    pose: Similarity, camera: Camera, model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig
+) -> Similarity:
+    """Returns a pose whose distance from a camera is not known, moved along its line of sight into the visual hull, and
+    scaled so that the camera sees the same. Raises NoSubject."""
+    origin = head_origin(model, silhouettes, rig, pose.rotation)
+    along = pose.translation - camera.centre_world
+    share = float((origin - camera.centre_world) @ along / (along @ along))
+    return Similarity(share * pose.scale, pose.rotation, camera.centre_world + share * along)
 
 
 def start_poses(

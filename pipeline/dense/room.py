@@ -24,6 +24,9 @@ STEPS = 128  # along a ray through the subject
 SLACK_PX = 1.0  # of the least size: a mask may be that narrow
 LEAST_ROOM_MM = 4.0
 BOUND_BLUR_PX = 1.0  # of the least size: the hull has creases that the subject does not have
+LOOSE_HULL_MM = (
+    30.0  # of a hull's front before the fitted head: 5 to 15 for cameras around a head, 100 for three in front
+)
 STEEPEST = 3.0  # slope against the image plane: 72 degrees
 
 
@@ -81,13 +84,38 @@ def _bounds(
     )  # fmt: skip
     room = near > 0.0
     near[room] -= step
-    far[room] = np.minimum(far[room], near[room] + settings.reach_mm)
-    if head_world is not None:
+    if head_world is None:
+        far[room] = np.minimum(far[room], near[room] + settings.reach_mm)
+    else:
         head, _ = depth_map(camera, head_world.vertices, head_world.faces)
-        seen = room & np.isfinite(head)
-        far[seen] = np.minimum(far[seen], head[seen] + settings.behind_head_mm)
+        _bound_by_head(near, far, room, head, settings)
     far[room] = np.maximum(far[room], near[room] + LEAST_ROOM_MM + step)
     return near, far
+
+
+def _bound_by_head(
+    near: Float32[np.ndarray, "h w"],
+    far: Float32[np.ndarray, "h w"],
+    room: Bool[np.ndarray, "h w"],
+    head: Float[np.ndarray, "h w"],
+    settings: DenseSettings,
+) -> None:
+    """Narrows the bounds in place to what may stand before and behind the fitted head, whose depths are ``head`` (mm,
+    infinite beside it).
+
+    Cameras that all stand on one side leave a hull that reaches decimetres before the face. There neither its front
+    nor what is ``reach_mm`` behind it says where the subject is: the head does, and beside it its nearest and farthest
+    places.
+    """
+    seen = room & np.isfinite(head)
+    if not seen.any() or np.median((head - near)[seen]) < LOOSE_HULL_MM:
+        far[room] = np.minimum(far[room], near[room] + settings.reach_mm)
+    else:
+        beside = room & ~seen
+        near[beside] = np.maximum(near[beside], float(head[seen].min()) - settings.before_head_mm)
+        far[beside] = np.minimum(far[beside], float(head[seen].max()) + settings.before_head_mm)
+        near[seen] = np.maximum(near[seen], head[seen] - settings.before_head_mm)
+    far[seen] = np.minimum(far[seen], head[seen] + settings.behind_head_mm)
 
 
 def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"], stack: Stack, view: int) -> Room:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from pipeline.alignment.silhouette_search import fan_strength
 from pipeline.diagnostics import ReportWarning
-from pipeline.faces.detection import FaceDetection
+from pipeline.faces.detection import CERTAIN_SCORE, FaceDetection
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.subject import SubjectFaces
 from rig.geometry import Similarity
@@ -39,6 +39,11 @@ class PoseEvidence:
     off: Mapping[str, float]
     rival: float | None
     doubtful: bool
+
+    @property
+    def is_on_face(self) -> bool:
+        """Whether two views or more show the face where the head has it, and none elsewhere."""
+        return len(self.off) >= MIN_VIEWS and max(self.off.values()) <= ELSEWHERE
 
 
 def judge_pose(
@@ -67,11 +72,14 @@ def judge_pose(
     if subject is not None and places is not None:
         off = landmark_offsets(subject, places, head_world, world_from_head, rig)
         elsewhere = [name for name, share in off.items() if share > ELSEWHERE]
-        if len(elsewhere) >= MIN_VIEWS and 2 * len(elsewhere) > len(off):
+        if elsewhere and 2 * len(elsewhere) > len(off):
             warnings.append(_elsewhere(elsewhere, off))
         facing = cameras_in_front(world_from_head, rig)
         if not off and len(facing) >= MIN_VIEWS:
             warnings.append(compose("no-face", views=len(facing)))
+    if subject is not None and subject.matched is not None and len(subject.matched.detections) < MIN_VIEWS:
+        alone = next(iter(subject.matched.detections))
+        warnings.append(compose("pose-doubtful", finding=compose("pose-one-view", camera=alone)))
     if rival is not None and rival < RIVAL_MARGIN:
         warnings.append(compose("pose-doubtful", finding=compose("pose-rival", share=rival)))
     if method == "silhouettes" and fan_strength(rig) > ONE_SIDED:
@@ -104,9 +112,12 @@ def cameras_in_front(world_from_head: Similarity, rig: Rig) -> tuple[str, ...]:
 
 
 def _seen(subject: SubjectFaces) -> dict[str, tuple[FaceDetection, ...]]:
-    """The subject's face by camera; where views do not agree on one, whatever each shows."""
+    """The subject's face by camera; where views do not agree on one, whatever each shows, but for doubtful faces in one
+    view alone."""
     if subject.matched is None:
-        return {name: faces for name, faces in subject.found.items() if faces}
+        seen = {name: faces for name, faces in subject.found.items() if faces}
+        doubtful = len(seen) < MIN_VIEWS and all(f.score < CERTAIN_SCORE for faces in seen.values() for f in faces)
+        return {} if doubtful else seen
     return {name: (face,) for name, face in subject.matched.detections.items()}
 
 

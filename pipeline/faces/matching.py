@@ -57,7 +57,7 @@ class MatchedFaces:
     view_noise_px: Mapping[str, float]  # of all pixels of a view together, along each axis
     points_world: Float[np.ndarray, "468 3"]
     covariances: Float[np.ndarray, "468 3 3"]  # mm^2
-    shared_mm: Float[np.ndarray, "m 468 3"]  # two modes a view
+    shared_mm: Float[np.ndarray, "m 468 3"]  # two modes a view; more where one view alone shows the face
     residuals_px: Mapping[str, Float[np.ndarray, "468 2"]]  # ``pixels`` minus projected points
     world_from_face: Similarity  # of a mean adult's points (``points.PointTable``)
     relief: float  # 1 for a mean face, 0 for a poster

@@ -1,8 +1,9 @@
 """How a face lies that one view alone shows, by the mean adult's points.
 
-Enters: a detection and its camera. Leaves: world_from_face. On rendered captures it is turned by 5 degrees against what
-all views say (median, to 75 degrees from the camera; 17 in profiles). Its distance follows from its size: 9 % off
-(RMS), 24 % in profiles, and as much as a head differs from the mean adult's.
+Enters: a detection and its camera. Leaves: world_from_face, and the points with what one view leaves open of them. On
+rendered captures it is turned by 5 degrees against what all views say (median, to 75 degrees from the camera; 17 in
+profiles). Its distance follows from its size: 9 % off (RMS), 24 % in profiles, and as much as a head differs from the
+mean adult's.
 """
 
 import cv2
@@ -10,12 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.faces.detection import FaceDetection
+from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import point_table
-from pipeline.faces.triangulated_face import unbiased_px
+from pipeline.faces.triangulated_face import point_noise_px, unbiased_px, view_noise_px
 from rig.camera import Camera
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 
 ROUNDS = 3  # of the pose, and the bias that follows from it
+DISTANCE_SHARE = 0.1  # standard deviation of the distance, by itself: measured, and by how heads differ
+TURN_RAD = 0.1  # the same of the turn about each axis
 MIN_COSINE = 0.2  # of the angle from a point's normal to the camera: those that it sees
 
 
@@ -35,6 +39,39 @@ def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | Non
         normals = point_table().normals @ placed.rotation.T
         seen = (normals * towards).sum(axis=1) > MIN_COSINE * np.linalg.norm(towards, axis=1)
     return placed
+
+
+def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces | None:
+    """Returns the face as ``matching`` hands it on, for a view that alone shows one. None as ``place_from_one_view``.
+
+    The pixels say where the points are across the line of sight. What they leave open moves all points together: along
+    their rays, and about the face's middle.
+    """
+    placed = place_from_one_view(face, camera)
+    if placed is None:
+        return None
+    points = placed.apply(point_table().shape_mm)
+    noise_px, view_px = (
+        point_noise_px(face.size_px, points, placed, camera),
+        view_noise_px(face.size_px, placed, camera),
+    )
+    along = points - camera.centre_world
+    px_mm = np.linalg.norm(along, axis=1) / camera.intrinsics.fx
+    turns = TURN_RAD * np.cross(np.eye(3)[:, None], (points - points.mean(axis=0))[None])
+    across = view_px * px_mm[None, :, None] * camera.camera_from_world.rotation[:2, None]
+    return MatchedFaces(
+        detections={name: face},
+        outliers={},
+        pixels={name: unbiased_px(face, placed, camera)},
+        noise_px={name: noise_px},
+        view_noise_px={name: view_px},
+        points_world=points,
+        covariances=((noise_px * px_mm) ** 2)[:, None, None] * np.eye(3),
+        shared_mm=np.concatenate([DISTANCE_SHARE * along[None], turns, across]),
+        residuals_px={name: unbiased_px(face, placed, camera) - camera.project(points)},
+        world_from_face=placed,
+        relief=1.0,
+    )
 
 
 def _pose(points: Float[np.ndarray, "n 3"], normalised: Float[np.ndarray, "n 2"]) -> RigidTransform | None:

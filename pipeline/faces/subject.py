@@ -23,7 +23,7 @@ from pipeline.faces.eyes import find_eyes
 from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, complete_match, find_subject_face
 from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import direction_from_face, point_table
-from pipeline.faces.single_view import place_from_one_view
+from pipeline.faces.single_view import match_alone
 from pipeline.faces.triangulated_face import TriangulatedFace
 from pipeline.multiview.spread_views import spread_views
 from rig.capture import ImageRgb
@@ -43,14 +43,12 @@ MIN_INSIDE = 0.6  # share of a face's points within a picture
 class SubjectFaces:
     """What was found in each view that was searched or looked at, best first, and the subject among it.
 
-    ``world_from_face`` says how the subject's face lies (``points.PointTable``): by its points in the world, or, where
-    one view alone shows a face, by the mean adult's (``single_view``).
+    Where one view alone shows a face, and that beyond doubt, its points are the mean adult's (``single_view``).
     """
 
     found: Mapping[str, tuple[FaceDetection, ...]]
-    matched: MatchedFaces | None  # None where no two views agree
+    matched: MatchedFaces | None  # None where views that show faces do not agree on one
     expected: tuple[str, ...]  # views towards which the matched face looks, and whose pictures hold it
-    world_from_face: Similarity | None = None
 
 
 def find_subject(
@@ -79,9 +77,9 @@ def find_subject(
     if not any(found.values()):
         found, face = _search(scene, in_order[:SMALL_FACE_VIEWS], find_small_faces, report)
     report(1.0)
-    matched = face and complete_match(face, found, views)
+    matched = complete_match(face, found, views) if face is not None else _matched_alone(found, views)
     if matched is None:
-        return SubjectFaces(found, None, (), _placed_alone(found, views))
+        return SubjectFaces(found, None, ())
     placed = matched.world_from_face
     with_eyes = {
         name: find_eyes(scene.pyramids[name], seen, networks)
@@ -89,7 +87,7 @@ def find_subject(
         else seen
         for name, seen in matched.detections.items()
     }
-    return SubjectFaces(found, replace(matched, detections=with_eyes), tuple(_expected(placed, views)), placed)
+    return SubjectFaces(found, replace(matched, detections=with_eyes), tuple(_expected(placed, views)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,13 +143,13 @@ def _next_view(left: Sequence[str], found: Mapping[str, tuple[FaceDetection, ...
     return min(left, key=lambda name: abs(apart_deg(name) - APART_DEG))
 
 
-def _placed_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> Similarity | None:
-    """How a face lies that is beyond doubt and the only one that any view shows."""
+def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> MatchedFaces | None:
+    """The face that is beyond doubt and the only one that any view shows."""
     seen = [(name, faces) for name, faces in found.items() if faces]
     if len(seen) != 1 or len(seen[0][1]) != 1 or seen[0][1][0].score < CERTAIN_SCORE:
         return None
     name, (face,) = seen[0]
-    return place_from_one_view(face, rig[name])
+    return match_alone(name, face, rig[name])
 
 
 def _look(

@@ -17,13 +17,12 @@ from pipeline.estimation.positive_definite import inverse
 from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.head_problem import started_problem
-from pipeline.fitting.noise_model import is_bare, with_misfit
+from pipeline.fitting.noise_model import is_bare, with_clutter_of_start, with_misfit
 from pipeline.fitting.problem import (
     FIRST_CORRELATION_PX,
     POSE,
     ContourProblem,
     LandmarkObservations,
-    RimNoise,
     Stage,
     StageEvidence,
     State,
@@ -87,6 +86,8 @@ def solve_contour(
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
+    if landmarks is not None:
+        evidence = with_clutter_of_start(problem, evidence, state, few)
     state, spent, reason = run_stage(problem, evidence, state, few, lambda f: report("fit", 0.2 * f))
     state, used, reason = run_stage(problem, evidence, state, span, lambda f: report("fit", 0.2 + 0.2 * f))
     tried, more, _ = run_stage(problem, evidence, state, whole, lambda f: report("fit", 0.4 + 0.1 * f))
@@ -147,7 +148,7 @@ def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
     """The evidence while residuals of that scale are let in: half of them counts as noise."""
     noise = evidence.noise
     unit = max(noise.unit, coarse_unit(scale_px))
-    return StageEvidence(RimNoise(unit, noise.floor_px, noise.clutter), evidence.photographs)
+    return replace(evidence, noise=replace(noise, unit=unit))
 
 
 def coarse_unit(scale_px: float) -> float:

@@ -11,6 +11,7 @@ from pipeline.fitting.problem import FIRST_NOISE_PX, ContourProblem, RimNoise, S
 from pipeline.fitting.rim import Rim
 from pipeline.fitting.rim_term import observed_rim
 
+START_CLUTTER_MM = 12.0
 BLOCK_PX = 20.0
 BARE_SLACK_PX = 0.1  # noise of a contour's RMS
 FLOOR_SIGMAS, FLOOR_MOST_PX = 3.0, 6.0
@@ -27,11 +28,25 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
     near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
     deviation = 1.4826 * float(np.median(np.abs(near))) if len(near) > 10 else FIRST_NOISE_PX
     floor = min(FLOOR_SIGMAS * deviation, FLOOR_MOST_PX)
-    clutter = evidence.noise.clutter
-    if clutter is None and not stage.whole_head:  # a bare head has none
-        clutter = find_clutter(problem, rim, max(CLUTTER_PX, CLUTTER_SIGMAS * deviation))
+    clutter, settled = evidence.noise.clutter, evidence.noise.is_settled
+    if not settled and not stage.whole_head:  # a bare head has none
+        clutter, settled = find_clutter(problem, rim, max(CLUTTER_PX, CLUTTER_SIGMAS * deviation)), True
     unit = estimated_unit(problem, rim, 2.0 * floor) or evidence.noise.unit
-    return StageEvidence(RimNoise(unit, floor, clutter), evidence.photographs)
+    return StageEvidence(RimNoise(unit, floor, clutter, settled), evidence.photographs)
+
+
+def with_clutter_of_start(
+    problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage
+) -> StageEvidence:
+    """The evidence with what no head makes of the outlines, where found landmarks say how the head lies.
+
+    Long hair before a face is wider than any face, and pulls the first modes to it before residuals could tell.
+    """
+    rim = observed_rim(problem, evidence, state, stage)
+    depths = [camera.camera_from_world.apply(state.world_from_head.translation)[2] for camera in problem.rig]
+    px_per_mm = float(np.median([c.intrinsics.fx / z for c, z in zip(problem.rig, depths, strict=True)]))
+    clutter = find_clutter(problem, rim, START_CLUTTER_MM * px_per_mm)
+    return replace(evidence, noise=replace(evidence.noise, clutter=clutter))
 
 
 def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:

@@ -122,11 +122,13 @@ class SurfaceObservations:
 class RimNoise:
     """How far an outline may be believed. ``unit``: l sigma^2 (px^3), what a px^2 of residual along a px of outline is
     divided by; ``floor_px``: no robust scale below this, three standard deviations of the model's misfit; ``clutter``:
-    per view, in cells, where the input is hair or clothes, None where nobody has looked."""
+    per view, in cells, where the input is hair or clothes, None where nobody has looked; ``is_settled``: whether that
+    comes from a fit, not from its start alone."""
 
     unit: float
     floor_px: float
     clutter: tuple[Bool[np.ndarray, "_ _"], ...] | None
+    is_settled: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

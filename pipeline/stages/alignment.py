@@ -5,7 +5,7 @@ from typing import Literal
 
 from pipeline.alignment.face_alignment import align_to_face, frontmost_camera
 from pipeline.alignment.landmarks import feature_alignment
-from pipeline.alignment.silhouette_search import search_alignment
+from pipeline.alignment.silhouette_search import moved_to_hull, search_alignment
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.model_basis import model_basis
 from pipeline.faces.landmark_map import landmark_map
@@ -55,9 +55,11 @@ def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> St
     if views.capture.features or face is None:
         return align_to_views(model, views, rig, settings, progress=context.progress)
     found = align_to_face(model, face, landmark_map(context.model))
-    facing, middle = found.world_from_head.rotation[:, 2], found.world_from_head.translation
-    front = settings.front or frontmost_camera(facing, middle, rig)
-    return Staged(Alignment(found.world_from_head, front, "landmarks", found.landmarks))
+    pose = found.world_from_head
+    if len(face.detections) == 1:  # one view does not tell the distance
+        pose = moved_to_hull(pose, rig[next(iter(face.detections))], model, views.silhouettes, rig)
+    front = settings.front or frontmost_camera(pose.rotation[:, 2], pose.translation, rig)
+    return Staged(Alignment(pose, front, "landmarks", found.landmarks))
 
 
 def align_to_views(

@@ -19,6 +19,7 @@ from pipeline.evidence.expression import (
 )
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
 from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines
+from pipeline.evidence.pose import PoseEvidence
 from pipeline.fitting.expression_evidence import makes_face
 from pipeline.fitting.fine.blink import blinks_of, with_lids
 from pipeline.fitting.fine.expression_reading import with_read_expression
@@ -58,10 +59,12 @@ def judge_head(
     head: HeadFit,
     refined: RefinedHead,
     texturing: Texturing,
+    pose: PoseEvidence,
 ) -> Staged[Evidence]:
     """Measures the delivered head, and warns of what heads, rigs and masks cannot be.
 
-    Raises UnexplainedOutlines where it explains hardly any outline, unless the settings let that pass."""
+    Raises UnexplainedOutlines where it explains hardly any outline and no found face says that it lies right (long hair
+    all around has outlines of its own), unless the settings let that pass."""
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)
     fitted = {name: np.isfinite(depth) for name, depth in texturing.depths.items()}
@@ -84,7 +87,7 @@ def judge_head(
     )
     warnings = plausibility_warnings(fit, model, cameras, widths_px)
     pixels_mm = {camera.name: pixel_mm(camera, fit.world_from_head.translation) for camera in rig}
-    unexplained = unexplained_outlines(cameras, pixels_mm)
+    unexplained = None if pose.is_on_face else unexplained_outlines(cameras, pixels_mm)
     if unexplained is not None and context.settings.unexplained_outlines == "refuse":
         raise UnexplainedOutlines(unexplained)
     warnings += [] if unexplained is None else [unexplained]

@@ -34,7 +34,7 @@ class HeadSeed:
 def find_head_seed(images: Mapping[str, ImageRgb], rig: Rig) -> HeadSeed | None:
     """Finds the subject's face in the photographs; None where no two of them agree on one."""
     face = find_subject(images, rig, _networks()).matched
-    if face is None:
+    if face is None or len(face.detections) < 2:  # one view does not tell the distance
         return None
     world_from_face = face.world_from_face
     centre = world_from_face.translation - world_from_face.scale * BEHIND_FACE_MM * face.facing_world

@@ -142,6 +142,7 @@ TEMPLATES = {
     "no-face": "no face was found in the photographs, though {views} cameras stand before the head as it was fitted: its pose comes from outlines alone. Look at the overlays; give feature points or --front where it is wrong",
     "pose-doubtful": "{finding}",
     "pose-rival": "another pose explains the outlines almost as well (its cost is {share:.1%} higher): look at the overlays; give feature points, --front or more views",
+    "pose-one-view": "{camera} alone shows the face: how it is turned is known to some ten degrees only: give feature points, or add views from the front",
     "pose-one-sided": "no face was found, and the cameras look from nearly one side: outlines hardly tell how the head nods: give feature points, or views from the side",
     "face-elsewhere": "the head's face is not where the photographs show one: in {cameras} it lies up to {sizes:.1f} face sizes away. Do not use this head: give feature points or --front, and check calibration and masks",
     "head-cut-off-at-side": "the head is cut off at the {side:word} of the image: move the camera back or turn it",

@@ -582,6 +582,7 @@ export default {
   "no-face": "in den Fotos wurde kein Gesicht gefunden, obwohl {views} Kameras vor dem Kopf stehen, wie er angepasst wurde: Seine Lage kommt allein aus Umrissen. Überlagerungen ansehen; wo sie falsch ist, Merkmale setzen oder --front angeben",
   "pose-doubtful": "{finding}",
   "pose-rival": "eine andere Lage erklärt die Umrisse fast ebenso gut (ihre Kosten sind {share:.1%} höher): Überlagerungen ansehen; Merkmale setzen, --front oder mehr Ansichten geben",
+  "pose-one-view": "nur {camera} zeigt das Gesicht: wie es gedreht ist, ist nur auf etwa zehn Grad bekannt: Merkmale angeben oder Ansichten von vorn hinzufügen",
   "pose-one-sided": "es wurde kein Gesicht gefunden, und die Kameras blicken fast von einer Seite: Konturen sagen kaum, wie der Kopf geneigt ist: Merkmale oder Ansichten von der Seite geben",
   "face-elsewhere": "das Gesicht des Kopfes ist nicht, wo die Fotos eines zeigen: in {cameras} liegt es bis zu {sizes:.1f} Gesichtsgrößen daneben. Diesen Kopf nicht verwenden: Merkmale setzen oder --front angeben und Kalibrierung und Masken prüfen",
   "head-cut-off-at-side": "der Kopf ist abgeschnitten ({side:word}): Kamera zurückstellen oder drehen",

@@ -1,5 +1,7 @@
 """A head is held against the faces that photographs show: in place, back to front, and where nobody found one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.evidence.pose import cameras_in_front, judge_pose
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.landmark_map import landmark_map
+from pipeline.faces.single_view import match_alone
 from pipeline.faces.subject import SubjectFaces
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
@@ -95,3 +98,22 @@ def test_outlines_of_one_side_alone_are_in_doubt(model: HeadModel) -> None:
 def test_a_rival_that_is_not_beaten_is_said(model: HeadModel, rig: Rig) -> None:
     pose = posed(0.0, rig)
     assert codes(model, pose, rig, faces_of(model, pose, rig, FACING), rival=0.01) == ["pose-doubtful"]
+
+
+def test_a_face_that_one_view_shows_elsewhere_is_told(model: HeadModel, rig: Rig) -> None:
+    pose = posed(0.0, rig)
+    assert "face-elsewhere" in codes(model, posed(60.0, rig), rig, faces_of(model, pose, rig, FACING[:1]))
+
+
+def test_a_doubtful_face_in_one_view_is_no_evidence(model: HeadModel, rig: Rig) -> None:
+    pose = posed(0.0, rig)
+    seen = faces_of(model, pose, rig, FACING[:1])
+    doubtful = {name: tuple(replace(face, score=3.0) for face in faces) for name, faces in seen.found.items()}
+    assert "face-elsewhere" not in codes(model, posed(60.0, rig), rig, replace(seen, found=doubtful))
+
+
+def test_a_pose_that_one_view_alone_tells_is_doubtful(model: HeadModel, rig: Rig) -> None:
+    pose = posed(0.0, rig)
+    seen = faces_of(model, pose, rig, FACING[:1])
+    alone = match_alone(FACING[0], seen.found[FACING[0]][0], rig[FACING[0]])
+    assert codes(model, pose, rig, replace(seen, matched=alone)) == ["pose-doubtful"]

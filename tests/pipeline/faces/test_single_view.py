@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.faces.single_view import place_from_one_view
+from pipeline.faces.points import point_table
+from pipeline.faces.single_view import DISTANCE_SHARE, match_alone, place_from_one_view
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import Similarity, look_at, rotation_from_vector, vector_from_rotation
 from tests.support.drawn_faces import seen_face
@@ -45,3 +46,27 @@ def test_points_outside_the_lens_are_no_pose() -> None:
     far_off = replace(face, landmarks_px=face.landmarks_px + (3000.0, 0.0))
     assert place_from_one_view(face, narrow) is not None
     assert place_from_one_view(far_off, narrow) is None
+
+
+def test_what_one_view_leaves_open_is_said() -> None:
+    """Along the rays a tenth of the distance, across them what pixels leave: a child's points are among the likely."""
+    child = Similarity(0.9, rotation_from_vector(np.array([0.1, -0.2, 0.0])), np.array([10.0, 5.0, 0.0]))
+    found = match_alone("front", seen_face(child, camera(), np.random.default_rng(0)), camera())
+    assert found is not None
+    assert list(found.detections) == ["front"]
+    modes = found.shared_mm.reshape(len(found.shared_mm), -1)
+    error = found.points_world - child.apply(point_table().shape_mm)
+    assert np.linalg.norm(error, axis=1).mean() > 90.0  # taken for an adult, farther away
+    covariance = modes.T @ modes
+    for k, block in enumerate(found.covariances):
+        covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += block
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), error.ravel())
+    assert (whitened**2).mean() < 2.0
+    along = found.points_world - camera().centre_world
+    assert np.allclose(found.shared_mm[0], DISTANCE_SHARE * along)
+
+
+def test_a_view_that_explains_no_face_matches_none() -> None:
+    face = seen_face(Similarity.identity(), camera(), np.random.default_rng(0))
+    narrow = replace(camera(), intrinsics=replace(camera().intrinsics, distortion=Distortion(k1=-0.28)))
+    assert match_alone("front", replace(face, landmarks_px=face.landmarks_px + (3000.0, 0.0)), narrow) is None
