@@ -41,11 +41,11 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     alignment = run(align_head, context, views, faces)
     labels, head = fit_shape(run, context, views, alignment)
     depth = run(measure_depth, context, views, head, labels)
-    refined = run(refine_head, context, views, head, labels, depth)
+    refined = run(refine_head, context, views, faces, head, labels, depth)
     texturing = run(texture_head, context, views, head, refined)
     bust = run(fuse_bust, context, views, depth, refined, texturing.capture)
     pose = run(check_pose, context, faces, alignment, head, refined)
-    evidence = run(judge_head, context, views, alignment, head, refined, texturing, pose)
+    evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing, pose)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(

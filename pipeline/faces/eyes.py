@@ -11,10 +11,15 @@ from jaxtyping import Float
 
 from pipeline.faces.crops import Crop, Pyramid, in_picture
 from pipeline.faces.detection import FaceDetection
+from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import EYE_SIZE, FaceNetworks
-from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS
+from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS, direction_from_face
+from rig.rig import Rig
 
 CROP_OF_WIDTH = 2.3  # side of an eye's crop by the distance of its corners, as the network was trained
+LIDS = {"right": slice(0, 16), "left": slice(16, 32)}  # rows of ``FaceDetection.lids_px``
+INNER, LOWER, UPPER = 8, slice(1, 8), slice(9, 16)  # of one eye's lids: its inner corner, and edges but for corners
+OPENING_VIEWS = 4  # the most frontal ones
 
 
 def find_eyes(pyramid: Pyramid, face: FaceDetection, networks: FaceNetworks) -> FaceDetection:
@@ -23,6 +28,37 @@ def find_eyes(pyramid: Pyramid, face: FaceDetection, networks: FaceNetworks) -> 
     left = _place(pyramid, face.landmarks_px[list(LEFT_EYE_CORNERS)], networks, mirrored=True)
     lids, irises = (np.concatenate(pair) for pair in zip(right, left, strict=True))
     return replace(face, irises_px=irises, lids_px=lids)
+
+
+def eye_openings(face: MatchedFaces, rig: Rig) -> dict[str, float]:
+    """Returns how far the lids of each eye (``right``, ``left``) stand apart, by the eye's length: the mean along the
+    lids, and the median of the most frontal views. An eye that no view looked at closely is left out.
+
+    On rendered heads of both models, 40 eyes of each state: open 0.12 to 0.25, half closed 0.07 to 0.17, closed 0.03 to
+    0.10; on six path-traced and scanned people: open 0.18 to 0.27, closed 0.03 to 0.05.
+    """
+    facing = {name: direction_from_face(face.world_from_face, rig[name]) for name in face.detections}
+    frontal = sorted(facing, key=lambda name: -facing[name][2])
+    openings: dict[str, float] = {}
+    for side, rows in LIDS.items():
+        views = [
+            _opening(lids[rows], facing[name])
+            for name in frontal
+            if (lids := face.detections[name].lids_px) is not None
+        ]
+        if views:
+            openings[side] = float(np.median(views[:OPENING_VIEWS]))
+    return openings
+
+
+def _opening(lids_px: Float[np.ndarray, "16 2"], direction: Float[np.ndarray, " 3"]) -> float:
+    """Height of the gap by the length between the corners, as if seen from the front."""
+    across = lids_px[INNER] - lids_px[0]
+    length = float(np.linalg.norm(across))
+    normal = np.array([-across[1], across[0]]) / length
+    gap = float(np.abs((lids_px[LOWER] - lids_px[UPPER]) @ normal).mean())
+    x, y, _ = direction
+    return gap / length * float(np.sqrt((1.0 - x * x) / (1.0 - y * y)))
 
 
 def _place(

@@ -23,11 +23,13 @@ from pipeline.evidence.pose import PoseEvidence
 from pipeline.fitting.expression_evidence import makes_face
 from pipeline.fitting.fine.blink import blinks_of, with_lids
 from pipeline.fitting.fine.expression_reading import with_read_expression
+from pipeline.fitting.fine.eyelids import MAX_CLOSED_OPENING, MIN_HALF_OPENING
 from pipeline.fitting.fine.refine import Displaced
 from pipeline.fitting.fit import Fit
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
@@ -55,6 +57,7 @@ class Evidence:
 def judge_head(
     context: ReconstructionContext,
     views: Views,
+    faces: Faces,
     alignment: Alignment,
     head: HeadFit,
     refined: RefinedHead,
@@ -91,7 +94,8 @@ def judge_head(
     if unexplained is not None and context.settings.unexplained_outlines == "refuse":
         raise UnexplainedOutlines(unexplained)
     warnings += [] if unexplained is None else [unexplained]
-    return Staged(evidence, [*warnings, *eye_warnings(shut_eyes(model, made) | closed_eyes)])
+    closed_eyes = confirmed_closed(shut_eyes(model, made) | closed_eyes, faces.eye_openings)
+    return Staged(evidence, [*warnings, *eye_warnings(closed_eyes)])
 
 
 def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced: Displaced) -> tuple[Fit, float]:
@@ -114,6 +118,14 @@ def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced:
         median=settings.expression_median,
     )
     return with_lids(read, model, lids), LEAST_SIGMA if read is fit else READ_SIGMA
+
+
+def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> frozenset[str]:
+    """Returns which eyes are closed, of what the head shows and how far the found lids stand apart: those decide where
+    they can."""
+    met = {side for side, opening in openings.items() if opening < MIN_HALF_OPENING}
+    apart = {side for side, opening in openings.items() if opening > MAX_CLOSED_OPENING}
+    return (closed | met) - apart
 
 
 def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:

@@ -1,7 +1,9 @@
 """The subject's face in the photographs: where it is, how it is turned, 468 landmarks on it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+from pipeline.faces.eyes import eye_openings
 from pipeline.faces.subject import SubjectFaces, find_subject
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged, stage
@@ -10,9 +12,13 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Faces:
-    """What the networks found; None where the settings do not ask them."""
+    """What the networks found; None where the settings do not ask them.
+
+    ``eye_openings``: how far the lids of each eye stand apart (``faces.eyes``), where the subject's face was found.
+    """
 
     subject: SubjectFaces | None
+    eye_openings: Mapping[str, float] = field(default_factory=dict)
 
 
 @stage("faces")
@@ -23,4 +29,4 @@ def find_faces(context: ReconstructionContext, capture: Capture) -> Staged[Faces
     subject = find_subject(
         capture.images, context.rig, context.networks, report=lambda share: context.progress("faces", share)
     )
-    return Staged(Faces(subject))
+    return Staged(Faces(subject, {} if subject.matched is None else eye_openings(subject.matched, context.rig)))

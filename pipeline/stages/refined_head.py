@@ -14,6 +14,7 @@ from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.fitting.untangling import untangled_head
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth, is_refined
+from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
@@ -37,7 +38,7 @@ class RefinedHead:
 
 @stage("fine")
 def refine_head(
-    context: ReconstructionContext, views: Views, head: HeadFit, labels: PartLabels, depth: Depth
+    context: ReconstructionContext, views: Views, faces: Faces, head: HeadFit, labels: PartLabels, depth: Depth
 ) -> Staged[RefinedHead]:
     """Deforms the fitted head to the dense surface where that shows enough of the face."""
     settings, fit, model, mesh = context.settings, head.fit, head.model, head.mesh_world
@@ -53,7 +54,7 @@ def refine_head(
         settings.fine,
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,
-        eyes=look_at_eyes(model, mesh.vertices, views.capture.images, context.rig),
+        eyes=look_at_eyes(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
         patches=patch_search(model, fit, depth.images, distances, hair, context.rig, settings.photo),
         report=context.progress,
     )

@@ -66,7 +66,9 @@ def judged_lids(
         shown = eyes.get(side)
         shut = shown is not None and shown.closed
         found[side] = 1.0 if shut and share >= SHUT else share
-        if shut and share < SHUT and half < OPEN:
+        if shown is not None and shown.is_surely_open:
+            found[side] = min(share, HALF)
+        if shown is not None and shut and share < SHUT and (half < OPEN or shown.is_surely_closed):
             otherwise.add(side)
     return found, frozenset(otherwise)
 

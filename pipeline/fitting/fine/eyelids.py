@@ -33,20 +33,34 @@ VIEWS, LEAST_FACING = 5, 0.6  # the most frontal cameras
 WHITE_CHROMA, WHITE_LIGHT, DARK_LIGHT = 0.5, 0.6, 0.35  # by the skin's
 WHITE_SHARE, DARK_SHARE = 0.05, 0.1  # of what is looked at; lashes of a closed eye are a line
 LEAST_VERTICES = 12
+MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.07, 0.1  # of lids that are half closed, and of lids that meet
 
 
 @dataclass(frozen=True, slots=True)
 class EyeEvidence:
-    """What the photographs show between the lids: shares of the opening, 0 to 1."""
+    """What the photographs show between the lids: shares of the opening, 0 to 1; and how far the lids stand apart where
+    a face was found (``faces.eyes.eye_openings``)."""
 
     white: float
     dark: float
     views: int
+    opening: float | None = None
+
+    @property
+    def is_surely_closed(self) -> bool:
+        """Whether the lids lie nearer to each other than any half closed ones."""
+        return self.opening is not None and self.opening < MIN_HALF_OPENING
+
+    @property
+    def is_surely_open(self) -> bool:
+        """Whether the lids stand farther apart than any closed ones."""
+        return self.opening is not None and self.opening > MAX_CLOSED_OPENING
 
     @property
     def closed(self) -> bool:
-        """Skin, and nothing else."""
-        return self.views > 0 and self.white < WHITE_SHARE and self.dark < DARK_SHARE
+        """Skin, and nothing else, between lids that do not surely stand apart; or lids that surely meet."""
+        nothing = self.views > 0 and self.white < WHITE_SHARE and self.dark < DARK_SHARE
+        return self.is_surely_closed or (nothing and not self.is_surely_open)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +95,7 @@ def look_at_eyes(
     vertices: Float[np.ndarray, "v 3"],
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
     rig: Rig,
+    openings: Mapping[str, float],
 ) -> dict[str, EyeEvidence]:
     """What shows between the lids of each eye (``right``, ``left``).
 
@@ -89,6 +104,7 @@ def look_at_eyes(
         vertices: the fitted head, full level, world frame, mm.
         images: photographs by camera, sRGB.
         rig: the cameras.
+        openings: of the lids of the found face, by side, where there is one.
     """
     normals = vertex_normals(vertices, model.levels["full"].faces)
     found = {}
@@ -103,7 +119,7 @@ def look_at_eyes(
         ]
         shares = [each for each in shares if each is not None]
         white, dark = np.median(shares, axis=0) if shares else (0.0, 0.0)
-        found[side] = EyeEvidence(float(white), float(dark), len(shares))
+        found[side] = EyeEvidence(float(white), float(dark), len(shares), openings.get(side))
     return found
 
 

@@ -1,12 +1,19 @@
 """Eyes of a found face: irises and lids where they are drawn, open or closed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.faces.crops import make_pyramid
-from pipeline.faces.detection import find_faces
-from pipeline.faces.eyes import find_eyes
+from pipeline.faces.detection import FaceDetection, find_faces
+from pipeline.faces.eyes import eye_openings, find_eyes
+from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import FaceNetworks, load_networks
+from pipeline.faces.points import point_table
+from rig.camera import Camera, Intrinsics
+from rig.geometry import Similarity, look_at
+from rig.rig import Rig
 from tests.support.drawn_faces import drawn_face, turned_about
 
 
@@ -52,3 +59,40 @@ def test_the_two_eyes_of_a_symmetric_face_are_alike(networks: FaceNetworks) -> N
         right, left = points[: len(points) // 2], points[len(points) // 2 :]
         assert np.abs((640.0 - left[:, 0]) - right[:, 0]).max() < 1.5
         assert np.abs(left[:, 1] - right[:, 1]).max() < 1.5
+
+
+def planted(openings: tuple[float, float], direction: np.ndarray) -> MatchedFaces:
+    """A face whose lids stand apart by shares of the eye's length, as a camera in that direction sees it."""
+    x, y, _ = direction
+    across, up = np.sqrt(1.0 - x * x), np.sqrt(1.0 - y * y)
+    lids = []
+    for middle, opening in zip(((300.0, 200.0), (420.0, 210.0)), openings, strict=True):
+        along = np.linspace(-30.0, 30.0, 9)
+        half = 0.5 * 60.0 * opening
+        lower = np.column_stack([along, np.where(abs(along) < 29.0, half, 0.0)])
+        upper = np.column_stack([along[1:-1], np.full(7, -half)])
+        lids.append(np.concatenate([lower, upper]) * (across, up) + middle)
+    points = point_table().shape_mm
+    face = FaceDetection(np.zeros((468, 2)), np.zeros(468), 30.0, np.zeros(4), 0.0, lids_px=np.concatenate(lids))
+    other = replace(face, lids_px=None)
+    faces = {"cam00": face, "cam01": other}
+    empty = np.zeros((468, 3, 3))
+    return MatchedFaces(faces, {}, {}, {}, {}, points, empty, np.zeros((0, 468, 3)), {}, Similarity.identity(), 1.0)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 30.0, -45.0])
+def test_openings_are_as_if_seen_from_the_front(yaw_deg: float) -> None:
+    direction = np.array([np.sin(np.radians(yaw_deg)), 0.1, np.cos(np.radians(yaw_deg))])
+    direction /= np.linalg.norm(direction)
+    k = Intrinsics(640, 480, 800.0, 800.0, 319.5, 239.5)
+    pose = look_at(1000.0 * direction, np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    rig = Rig((Camera("cam00", k, pose), Camera("cam01", k, pose)))
+    found = eye_openings(planted((0.2, 0.05), direction), rig)
+    assert found == pytest.approx({"right": 0.2, "left": 0.05}, abs=1e-6)
+
+
+def test_eyes_that_nobody_looked_at_have_no_opening() -> None:
+    face = planted((0.2, 0.2), np.array([0.0, 0.0, 1.0]))
+    pose = look_at(np.array([0.0, 0.0, 1000.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    rig = Rig((Camera("cam01", Intrinsics(640, 480, 800.0, 800.0, 319.5, 239.5), pose),))
+    assert eye_openings(replace(face, detections={"cam01": face.detections["cam01"]}), rig) == {}

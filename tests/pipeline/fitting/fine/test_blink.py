@@ -73,3 +73,21 @@ def test_a_model_that_does_not_blink_says_nothing_of_lids() -> None:
     fit = fit_of(model)
     assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), {}) == ({}, frozenset())
     assert not blink_shift(fit, model, {}).any()
+
+
+def test_lids_that_the_found_face_shows_apart_are_not_closed(model: HeadModel) -> None:
+    """The photographs show no white between them, and the points lie as if they were closed."""
+    fit = fit_of(model)
+    surface = points_of(model, with_lids(fit, model, {"left": 1.0}))
+    apart = {"left": EyeEvidence(0.0, 0.01, 5, opening=0.2)}
+    lids, otherwise = judged_lids(fit, model, head_of(model, fit), surface, apart)
+    assert lids["left"] == 0.5
+    assert not otherwise
+
+
+def test_lids_that_the_found_face_shows_together_are_closed(model: HeadModel) -> None:
+    """Dark lashes, and points that say that the model's blink does not fit."""
+    fit = fit_of(model)
+    together = {"left": EyeEvidence(0.1, 0.3, 5, opening=0.04)}
+    _, otherwise = judged_lids(fit, model, head_of(model, fit), points_of(model, fit), together)
+    assert otherwise == {"left"}
