@@ -18,11 +18,11 @@ from rig.formats.shot_files import BESIDE_PICTURES, find_files, listed_pictures
 from rig.messages.message import MessageDocument, compose, documents_of, texts_of
 from rig.progress import Progress
 from server.cli.answers import service_settings
-from server.cli.reconstruct_local import folder_of
 from server.tasks.child import WorkFailed
 from server.tasks.ingest import check_capture
 from server.tasks.photographs import photographs_alone, read_scaled_capture
 from server.tasks.prepare import prepare_kernels
+from server.tasks.reconstruct_folder import folder_of
 
 if TYPE_CHECKING:
     from pipeline.imaging.silhouette import Silhouette

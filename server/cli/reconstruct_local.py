@@ -1,25 +1,22 @@
 """``eigenhead reconstruct``: one capture without the service, in this process."""
 
 import json
-import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from functools import partial
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.errors import InputError
-from rig.formats.archive import extract_archive
 from rig.formats.capture_folder import capture_root
 from rig.formats.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
 from server.cli.answers import CannotWrite, SpoilsCapture
 from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
-from server.tasks.prepare import prepare_kernels
+from server.tasks.child import Bench
 from server.tasks.progress import JobProgress
+from server.tasks.reconstruct_folder import folder_of, reconstruct_folder
 
 if TYPE_CHECKING:
     from pipeline.results.report_types import Report as ReportDocument
@@ -67,17 +64,6 @@ def reconstruct_locally(
 def _reconstruct_folder(
     folder: Path, out: Path, *, kept: Path, model: str | None, chosen: "Settings", report: Progress
 ) -> None:
-    from server.tasks.photographs import keep_masks, read_or_calibrate
-
-    prepared = read_or_calibrate(folder, kept, front=chosen.front, report=report)
-    shot, rig = prepared.capture, prepared.rig
-    prepare_kernels(report, chosen)
-    from pipeline.eigenheads.model import load_model
-    from pipeline.reconstruct import reconstruct
-    from pipeline.results.write import write_result
-    from pipeline.stages.context import ReconstructionContext
-    from pipeline.templates.load import load_template
-    from rig.render.renderer import Renderer
     from server.tasks.stage_durations import StageDurations
 
     durations = StageDurations()
@@ -87,15 +73,10 @@ def _reconstruct_folder(
         progress.report(stage, fraction)
         report(stage, progress.progress())
 
-    tell("read", 0.0)
-    head_model = load_model(model or "default")
-    template = load_template(chosen.outputs.template, head_model)
-    with Renderer.create() as renderer:
-        segment = partial(keep_masks, kept)
-        done = reconstruct(ReconstructionContext(shot, rig, head_model, chosen, renderer, tell, segment))
-    done = replace(done, warnings=(*prepared.warnings, *done.warnings))
-    tell("write", 0.0)
-    write_result(out, done, shot, template)
+    with closing(Bench()) as bench:
+        reconstruct_folder(
+            bench, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, ahead=report
+        )  # fmt: skip
     durations.learn(chosen, progress.finish())
 
 
@@ -121,14 +102,3 @@ def _result_folder(out: Path) -> Iterator[Path]:
         except OSError as error:
             raise CannotWrite(out, error) from error
         yield fresh
-
-
-@contextmanager
-def folder_of(capture: Path) -> Iterator[Path]:
-    """A capture folder, or what is in an archive of one for as long as it is needed. Raises InputError."""
-    if capture.is_dir():
-        yield capture
-        return
-    with tempfile.TemporaryDirectory() as scratch:
-        extract_archive(capture, Path(scratch) / "capture")
-        yield Path(scratch) / "capture"

@@ -19,9 +19,10 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing.connection import Connection
+from types import MappingProxyType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from rig.errors import Cancelled, EigenheadError, InputError
@@ -65,12 +66,19 @@ class Bench:
             self._things[name] = self._stack.enter_context(thing) if hasattr(thing, "__exit__") else thing
         return self._things[name]
 
+    def close(self) -> None:
+        """Closes what is kept, the newest first."""
+        self._things.clear()
+        self._stack.close()
+
 
 class Child:
-    """One child process; a call starts it when there is none. Not for two threads at once."""
+    """One child process; a call starts it when there is none. Not for two threads at once.
 
-    def __init__(self, niceness: int = 0) -> None:
-        self._niceness = niceness
+    ``variables``: of its environment, over those of this process."""
+
+    def __init__(self, niceness: int = 0, variables: Mapping[str, str] = MappingProxyType({})) -> None:
+        self._niceness, self._variables = niceness, dict(variables)
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
 
@@ -122,8 +130,9 @@ class Child:
         ours, theirs = socket.socketpair()
         command = python_command("tasks.child", str(theirs.fileno()), str(self._niceness))
         with theirs:
+            environment = python_environment() | self._variables
             self._process = subprocess.Popen(
-                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=2, env=python_environment()
+                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=2, env=environment
             )
         self._connection = Connection(ours.detach())
         return self._connection

@@ -36,6 +36,7 @@ from rig.errors import Cancelled, InputError
 from rig.messages.message import MessageDocument, compose
 from server.errors import Refused, unusable_input
 from server.problem_types import type_of_failure
+from server.processes import process_identity
 from server.services import calibrations
 from server.services.failures import JobFailed
 from server.services.jobs import DELIVERY, WORKFLOW
@@ -51,7 +52,7 @@ from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
 from server.worker.engine import engine_config, take_over
-from server.worker.heartbeat import dead_workers, process_identity
+from server.worker.heartbeat import dead_workers
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 

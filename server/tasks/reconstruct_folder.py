@@ -1,0 +1,96 @@
+"""A capture as it lies on somebody's disk, made a result folder: an archive is unpacked, cameras and masks that are
+missing are found and kept. The command line's way; a job of the service has its capture taken in before."""
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rig.formats.archive import extract_archive
+from rig.progress import Progress
+from server.processes import end_with_parent, share_one_heap
+from server.tasks.child import Bench
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
+
+
+@contextmanager
+def folder_of(capture: Path) -> Iterator[Path]:
+    """A capture folder, or what is in an archive of one for as long as it is needed. Raises InputError."""
+    if capture.is_dir():
+        yield capture
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        extract_archive(capture, Path(scratch) / "capture")
+        yield Path(scratch) / "capture"
+
+
+def reconstruct_folder(
+    bench: Bench,
+    report: Progress,
+    *,
+    folder: Path,
+    out: Path,
+    kept: Path,
+    model: str | None,
+    chosen: "Settings",
+    ahead: Progress,
+) -> None:
+    """Reconstructs a capture folder into ``out``. ``kept`` is where cameras and masks that had to be found stay,
+    whatever comes after; ``ahead`` is told of what comes before the first stage: cameras, loops.
+
+    Raises what the pipeline raises, and OSError for a full disk."""
+    from server.tasks.photographs import keep_masks, read_or_calibrate
+    from server.tasks.prepare import prepare_kernels
+
+    prepared = read_or_calibrate(folder, kept, front=chosen.front, report=ahead)
+    kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
+    bench.keep(f"loops {kind}", lambda: prepare_kernels(ahead, chosen))
+    from pipeline.eigenheads.model import load_model
+    from pipeline.reconstruct import reconstruct
+    from pipeline.results.write import write_result
+    from pipeline.stages.context import ReconstructionContext
+    from pipeline.templates.load import load_template
+    from rig.render.renderer import Renderer
+
+    report("read", 0.0)
+    name = model or "default"
+    head_model = bench.keep(f"model {name}", lambda: load_model(name))
+    template = load_template(chosen.outputs.template, head_model)
+    renderer = bench.keep("renderer", Renderer.create)
+    segment = partial(keep_masks, kept)
+    context = ReconstructionContext(prepared.capture, prepared.rig, head_model, chosen, renderer, report, segment)
+    done = reconstruct(context)
+    done = replace(done, warnings=(*prepared.warnings, *done.warnings))
+    report("write", 0.0)
+    write_result(out, done, prepared.capture, template)
+
+
+def reconstruct_beside(
+    bench: Bench,
+    report: Progress,
+    *,
+    parent: int,
+    capture: str,
+    result: str,
+    scratch: str,
+    model: str | None,
+    settings: Mapping[str, object],
+) -> None:
+    """In a child of the process ``parent``: reconstructs a capture folder or archive into the new folder ``result``;
+    all that is temporary lies in the folder ``scratch``."""
+    end_with_parent(parent)
+    share_one_heap()
+    from pipeline.settings import settings_from_document
+
+    os.environ["TMPDIR"] = tempfile.tempdir = scratch
+    chosen, out = settings_from_document(settings), Path(result)
+    with folder_of(Path(capture)) as folder:
+        reconstruct_folder(
+            bench, report, folder=folder, out=out, kept=out, model=model, chosen=chosen, ahead=report
+        )  # fmt: skip
