@@ -94,6 +94,7 @@ LONG_FOR_A_REASON = {
 
 MANY_FOR_A_REASON = {
     "server.cli.heads.reconstruct": "each is an option of a command",
+    "server.cli.batch.batch": "each is an option of a command",
     "server.cli.experiments.experiments": "each is an option of a command",
     "server.cli.heads.simulate": "each is an option of a command",
     "pipeline.dense.window_bias_kernels.windowed_heights": "a compiled loop over a thread's share of plain arrays",

@@ -107,6 +107,15 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
     return parts, hashlib.sha256(raw).hexdigest()
 
 
+def expression_names(path: Path) -> tuple[str, ...]:
+    """Returns the names of a model's expressions without reading its shapes. Raises BadModel."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return tuple(json.loads(file["meta"].tobytes()).get("expressions", ()))
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
+        raise BadModel(path, f"damaged or incomplete ({fault})") from None
+
+
 def _parts(meta: dict, file: Mapping[str, np.ndarray]) -> ModelParts:
     mean = file["mean"]
     return ModelParts(

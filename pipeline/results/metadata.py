@@ -1,14 +1,11 @@
 """What files say of themselves: model, version, unit, frame, and what the job that made them was given. No ids and no
 times, so that the bytes repeat."""
 
-import hashlib
-import json
-from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.settings import document_from_settings
+from pipeline.settings import document_from_settings, document_sha256
 
 
 def ply_comments(result: Reconstruction) -> list[str]:
@@ -34,11 +31,6 @@ def asset_extras(result: Reconstruction) -> dict[str, Any]:
         "settings_sha256": document_sha256(document_from_settings(result.settings)),
         "version": version("eigenhead"),
     }
-
-
-def document_sha256(document: Mapping[str, Any]) -> str:
-    """sha256 of the canonical JSON of a document."""
-    return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def _ascii(text: str) -> str:

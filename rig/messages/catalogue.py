@@ -7,9 +7,9 @@ A new message: its code and template in a module of ``rig/messages/english``, it
 from collections.abc import Mapping
 from types import MappingProxyType, ModuleType
 
-from rig.messages.english import calibration, cameras, formats, general, pipeline, rig, server
+from rig.messages.english import batch, calibration, cameras, formats, general, pipeline, rig, server
 
-AREAS: tuple[ModuleType, ...] = (calibration, cameras, formats, general, pipeline, rig, server)
+AREAS: tuple[ModuleType, ...] = (batch, calibration, cameras, formats, general, pipeline, rig, server)
 
 
 def _all() -> dict[str, str]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 app = typer.Typer(rich_markup_mode=None)
 
 
-def _of_setting(name: str) -> Callable[[], tuple[str, ...]]:
+def of_setting(name: str) -> Callable[[], tuple[str, ...]]:
     """What a setting of the pipeline may be."""
 
     def choices() -> tuple[str, ...]:
@@ -43,7 +43,7 @@ def _of_setting(name: str) -> Callable[[], tuple[str, ...]]:
     return choices
 
 
-def _of_output(name: str) -> Callable[[], tuple[str, ...]]:
+def of_output(name: str) -> Callable[[], tuple[str, ...]]:
     """The same of a setting of the outputs."""
 
     def choices() -> tuple[str, ...]:
@@ -60,7 +60,7 @@ def _templates() -> tuple[str, ...]:
     return tuple(list_templates())
 
 
-def _formats(value: str | None) -> str | None:
+def format_names(value: str | None) -> str | None:
     """A callback: names of ``FORMATS`` with commas between."""
     from pipeline.settings import FORMATS
 
@@ -75,18 +75,19 @@ def _formats(value: str | None) -> str | None:
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
-    method: Annotated[str | None, chosen("contour (the default) or simplex.", _of_setting("method"))] = None,
+    method: Annotated[str | None, chosen("contour (the default) or simplex.", of_setting("method"))] = None,
     model: Annotated[
         str | None,
         typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
-    detail: Annotated[str | None, chosen("span, kernel, photo or fine (the default).", _of_setting("detail"))] = None,
-    surface: Annotated[str | None, chosen("head, bust or both (the default).", _of_output("surface"))] = None,
+    detail: Annotated[str | None, chosen("span, kernel, photo or fine (the default).", of_setting("detail"))] = None,
+    surface: Annotated[str | None, chosen("head, bust or both (the default).", of_output("surface"))] = None,
     formats: Annotated[
         str | None,
         typer.Option(
-            help="Of the head: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.", callback=_formats
+            help="Of the head: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.",
+            callback=format_names,
         ),
     ] = None,
     delight: Annotated[
@@ -115,7 +116,8 @@ def reconstruct(
     json_out: Json = False,
 ) -> None:
     """Reconstruct one capture without the service."""
-    from server.cli.reconstruct_local import reconstruct_locally, settings_document
+    from server.cli.reconstruct_local import reconstruct_locally
+    from server.tasks.settings_file import settings_document
 
     switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
     switches |= {"neutral": neutral, "morphs": morphs}
@@ -144,7 +146,7 @@ def check(
 
     Status 2 where it cannot be reconstructed; with warnings it can, and the status is 0."""
     from server.cli.check import checked, lines
-    from server.cli.reconstruct_local import settings_document
+    from server.tasks.settings_file import settings_document
 
     with progress_bar() as report:
         document = settings_document(settings, texture={"chart": True} if chart else None)
@@ -177,8 +179,8 @@ def verify(
     """Judge a rig by a mannequin of known shape.
 
     Status 1 where a limit is missed."""
-    from server.cli.reconstruct_local import settings_document
     from server.cli.verify import LimitsMissed, lines, read_limits, verify_captures
+    from server.tasks.settings_file import settings_document
 
     wanted, chosen = read_limits(limits), settings_document(settings)
     prepare_file(out / "report.json")

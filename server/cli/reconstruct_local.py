@@ -1,13 +1,11 @@
 """``eigenhead reconstruct``: one capture without the service, in this process."""
 
 import json
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rig.errors import InputError
 from rig.formats.capture_folder import capture_root
 from rig.formats.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
@@ -21,25 +19,6 @@ from server.tasks.reconstruct_folder import folder_of, reconstruct_folder
 if TYPE_CHECKING:
     from pipeline.results.report_types import Report as ReportDocument
     from pipeline.settings import Settings
-
-
-def settings_document(path: Path | None, **given: str | Mapping[str, object] | None) -> dict[str, object]:
-    """Settings from a TOML or JSON file, then from options; tables are merged. Raises InputError."""
-    document: dict[str, object] = {}
-    if path is not None:
-        try:
-            text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
-            braced = path.suffix == ".json" or (path.suffix != ".toml" and text.lstrip().startswith("{"))
-            document = json.loads(text) if braced else tomllib.loads(text)
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(path.name, [f"cannot be read ({error})"]) from error
-        if not isinstance(document, dict):
-            raise InputError(path.name, ["is no table of settings"])
-    for name, value in given.items():
-        old = document.get(name)
-        if value is not None:
-            document[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, Mapping) else value
-    return document
 
 
 def reconstruct_locally(

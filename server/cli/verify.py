@@ -78,7 +78,7 @@ def verify_captures(
 def read_limits(path: Path | None) -> "Limits":
     """Limits of a TOML or JSON file over the defaults. Raises InputError."""
     from pipeline.verification.limits import limits_from_document
-    from server.cli.reconstruct_local import settings_document
+    from server.tasks.settings_file import settings_document
 
     return limits_from_document(settings_document(path), path.name if path else "limits")
 

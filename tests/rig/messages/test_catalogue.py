@@ -45,7 +45,6 @@ RAW = {
     "server/cli/demo.py": 1,
     "server/cli/doctor.py": 2,
     "server/cli/real.py": 1,
-    "server/cli/reconstruct_local.py": 2,
     "server/cli/refine.py": 2,
     "server/cli/studio.py": 1,
     "server/cli/verify.py": 4,

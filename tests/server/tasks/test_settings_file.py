@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rig.errors import InputError
-from server.cli.reconstruct_local import settings_document
+from server.tasks.settings_file import settings_document
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,206 @@
+"""The captures of a batch: those below a folder, or those that a list names with subject, session and settings.
+
+A name is a path of its own below ``OUT``. A list is a text file with a capture a line (``#`` begins a remark), or a CSV
+file whose first row names its columns; its paths count from where the list lies.
+"""
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+from rig.errors import InputError
+from rig.formats.cameras_file import find_rig_file
+from rig.formats.picture_names import is_junk
+from rig.formats.shot_files import BESIDE_PICTURES, listed_pictures
+from rig.messages.message import Message, compose
+from rig.text import suggest
+from server.tasks.settings_file import read_settings_file
+
+ARCHIVES = (".tar.gz", ".tgz", ".tar", ".zip")
+COLUMNS = ("capture", "name", "subject", "session", "settings")
+MIN_PICTURES = 3  # of a folder of photographs alone: fewer are no capture, and perhaps somebody's notes
+TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html")  # of OUT itself
+NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class BatchCapture:
+    """``name``: of its result folder; ``settings``: what its row says, over those of the whole batch."""
+
+    name: str
+    path: Path
+    subject: str = ""
+    session: str = ""
+    settings: Mapping[str, object] = field(default=NO_SETTINGS)
+
+
+def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
+    """Returns every capture below a folder, by name; ``out`` and results elsewhere are passed over.
+
+    Raises InputError where there is none, where the folder itself is one, and naming all that would share a name."""
+    if is_capture(folder) and (find_rig_file(folder) is not None or (folder / "images").is_dir()):
+        raise InputError(folder.name, [compose("batch-folder-is-capture")])
+    found = [BatchCapture(_name(path, folder), path) for path in _walk(folder, out.resolve())]
+    if not found:
+        raise InputError(folder.name, [compose("batch-folder-empty")])
+    faults = _name_faults(found, [capture.path.relative_to(folder).as_posix() for capture in found])
+    if faults:
+        raise InputError(folder.name, faults)
+    return tuple(sorted(found, key=lambda capture: capture.name))
+
+
+def is_capture(path: Path) -> bool:
+    """Whether a file is an archive, or a folder holds cameras or photographs."""
+    if path.is_file():
+        return is_archive(path)
+    if find_rig_file(path) is not None or (path / "images").is_dir():
+        return True
+    return len(listed_pictures(path)) >= MIN_PICTURES
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a file's name is that of an archive."""
+    return path.name.lower().endswith(ARCHIVES)
+
+
+def read_list(path: Path) -> tuple[BatchCapture, ...]:
+    """Reads a list of captures, in its order. Raises InputError naming every fault with its line."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise InputError(path.name, [compose("batch-list-unreadable", reason=str(error))]) from error
+    faults: list[Message] = []
+    rows = list(_csv_rows(text, faults) if _is_csv(path, text) else _text_rows(text))
+    found, lines = [], []
+    for line, row in rows:
+        wrong: list[Message] = []
+        found.append(_capture_of(row, path.parent, wrong))
+        lines.append(line)
+        faults += [compose("batch-line", line=line, fault=fault) for fault in wrong]
+    if not rows and not faults:
+        faults.append(compose("batch-list-empty"))
+    told = [compose("batch-line-number", line=line) for line in lines]
+    faults += _name_faults([capture for capture in found if capture.name], [message.text for message in told])
+    if faults:
+        raise InputError(path.name, faults)
+    return tuple(found)
+
+
+def _walk(folder: Path, out: Path) -> Iterator[Path]:
+    for path in sorted(folder.iterdir()):
+        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth"):
+            continue
+        if is_capture(path):
+            yield path
+        elif path.is_dir() and not path.is_symlink() and not (path / "report.json").is_file():
+            yield from () if path.name in BESIDE_PICTURES else _walk(path, out)
+
+
+def _name(path: Path, folder: Path) -> str:
+    """The path below ``folder`` without an archive's ending, and where it is elsewhere its last part."""
+    below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.resolve().name)
+    name = below.as_posix()
+    if path.is_dir():
+        return name
+    ending = next((ending for ending in ARCHIVES if name.lower().endswith(ending)), "")
+    return name[: len(name) - len(ending)]
+
+
+def _is_csv(path: Path, text: str) -> bool:
+    first = text.lstrip().partition("\n")[0]
+    return path.suffix.lower() == ".csv" or "capture" in (cell.strip() for cell in first.split(","))
+
+
+def _text_rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
+    for number, line in enumerate(text.splitlines(), 1):
+        capture = line.strip()
+        if capture and not capture.startswith("#"):
+            yield number, {"capture": capture}
+
+
+def _csv_rows(text: str, faults: list[Message]) -> Iterator[tuple[int, dict[str, str]]]:
+    reader = csv.reader(text.splitlines(keepends=True), skipinitialspace=True)
+    header = [cell.strip() for cell in next(reader, [])]
+    faults += _header_faults(header)
+    if "capture" not in header:
+        return
+    for cells in reader:
+        if not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#"):
+            continue
+        if len(cells) > len(header):
+            fault = compose("batch-cells-many", cells=len(cells), columns=len(header))
+            faults.append(compose("batch-line", line=reader.line_num, fault=fault))
+            continue
+        yield reader.line_num, {name: cell.strip() for name, cell in zip(header, cells, strict=False)}
+
+
+def _header_faults(header: list[str]) -> list[Message]:
+    faults = []
+    if "capture" not in header:
+        faults.append(compose("batch-column-missing", columns=header or ["-"]))
+    for name in header:
+        if name not in COLUMNS:
+            near = suggest(name, COLUMNS)
+            faults.append(
+                compose("batch-column-unknown-near", column=f"{name!r}", near=near[0])
+                if near
+                else compose("batch-column-unknown", column=f"{name!r}", known=COLUMNS)
+            )
+    faults += [compose("batch-column-twice", column=name) for name, count in Counter(header).items() if count > 1]
+    return faults
+
+
+def _capture_of(row: Mapping[str, str], folder: Path, faults: list[Message]) -> BatchCapture:
+    settings: dict[str, object] = {}
+    if row.get("settings"):
+        try:
+            settings = _settings_of(row["settings"], folder)
+        except InputError as error:
+            faults += error.located()
+    if not row.get("capture"):
+        faults.append(compose("batch-capture-unnamed"))
+        return BatchCapture("", folder)
+    path = folder / Path(row["capture"]).expanduser()
+    if not path.exists():
+        faults.append(compose("batch-capture-missing", path=str(path)))
+    elif not path.is_dir() and not is_capture(path):
+        faults.append(compose("batch-capture-strange", path=str(path)))
+    name = row.get("name") or _name(path, folder)
+    return BatchCapture(name, path, row.get("subject", ""), row.get("session", ""), MappingProxyType(settings))
+
+
+def _settings_of(text: str, folder: Path) -> dict[str, object]:
+    """A cell: a JSON object, or a file that holds one, or TOML."""
+    if not text.startswith("{"):
+        return read_settings_file(folder / text)
+    try:
+        return dict(json.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise InputError("settings", [compose("settings-unreadable", reason=str(error))]) from error
+
+
+def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Message]:
+    """Of names that cannot be folders below OUT, or would be one folder, or one within the other."""
+    faults: list[Message] = []
+    folded: dict[str, list[str]] = {}
+    for capture, place in zip(captures, places, strict=False):
+        folded.setdefault(capture.name.casefold(), []).append(place)
+        parts = capture.name.split("/")
+        if any(not part or part.startswith(".") or "\0" in part or "\\" in part for part in parts) or (
+            parts[0].casefold() in TAKEN_NAMES
+        ):
+            faults.append(compose("batch-name-wrong", name=f"{capture.name!r}", where=place))
+    for name, where in folded.items():
+        if len(where) > 1:
+            faults.append(compose("batch-name-twice", name=name, where=where))
+        parents = [parent for parent in map("/".join, _parents(name.split("/"))) if parent in folded]
+        faults += [compose("batch-name-within", name=name, outer=parent) for parent in parents]
+    return faults
+
+
+def _parents(parts: list[str]) -> Iterator[list[str]]:
+    yield from (parts[:count] for count in range(1, len(parts)))

@@ -1,0 +1,146 @@
+"""Who works on what, by files alone: a claim is a symbolic link of the claimed name to its owner's file.
+
+Making a link is atomic and refused where one is, on local disks and on NFS and Lustre, where ``flock`` may not reach
+other machines; and it says at once whose it is. An owner is one process. Its file is touched every ``BEAT_S`` seconds;
+whoever is silent for ``SILENT_S``, whose process is gone (same machine), or whose file is gone, has lost its claims.
+
+A lost claim is taken away by one process alone: that which claims the claim (its name and the loser's token) first.
+Nobody else removes the link, so that what is removed is never a newer one. A process that was stopped for longer than
+``SILENT_S`` and goes on asks ``Claims.holds`` before it lays a result down.
+"""
+
+import json
+import os
+import secrets
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from server.processes import process_identity, process_started
+
+BEAT_S = 10.0
+SILENT_S = 180.0  # NFS tells of a touch up to 60 s late (acregmax of nfs(5)); then a beat, and as much again
+SUFFIX = ".json"
+
+
+class Claims:
+    """This process's claims in a folder that all who share the work see. Its methods are for any thread."""
+
+    def __init__(self, folder: Path, *, silent_s: float = SILENT_S) -> None:
+        self.token = secrets.token_hex(8)
+        self._folder, self._silent_s = folder, silent_s
+        self._machine, self._host, self._pid, self._started = process_identity()
+        self._owner = self._owners / f"{self.token}{SUFFIX}"
+        self._ended = threading.Event()
+
+    @contextmanager
+    def beating(self) -> Iterator[None]:
+        """Keeps the owner's file and its heartbeat while the block runs; claims can be taken within alone."""
+        self._show()
+        beat = threading.Thread(target=self._beat, name="claims", daemon=True)
+        beat.start()
+        try:
+            yield
+        finally:
+            self._ended.set()
+            beat.join()
+            self._owner.unlink(missing_ok=True)
+
+    def take(self, name: str) -> bool:
+        """Claims a name; False where somebody else has it."""
+        return self._take(self._folder / name)
+
+    def holds(self, name: str) -> bool:
+        """Whether the claim is still this process's own."""
+        return _holder(self._folder / name) == self.token
+
+    def release(self, name: str) -> None:
+        """Gives a claim back."""
+        if self.holds(name):
+            (self._folder / name).unlink(missing_ok=True)
+
+    def is_alive(self, token: str) -> bool:
+        """Whether an owner may still be at work."""
+        if token == self.token:
+            return True
+        path = self._owners / f"{token}{SUFFIX}"
+        try:
+            seen, owner = path.stat().st_mtime, json.loads(path.read_text(encoding="utf-8"))
+            here, pid, started = owner["machine"] == self._machine, owner["pid"], owner["started"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+        if here and process_started(pid) != started:
+            return False
+        with suppress(OSError):
+            os.utime(self._owner)
+            # Both are times of the file's server, and need no clocks that agree.
+            return self._owner.stat().st_mtime - seen < self._silent_s
+        return True
+
+    def forget_dead(self) -> None:
+        """Takes claims and files of owners away that are dead."""
+        for path in self._folder.iterdir():
+            holder = _holder(path)
+            if holder and not self.is_alive(holder) and self._take(path):
+                path.unlink(missing_ok=True)
+        for path in self._owners.glob(f"*{SUFFIX}"):
+            if not self.is_alive(path.name.removesuffix(SUFFIX)):
+                path.unlink(missing_ok=True)
+
+    @property
+    def _owners(self) -> Path:
+        return self._folder / "owners"
+
+    def _take(self, path: Path) -> bool:
+        if self._link(path):
+            return True
+        holder = _holder(path)
+        if holder is None:
+            return self._link(path)
+        if self.is_alive(holder):
+            return False
+        breaker = path.with_name(f"{path.name}~{holder}")
+        if not self._take(breaker):
+            return False
+        try:
+            if _holder(path) == holder:
+                path.unlink(missing_ok=True)
+        finally:
+            breaker.unlink(missing_ok=True)
+        return self._link(path)
+
+    def _link(self, path: Path) -> bool:
+        try:
+            path.symlink_to(f"owners/{self.token}{SUFFIX}")
+        except FileExistsError:
+            return False
+        return True
+
+    def _show(self) -> None:
+        """Writes the owner's file; somebody who leaves may take the empty folder away meanwhile."""
+        owner = {"machine": self._machine, "host": self._host, "pid": self._pid, "started": self._started}
+        while True:
+            self._owners.mkdir(parents=True, exist_ok=True)
+            with suppress(FileNotFoundError):
+                part = self._owners / f"{self.token}.part"
+                part.write_text(json.dumps(owner), encoding="utf-8")
+                part.replace(self._owner)
+                return
+
+    def _beat(self) -> None:
+        while not self._ended.wait(BEAT_S):
+            try:
+                os.utime(self._owner)
+            except FileNotFoundError:  # taken for dead: claims are lost, and new ones may be taken
+                self._show()
+            except OSError:  # a file server that does not answer; the next beat tries again
+                continue
+
+
+def _holder(path: Path) -> str | None:
+    """The token of who has a claim; None where nobody has."""
+    try:
+        return path.readlink().name.removesuffix(SUFFIX)
+    except OSError:
+        return None

@@ -1,0 +1,37 @@
+"""What a result follows from, as sha256: a capture's files, settings, and the model."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from rig.formats.picture_names import is_junk
+
+
+def capture_sha256(path: Path) -> str:
+    """Digest of an archive's bytes, or of the names and bytes of all files in a capture folder. Raises OSError."""
+    if not path.is_dir():
+        return _file_sha256(path)
+    digest = hashlib.sha256()
+    for name, file in sorted(_files(path, "", frozenset())):
+        digest.update(f"{name}\0{_file_sha256(file)}\n".encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()
+
+
+def _files(folder: Path, prefix: str, within: frozenset[tuple[int, int]]) -> Iterator[tuple[str, Path]]:
+    """Files by their path below the capture, those behind links too; ``within``: folders above, against circles."""
+    state = folder.stat()
+    if (here := (state.st_dev, state.st_ino)) in within:
+        return
+    for entry in os.scandir(folder):
+        if is_junk(entry.name):
+            continue
+        if entry.is_dir():
+            yield from _files(Path(entry.path), f"{prefix}{entry.name}/", within | {here})
+        elif entry.is_file():
+            yield f"{prefix}{entry.name}", Path(entry.path)
+
+
+def _file_sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

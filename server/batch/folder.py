@@ -1,0 +1,193 @@
+"""The folder that a batch fills: results by name, each complete or absent, and beside them what is at work.
+
+NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it follows from
+heads.csv heads.parquet sheet.html
+.batch/           claims/, attempts/ (results on their way), failures/: gone when nothing is at work and none failed
+"""
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rig.atomic_write import write_atomically
+from rig.errors import EigenheadError
+from rig.messages.message import Message, compose, documents_of, read_message
+from server.storage.result_folder import RESULT_FILE
+
+RECORD = "batch.json"
+RECORD_FORMAT, FAILURE_FORMAT = "eigenhead-batch-result/1", "eigenhead-batch-failure/1"
+REPORT = "report.json"
+FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks")  # of captures of photographs alone
+
+
+class ForeignFiles(EigenheadError):
+    """A folder of the result's name that holds what no result has."""
+
+    def __init__(self, folder: Path, names: list[str]) -> None:
+        super().__init__(compose("batch-foreign-files", folder=str(folder), names=names[:5]))
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a result follows from; the version is no reason to make it again."""
+
+    input_sha256: str
+    settings_sha256: str
+    model_sha256: str
+    version: str
+
+    def is_of(self, other: "Origin") -> bool:
+        """Whether both are of the same input, settings and model."""
+        return (self.input_sha256, self.settings_sha256, self.model_sha256) == (
+            other.input_sha256,
+            other.settings_sha256,
+            other.model_sha256,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FailureRecord:
+    """Why the latest attempt at a capture failed. ``attempt``: whose it was."""
+
+    attempt: str
+    kind: str
+    message: Message
+    faults: tuple[Message, ...]
+    origin: Origin | None
+    trace: str = ""  # of a fault of the program's own
+
+
+class BatchFolder:
+    """Paths and records of ``out``. Which process may write what is settled by claims."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.work = out / ".batch"
+        self.claims, self.attempts = self.work / "claims", self.work / "attempts"
+
+    def result(self, name: str) -> Path:
+        return self.out / name
+
+    def origin(self, name: str) -> Origin | None:
+        """Reads what a complete result follows from; None where there is none."""
+        folder = self.result(name)
+        with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+            files: Mapping[str, int] = record["files"]
+            whole = record["format"] == RECORD_FORMAT and (folder / REPORT).is_file()
+            if whole and all((folder / file).stat().st_size == size for file, size in files.items()):
+                return Origin(**{key: record[key] for key in Origin.__dataclass_fields__})
+        return None
+
+    def report(self, name: str) -> dict[str, Any]:
+        """Reads a result's report.json. Raises OSError and ValueError."""
+        return json.loads((self.result(name) / REPORT).read_text(encoding="utf-8"))
+
+    def new_attempt(self, token: str) -> Path:
+        """Makes an empty folder for a result on its way, ``result`` and ``scratch`` within."""
+        self.attempts.mkdir(parents=True, exist_ok=True)
+        number = sum(path.name.startswith(f"{token}.") for path in self.attempts.iterdir())
+        while True:
+            attempt = self.attempts / f"{token}.{number}"
+            try:
+                attempt.mkdir()
+            except FileExistsError:
+                number += 1
+                continue
+            for part in ("result", "scratch"):
+                (attempt / part).mkdir()
+            return attempt
+
+    def publish(self, name: str, attempt: Path, origin: Origin) -> None:
+        """Lays the finished result of an attempt down under its name, in place of an earlier one.
+
+        Raises ForeignFiles, and OSError where another process has just laid its own down."""
+        made, target = attempt / "result", self.result(name)
+        self.check_replaceable(name)
+        sizes = {path.relative_to(made).as_posix(): path.stat().st_size for path in _files(made)}
+        sizes.pop(REPORT, None)  # it tells seconds, so that its size is another one each time
+        document = {"format": RECORD_FORMAT, "capture": name, **asdict(origin), "files": dict(sorted(sizes.items()))}
+        write_atomically(made / RECORD, json.dumps(document, indent=1).encode())
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists():
+            target.rename(attempt / "replaced")
+        made.rename(target)  # refused where a folder with files is
+        self.failure_file(name).unlink(missing_ok=True)
+
+    def check_replaceable(self, name: str) -> None:
+        """Raises ForeignFiles where a result's folder has what belongs to no result: it is not ours to throw away."""
+        try:
+            entries = sorted(path.name for path in self.result(name).iterdir())
+        except FileNotFoundError:
+            return
+        if foreign := [entry for entry in entries if entry not in FOUND_FILES and not RESULT_FILE.match(entry)]:
+            raise ForeignFiles(self.result(name), foreign)
+
+    def remove_attempts(self, is_alive: Callable[[str], bool]) -> None:
+        """Removes attempts of owners that are not alive."""
+        for path in self._attempts():
+            if not is_alive(path.name.partition(".")[0]):
+                shutil.rmtree(path, ignore_errors=True)
+
+    def failure(self, name: str) -> FailureRecord | None:
+        """Reads why a capture failed; None where it did not."""
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            record = json.loads(self.failure_file(name).read_text(encoding="utf-8"))
+            origin = None if record["origin"] is None else Origin(**record["origin"])
+            message, faults = read_message(record["message"]), tuple(map(read_message, record["faults"]))
+            return FailureRecord(record["attempt"], record["kind"], message, faults, origin, record["trace"])
+        return None
+
+    def note_failure(self, name: str, failure: FailureRecord) -> None:
+        """Writes why the latest attempt failed. Raises OSError."""
+        document = {
+            "format": FAILURE_FORMAT,
+            "capture": name,
+            "attempt": failure.attempt,
+            "kind": failure.kind,
+            "message": failure.message.document(),
+            "faults": documents_of(failure.faults),
+            "origin": None if failure.origin is None else asdict(failure.origin),
+            "trace": failure.trace,
+        }
+        write_atomically(self.failure_file(name), json.dumps(document, indent=1).encode())
+
+    def failure_file(self, name: str) -> Path:
+        return self.work / "failures" / f"{file_name(name)}.json"
+
+    def forget_failures_but_of(self, names: set[str]) -> None:
+        """Removes failures of captures that are in no list any more, and torn writes."""
+        retained = {self.failure_file(name).name for name in names}
+        with suppress(FileNotFoundError):
+            for path in (self.work / "failures").iterdir():
+                if path.name not in retained:
+                    path.unlink(missing_ok=True)
+
+    def remove_empty_folders(self) -> None:
+        """Removes what is empty of ``.batch``."""
+        inner = (self.claims / "owners", self.claims, self.attempts, self.work / "failures", self.work)
+        for folder in inner:
+            with suppress(OSError):
+                folder.rmdir()
+
+    def _attempts(self) -> list[Path]:
+        try:
+            return list(self.attempts.iterdir())
+        except FileNotFoundError:
+            return []
+
+
+def file_name(name: str) -> str:
+    """Returns a file name for a capture's: readable, and another one for each."""
+    readable = re.sub(r"[^\w-]+", "-", name)[:60]
+    return f"{readable}.{hashlib.sha256(name.encode('utf-8', 'surrogateescape')).hexdigest()[:16]}"
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.rglob("*")) if path.is_file())

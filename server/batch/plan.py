@@ -1,0 +1,62 @@
+"""What a batch is to make: each capture with its settings and model, all of it checked before any work begins."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+
+from pipeline.eigenheads.model_names import model_path, model_sha256
+from pipeline.settings import Settings, document_from_settings, document_sha256, settings_from_document
+from pipeline.templates.header import check_template
+from rig.errors import EigenheadError, InputError
+from rig.messages.message import Message, compose
+from server.batch.captures import BatchCapture
+from server.tasks.settings_file import merged_settings
+from server.tasks.stage_durations import StageDurations
+
+
+@dataclass(frozen=True, slots=True)
+class BatchTask:
+    """A capture and all that its result follows from, but for its files. ``expected_s``: seconds by stage."""
+
+    capture: BatchCapture
+    settings: Mapping[str, object]
+    settings_sha256: str
+    model: str | None
+    model_sha256: str
+    version: str
+    expected_s: Mapping[str, float]
+
+
+def plan_batch(
+    captures: Iterable[BatchCapture], settings: Mapping[str, object], model: str | None
+) -> tuple[BatchTask, ...]:
+    """Plans a batch: ``settings`` are of all captures, and a capture's own go over them.
+
+    Raises UnknownModel, what is wrong with a template, and InputError naming the captures whose settings are wrong."""
+    path = model_path(model or "default")
+    check_template(settings_from_document(settings).outputs.template, model or "default")
+    digest, durations, faults = model_sha256(path), StageDurations(), list[Message]()
+    tasks = []
+    for capture in captures:
+        try:
+            chosen = settings_from_document(merged_settings(settings, capture.settings))
+            check_template(chosen.outputs.template, model or "default")
+        except InputError as error:
+            faults += [compose("located", where=capture.name, fault=fault) for fault in error.faults]
+            continue
+        except EigenheadError as error:
+            faults.append(compose("located", where=capture.name, fault=error.message))
+            continue
+        expected_s = durations.of(chosen)
+        tasks.append(_task(capture, chosen, model, digest, expected_s))
+    if faults:
+        raise InputError("settings", faults)
+    return tuple(tasks)
+
+
+def _task(
+    capture: BatchCapture, chosen: Settings, model: str | None, model_digest: str, expected_s: Mapping[str, float]
+) -> BatchTask:
+    document = document_from_settings(chosen)
+    digest = document_sha256(document)
+    return BatchTask(capture, document, digest, model, model_digest, version("eigenhead"), expected_s)

@@ -1,0 +1,63 @@
+"""How far a batch is, and how long it takes yet."""
+
+import time
+from collections.abc import Callable
+
+Clock = Callable[[], float]
+
+
+class BatchProgress:
+    """Counts captures that end, and guesses by their mean what the others take.
+
+    Args:
+        captures: to be made, those that are there already left out.
+        workers: at once.
+        expected_s: of one capture, before one was made.
+        clock: seconds that only grow.
+    """
+
+    def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
+        self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock
+        self._running: dict[str, tuple[float, float]] = {}  # since when, and how far
+        self._took: list[float] = []
+        self.ended = self.failed = 0
+
+    def start(self, name: str) -> None:
+        self._running[name] = self._clock(), 0.0
+
+    def report(self, name: str, share: float) -> None:
+        """Takes in how far a capture is, from 0 to 1."""
+        if name in self._running:
+            self._running[name] = self._running[name][0], min(1.0, max(0.0, share))
+
+    def end(self, name: str, *, failed: bool) -> None:
+        """Takes in that a capture ended; one that failed says nothing of how long others take."""
+        since, _ = self._running.pop(name, (self._clock(), 0.0))
+        self.ended += 1
+        self.failed += failed
+        if not failed:
+            self._took.append(self._clock() - since)
+
+    def leave(self, name: str) -> None:
+        """Takes in that another process has this capture."""
+        self._running.pop(name, None)
+
+    def share(self) -> float:
+        """Returns what is done of all, from 0 to 1."""
+        begun = sum(share for _, share in self._running.values())
+        return min(1.0, (self.ended + begun) / max(1, self._captures))
+
+    def remaining_s(self) -> float:
+        """Returns the seconds that are left, if all workers stay at work."""
+        mean_s = sum(self._took) / len(self._took) if self._took else self._expected_s
+        waiting = max(0, self._captures - self.ended - len(self._running))
+        begun = [mean_s * (1.0 - share) for _, share in self._running.values()]
+        at_once = max(1, min(self._workers, waiting + len(begun)))
+        return max([(mean_s * waiting + sum(begun)) / at_once, *begun])
+
+
+def told_time(seconds: float) -> str:
+    """Returns seconds, minutes or hours in words, no more exact than a guess is."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

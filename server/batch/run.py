@@ -1,0 +1,258 @@
+"""A batch at work: each worker takes one capture after the other, in a child process that keeps models and loops.
+
+Whatever happens to a child or a capture is that capture's failure alone. Whatever happens to this process leaves
+results complete or absent; what it had begun is swept by whoever comes next.
+"""
+
+import os
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from rig.errors import Cancelled, EigenheadError, InputError
+from rig.messages.message import compose
+from rig.progress import Progress
+from server.batch.claims import Claims
+from server.batch.digests import capture_sha256
+from server.batch.failures import failure_of
+from server.batch.folder import BatchFolder, FailureRecord, Origin, file_name
+from server.tasks.child import Bench, Child
+from server.tasks.progress import JobProgress
+from server.tasks.reconstruct_folder import reconstruct_beside
+
+if TYPE_CHECKING:
+    from server.batch.plan import BatchTask
+
+POLL_S = 0.5  # between two questions whether a capture that another process has is done
+EXAMINERS = 4  # captures whose files are compared at once: hashing releases the interpreter lock
+TABLE = "table"  # the claim of who writes the tables
+
+
+class FolderWork(Protocol):
+    """What a worker runs for a capture: ``reconstruct_beside``."""
+
+    def __call__(
+        self,
+        bench: Bench,
+        report: Progress,
+        /,
+        *,
+        parent: int,
+        capture: str,
+        result: str,
+        scratch: str,
+        model: str | None,
+        settings: Mapping[str, object],
+    ) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a capture ended: ``made`` now, ``kept`` from before or from another process, or ``failed``."""
+
+    name: str
+    state: Literal["made", "kept", "failed"]
+    seconds: float = 0.0
+    failure: FailureRecord | None = None
+
+
+class Observer(Protocol):
+    """Who is told how a batch goes, from several threads, one at a time."""
+
+    def begin(self, pending: int) -> None: ...
+    def start(self, name: str) -> None: ...
+    def report(self, name: str, share: float) -> None: ...
+    def leave(self, name: str) -> None: ...
+    def end(self, outcome: Outcome) -> None: ...
+
+
+class BatchRun:
+    """One process's share of a batch."""
+
+    def __init__(
+        self,
+        folder: BatchFolder,
+        tasks: "Sequence[BatchTask]",
+        *,
+        workers: int,
+        variables: Mapping[str, str],
+        observer: Observer,
+        work: FolderWork = reconstruct_beside,
+        claims: Claims | None = None,
+    ) -> None:
+        self._folder, self._tasks, self._workers, self._variables = folder, tasks, workers, variables
+        self._observer, self._work = observer, work
+        self._claims = claims or Claims(folder.claims)
+        self._lock, self._stopped = threading.Lock(), threading.Event()
+        self._pending: deque[BatchTask] = deque()
+        self._failed_before: dict[str, str] = {}
+        self._outcomes: dict[str, Outcome] = {}
+
+    def run(self, publish_table: Callable[[], None]) -> list[Outcome]:
+        """Makes what is missing and returns how each capture ended, in the order of the tasks.
+
+        ``publish_table`` is called at the end, by one process of all at a time. Raises OSError where the folder cannot
+        be written."""
+        try:
+            with self._claims.beating():
+                self._sweep()
+                self._examine()
+                with self._lock:
+                    self._observer.begin(len(self._pending))
+                self._work_off()
+                with self._table_claim():
+                    publish_table()
+                self._sweep()
+        finally:
+            self._folder.remove_empty_folders()
+        return [self._outcomes[task.capture.name] for task in self._tasks if task.capture.name in self._outcomes]
+
+    def _examine(self) -> None:
+        """Tells what is there from what is missing."""
+
+        def kept(task: "BatchTask") -> bool:
+            try:
+                return self._is_done(task, None)
+            except OSError:  # said of the capture when its turn comes
+                return False
+
+        with ThreadPoolExecutor(EXAMINERS) as pool:
+            for task, done in zip(self._tasks, pool.map(kept, self._tasks), strict=True):
+                name = task.capture.name
+                if done:
+                    self._outcomes[name] = Outcome(name, "kept")
+                    continue
+                self._pending.append(task)
+                if (failure := self._folder.failure(name)) is not None:
+                    self._failed_before[name] = failure.attempt
+
+    def _is_done(self, task: "BatchTask", input_sha256: str | None) -> bool:
+        origin = self._folder.origin(task.capture.name)
+        if origin is None:
+            return False
+        return origin.is_of(self._origin(task, input_sha256 or capture_sha256(task.capture.path)))
+
+    def _origin(self, task: "BatchTask", input_sha256: str) -> Origin:
+        return Origin(input_sha256, task.settings_sha256, task.model_sha256, task.version)
+
+    def _work_off(self) -> None:
+        """Starts the workers, and stops them where somebody interrupts this process."""
+        with ThreadPoolExecutor(self._workers, thread_name_prefix="worker") as pool:
+            at_work = [pool.submit(self._serve) for _ in range(self._workers)]
+            try:
+                for done in as_completed(at_work):
+                    done.result()
+            except BaseException:
+                self._stopped.set()
+                raise
+
+    def _serve(self) -> None:
+        with closing(Child(variables=self._variables)) as child:
+            passed_over = 0
+            while not self._stopped.is_set():
+                with self._lock:
+                    if not self._pending:
+                        return
+                    task, left = self._pending.popleft(), len(self._pending)
+                if self._take(task, child):
+                    passed_over = 0
+                    continue
+                with self._lock:
+                    self._pending.append(task)
+                passed_over += 1
+                if passed_over > left:  # others have all that are left
+                    passed_over = 0
+                    self._stopped.wait(POLL_S)
+
+    def _take(self, task: "BatchTask", child: Child) -> bool:
+        """Whether a capture has ended: False where another process has it, or where this one is to stop."""
+        name = task.capture.name
+        claim = file_name(name)
+        if not self._claims.take(claim):
+            return False
+        try:
+            with self._lock:
+                self._observer.start(name)
+            outcome = self._outcome(task, claim, child)
+        finally:
+            self._claims.release(claim)
+        with self._lock:
+            if outcome is None:
+                self._observer.leave(name)
+                return False
+            self._outcomes[name] = outcome
+            self._observer.end(outcome)
+        return True
+
+    def _outcome(self, task: "BatchTask", claim: str, child: Child) -> Outcome | None:
+        name, began = task.capture.name, time.monotonic()
+        origin: Origin | None = None
+        try:
+            origin = self._origin(task, capture_sha256(task.capture.path))
+            if self._is_done(task, origin.input_sha256):
+                return Outcome(name, "kept")
+            failure = self._folder.failure(name)
+            if failure is not None and failure.attempt != self._failed_before.get(name):
+                return Outcome(name, "failed", failure=failure)  # another process tried just now
+            self._make(task, origin, child, claim)
+            return Outcome(name, "made", time.monotonic() - began)
+        except Cancelled:
+            return None
+        except (EigenheadError, OSError) as error:
+            if not self._claims.holds(claim):  # another process took this one for dead, and the capture over
+                return None
+            failure = failure_of(error, task.capture.path, self._claims.token, origin)
+        with suppress(OSError):  # on a full disk it is said on the terminal alone
+            self._folder.note_failure(name, failure)
+        return Outcome(name, "failed", time.monotonic() - began, failure)
+
+    def _make(self, task: "BatchTask", origin: Origin, child: Child, claim: str) -> None:
+        """Makes a result in a folder of its own and lays it down. Raises Cancelled where this process is to stop, or
+        another one has the capture now."""
+        name = task.capture.name
+        self._folder.check_replaceable(name)
+        attempt = self._folder.new_attempt(self._claims.token)
+        progress = JobProgress(task.expected_s)
+
+        def report(stage: str, fraction: float) -> None:
+            progress.report(stage, fraction)
+            with self._lock:
+                self._observer.report(name, progress.progress())
+
+        try:
+            run = child.remote(self._work, report=report, cancelled=self._stopped.is_set)
+            run(
+                parent=os.getpid(),
+                capture=str(task.capture.path.resolve()),
+                result=str((attempt / "result").resolve()),
+                scratch=str((attempt / "scratch").resolve()),
+                model=task.model,
+                settings=task.settings,
+            )
+            if capture_sha256(task.capture.path) != origin.input_sha256:
+                raise InputError(name, [compose("batch-capture-changed")])
+            if not self._claims.holds(claim):
+                raise Cancelled
+            self._folder.publish(name, attempt, origin)
+        finally:
+            shutil.rmtree(attempt, ignore_errors=True)
+
+    @contextmanager
+    def _table_claim(self) -> Iterator[None]:
+        while not self._claims.take(TABLE):
+            time.sleep(POLL_S)
+        try:
+            yield
+        finally:
+            self._claims.release(TABLE)
+
+    def _sweep(self) -> None:
+        """Removes what dead processes left."""
+        self._claims.forget_dead()
+        self._folder.remove_attempts(self._claims.is_alive)

@@ -1,0 +1,38 @@
+"""Shares of a batch for machines that know nothing of each other: by a stable hash of the captures' names."""
+
+import hashlib
+import re
+from dataclasses import dataclass
+
+from rig.errors import InputError
+from rig.messages.message import compose
+
+SHARDS_MOST = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """The share ``number`` (from 1) of ``count``."""
+
+    number: int
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def takes(self, name: str) -> bool:
+        """Whether the capture of that name is of this share; each is of exactly one."""
+        digest = hashlib.sha256(name.encode()).digest()
+        return int.from_bytes(digest[:8], "big") % self.count == self.number - 1
+
+
+WHOLE = Shard(1, 1)
+
+
+def read_shard(text: str) -> Shard:
+    """Reads K/N, K from 1 to N. Raises InputError."""
+    parts = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text.strip())
+    number, count = (int(parts[1]), int(parts[2])) if parts else (0, 0)
+    if not 1 <= number <= count <= SHARDS_MOST:
+        raise InputError("shard", [compose("batch-shard-wrong", text=f"{text!r:.40}", most=SHARDS_MOST)])
+    return Shard(number, count)

@@ -1,0 +1,71 @@
+"""Table and contact sheet of all that a batch has in its folder, whoever made it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.eigenheads.model_file import expression_names
+from pipeline.eigenheads.model_names import model_path
+from rig.atomic_write import write_atomically
+from rig.messages.message import MessageDocument, documents_of
+from server.batch.folder import BatchFolder, FailureRecord, Origin
+from server.batch.plan import BatchTask
+from server.batch.sheet import Card, figures_of, sheet_html, views_of
+from server.batch.table import Column, Row, columns_of, row_of
+from server.batch.table_files import write_table
+
+SHEET = "sheet.html"
+
+
+def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
+    """Writes table and sheet of all captures of a batch, those of other shards too, and returns the files.
+
+    Raises OSError."""
+    columns = columns_of(_expressions(tasks))
+    rows, cards = [], []
+    for task in tasks:
+        row, card = _told(folder, task, columns)
+        rows.append(row)
+        cards.append(card)
+    files = write_table(folder.out, columns, rows)
+    write_atomically(folder.out / SHEET, sheet_html(folder.out.resolve().name, cards).encode("utf-8", "replace"))
+    return [*files, folder.out / SHEET]
+
+
+def _told(folder: BatchFolder, task: BatchTask, columns: Sequence[Column]) -> tuple[Row, Card]:
+    name, capture = task.capture.name, task.capture
+    origin, report = _result(folder, task)
+    failure = None if report is not None else folder.failure(name)
+    row = row_of(capture, columns, report=report, origin=origin, failure=failure)
+    of = " / ".join(text for text in (capture.subject, capture.session) if text)
+    picture = None if report is None else views_of(folder.result(name) / "turntable.png")
+    told = tuple(report["warnings"]) if report is not None else _why(failure)
+    return row, Card(name, of, str(row["state"]), figures_of(row), told, picture, f"{name}/")
+
+
+def _result(folder: BatchFolder, task: BatchTask) -> tuple[Origin | None, dict[str, Any] | None]:
+    """A result of these settings and this model; one of others is to be made again."""
+    origin = folder.origin(task.capture.name)
+    wanted = task.settings_sha256, task.model_sha256
+    if origin is None or (origin.settings_sha256, origin.model_sha256) != wanted:
+        return None, None
+    try:
+        return origin, folder.report(task.capture.name)
+    except (OSError, ValueError):
+        return None, None
+
+
+def _why(failure: FailureRecord | None) -> tuple[MessageDocument, ...]:
+    if failure is None:
+        return ()
+    return tuple(documents_of(failure.faults or (failure.message,)))
+
+
+def _expressions(tasks: Sequence[BatchTask]) -> list[str]:
+    """Of all models in use, each name once."""
+    names = [name for model in dict.fromkeys(task.model for task in tasks) for name in _of_model(model)]
+    return list(dict.fromkeys(names))
+
+
+def _of_model(model: str | None) -> tuple[str, ...]:
+    return expression_names(model_path(model or "default"))

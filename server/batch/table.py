@@ -1,0 +1,174 @@
+"""The table of a batch: a row a capture, by the columns of ``columns_of``.
+
+What enters are the reports of results and the records of failures; what leaves are plain values. Lengths are mm in the
+world frame, angles do not occur. A cell is None where its row has no such value.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pipeline.eigenheads.landmarks import NAMES
+from pipeline.evidence.measurements import DISTANCES
+from pipeline.settings import document_sha256
+from server.batch.captures import BatchCapture
+from server.batch.folder import FailureRecord, Origin
+
+Value = str | float | int | bool | None
+Row = dict[str, Value]
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """``unit``: "" where there is none; ``words``: what docs/batch.md says of it."""
+
+    name: str
+    kind: Literal["text", "number", "count", "flag"]
+    unit: str
+    words: str
+
+
+WHOSE = (
+    Column("capture", "text", "", "name of the capture, and of its folder below OUT"),
+    Column("subject", "text", "", "of the list; empty without one"),
+    Column("session", "text", "", "of the list; empty without one"),
+    Column("state", "text", "", "done, failed, or missing: not made yet"),
+    Column("failure_kind", "text", "", "input, refused, crash, out-of-memory, disk-full, unwritable or bug"),
+    Column("failure", "text", "", "why it failed, every fault named"),
+)
+QUALITY = (
+    Column("quality_median_mm", "number", "mm", "median over the vertices of the posterior standard deviation"),
+    Column("quality_max_mm", "number", "mm", "the largest of them"),
+    Column("warnings", "text", "", "their codes, each once, with blanks between: docs/operator.md explains them"),
+    Column("warning_count", "count", "", "number of warnings"),
+    Column("detail", "text", "", "how deep the fit went: span, kernel, photo or fine"),
+    Column("method", "text", "", "contour or simplex"),
+    Column("front", "text", "", "the camera that the subject faces"),
+    Column("pose_method", "text", "", "what the pose came from: landmarks, features or silhouettes"),
+    Column("pose_doubtful", "flag", "", "whether the pose is in doubt"),
+    Column("cameras", "count", "", "cameras of the capture"),
+    Column("cameras_used", "count", "", "those whose pictures were used"),
+    Column("contour_rms_px", "number", "px", "distance of input and fitted contour, RMS over the used cameras"),
+    Column("head_scale", "number", "", "of world_from_head: the head's size beside the model's"),
+)
+ORIGIN = (
+    Column("seconds", "number", "s", "that the reconstruction took"),
+    Column("input_sha256", "text", "", "of the capture's files: what a later run compares"),
+    Column("settings_sha256", "text", "", "of all settings, as head.ply names it"),
+    Column("model", "text", "", "the head model's name"),
+    Column("model_sha256", "text", "", "of the head model's file"),
+    Column("version", "text", "", "of eigenhead that made the result"),
+)
+
+
+def measurement_columns() -> tuple[Column, ...]:
+    """Returns two columns a distance of Farkas: its value and its standard deviation."""
+    return tuple(
+        column
+        for name, (first, second) in DISTANCES.items()
+        for column in (
+            Column(f"{name}_mm", "number", "mm", f"distance from {first} to {second}"),
+            Column(f"{name}_std_mm", "number", "mm", f"standard deviation of {name}_mm"),
+        )
+    )
+
+
+def landmark_columns() -> tuple[Column, ...]:
+    """Returns six columns a landmark: its place in the world frame, and the standard deviation of each coordinate."""
+    places = (
+        Column(f"{name}_{axis}_mm", "number", "mm", f"{axis} of {name}, world frame") for name in NAMES for axis in AXES
+    )
+    spreads = (
+        Column(f"{name}_{axis}_std_mm", "number", "mm", f"standard deviation of {name}_{axis}_mm")
+        for name in NAMES
+        for axis in AXES
+    )
+    return (*places, *spreads)
+
+
+def expression_columns(names: Iterable[str]) -> tuple[Column, ...]:
+    """Returns two columns an expression of the model: its weight and its standard deviation."""
+    return tuple(
+        column
+        for name in names
+        for column in (
+            Column(f"expression_{name}", "number", "", f"weight of {name}, 0 to 1; 0 where the face does not make it"),
+            Column(f"expression_{name}_std", "number", "", f"standard deviation of expression_{name}"),
+        )
+    )
+
+
+def columns_of(expressions: Iterable[str]) -> tuple[Column, ...]:
+    """Returns all columns in their order; ``expressions``: names of the models that the batch uses."""
+    shown = expression_columns(expressions)
+    return (*WHOSE, *QUALITY, *measurement_columns(), *shown, *ORIGIN, *landmark_columns())
+
+
+def row_of(
+    capture: BatchCapture,
+    columns: Sequence[Column],
+    *,
+    report: Mapping[str, Any] | None = None,
+    origin: Origin | None = None,
+    failure: FailureRecord | None = None,
+) -> Row:
+    """Returns the row of a capture that is done (``report`` and ``origin``), failed, or neither."""
+    row: Row = {column.name: None for column in columns}
+    row |= {"capture": capture.name, "subject": capture.subject or None, "session": capture.session or None}
+    row["state"] = "missing"
+    if report is not None and origin is not None:
+        row |= {"state": "done"} | _of_report(report)
+        row |= {key: value for key, value in _expression(report, columns).items() if key in row}
+        row |= {"input_sha256": origin.input_sha256, "settings_sha256": document_sha256(report["settings"])}
+    elif failure is not None:
+        row |= {"state": "failed", "failure_kind": failure.kind, "failure": failure.message.text}
+    strange = row.keys() - {column.name for column in columns}
+    return {name: value for name, value in row.items() if name not in strange}
+
+
+def _of_report(report: Mapping[str, Any]) -> Row:
+    cameras = report["cameras"].values()
+    row: Row = {
+        "quality_median_mm": report["quality"]["median"],
+        "quality_max_mm": report["quality"]["max"],
+        "warnings": " ".join(dict.fromkeys(warning["code"] for warning in report["warnings"])),
+        "warning_count": len(report["warnings"]),
+        "detail": report["detail"]["level"],
+        "method": report["method"],
+        "front": report["front"],
+        "pose_method": report["pose"]["method"],
+        "pose_doubtful": report["pose"]["doubtful"],
+        "cameras": len(report["cameras"]),
+        "cameras_used": sum(camera["used"] for camera in cameras),
+        "contour_rms_px": _rms([camera["contour_rms_px"] for camera in cameras if camera["used"]]),
+        "head_scale": report["world_from_head"]["scale"],
+        "seconds": report["seconds"]["total"],
+        "model": report["model"]["name"],
+        "model_sha256": report["model"]["sha256"],
+        "version": report["version"],
+    }
+    for name, measured in report["measurements"].items():
+        row |= {f"{name}_mm": measured["value"], f"{name}_std_mm": measured["std"]}
+    for name, mark in report["landmarks"].items():
+        for k, axis in enumerate(AXES):
+            row[f"{name}_{axis}_mm"] = mark["position"][k]
+            row[f"{name}_{axis}_std_mm"] = None if mark["std"] is None else mark["std"][k]
+    return row
+
+
+def _expression(report: Mapping[str, Any], columns: Sequence[Column]) -> Row:
+    """The model's expressions: a report names those alone that the face makes."""
+    row: Row = {
+        column.name: 0.0
+        for column in columns
+        if column.name.startswith("expression_") and not column.name.endswith("_std")
+    }
+    for made in report["expression"]:
+        row |= {f"expression_{made['name']}": made["weight"], f"expression_{made['name']}_std": made["std"]}
+    return row
+
+
+def _rms(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return (sum(value**2 for value in known) / len(known)) ** 0.5 if known else None

@@ -1,0 +1,65 @@
+"""The table of a batch as files: CSV for everybody, Parquet with units where pyarrow is installed."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from rig.atomic_write import write_atomically
+from server.batch.table import Column, Row, Value
+
+CSV, PARQUET = "heads.csv", "heads.parquet"
+
+
+def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) -> list[Path]:
+    """Writes the table and returns its files; without pyarrow the CSV file alone. Raises OSError."""
+    files = [folder / CSV]
+    write_atomically(files[0], csv_bytes(columns, rows))
+    if has_parquet():
+        files.append(folder / PARQUET)
+        write_atomically(files[1], parquet_bytes(columns, rows))
+    else:
+        (folder / PARQUET).unlink(missing_ok=True)  # of an earlier run, and of other rows
+    return files
+
+
+def has_parquet() -> bool:
+    """Whether Parquet files can be written here."""
+    try:
+        import pyarrow.parquet  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
+    """Returns RFC 4180 in UTF-8, with all digits of every number; an empty cell is no value."""
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream)
+    writer.writerow([column.name for column in columns])
+    writer.writerows([_cell(row[column.name]) for column in columns] for row in rows)
+    return stream.getvalue().encode("utf-8", "backslashreplace")
+
+
+def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
+    """Returns a Parquet file whose fields say their unit and meaning in their metadata. Needs pyarrow."""
+    import pyarrow
+    import pyarrow.parquet
+
+    kinds = {"text": pyarrow.string(), "number": pyarrow.float64(), "count": pyarrow.int64(), "flag": pyarrow.bool_()}
+    fields = [
+        pyarrow.field(column.name, kinds[column.kind], metadata={"unit": column.unit, "description": column.words})
+        for column in columns
+    ]
+    arrays = [
+        pyarrow.array([row[column.name] for row in rows], kinds[column.kind], from_pandas=False) for column in columns
+    ]
+    sink = pyarrow.BufferOutputStream()
+    pyarrow.parquet.write_table(pyarrow.table(arrays, pyarrow.schema(fields)), sink)
+    return sink.getvalue().to_pybytes()
+
+
+def _cell(value: Value) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return "" if value is None else repr(value) if isinstance(value, float) else str(value)

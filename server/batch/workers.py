@@ -1,0 +1,64 @@
+"""How many captures at once, by the memory and the processors that this process may use."""
+
+import os
+from pathlib import Path
+
+WORKER_BYTES = 2 << 30
+"""Memory of a worker: 1.4 GB at the most in a default job of eleven cameras of 1024 x 768 (VmHWM of `eigenhead
+reconstruct scan-a`), and half as much again for larger pictures."""
+CGROUP = Path("/sys/fs/cgroup")
+
+
+def worker_count(cores: int, free_bytes: int, captures: int) -> int:
+    """Computes how many workers there are by default: one a core, as far as memory goes, and at least one."""
+    return max(1, min(cores, free_bytes // WORKER_BYTES, captures))
+
+
+def threads_of_worker(cores: int, workers: int) -> int:
+    """Computes how many threads of a loop each worker has, so that all of them fill the cores."""
+    return max(1, cores // workers)
+
+
+def usable_cores() -> int:
+    """Returns how many processors this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def free_memory(meminfo: Path = Path("/proc/meminfo"), cgroup: Path | None = None) -> int:
+    """Returns the bytes that are free: of the machine, and of the control group that a scheduler or container set."""
+    free = [_available(meminfo)]
+    group = _own_group() if cgroup is None else cgroup
+    while group.is_relative_to(CGROUP) or cgroup is not None:
+        limit, used = _number(group / "memory.max"), _number(group / "memory.current")
+        if limit is not None and used is not None:
+            free.append(max(0, limit - used))
+        if cgroup is not None or group == CGROUP:
+            break
+        group = group.parent
+    return min(free)
+
+
+def _available(meminfo: Path) -> int:
+    try:
+        lines = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
+        return int(lines["MemAvailable"].split()[0]) * 1024
+    except (OSError, ValueError, KeyError):
+        return WORKER_BYTES
+
+
+def _own_group() -> Path:
+    """The folder of this process's control group, version 2."""
+    try:
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return CGROUP
+    own = next((line[3:] for line in lines if line.startswith("0::")), "/")
+    return CGROUP / own.lstrip("/")
+
+
+def _number(path: Path) -> int | None:
+    """None for "max", and where there is no such file."""
+    try:
+        return int(path.read_text())
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,98 @@
+"""How a batch goes, for people: a bar on a terminal, else a line a capture, as the log of a scheduler keeps it."""
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from server.batch.progress import BatchProgress, told_time
+from server.batch.run import Outcome
+
+if TYPE_CHECKING:
+    from server.batch.plan import BatchTask
+
+
+class BatchDisplay:
+    """An ``Observer`` of a run. ``bar``: rich's, where there is a terminal."""
+
+    def __init__(self, workers: int, expected_s: float, bar: Any = None) -> None:
+        self._workers, self._expected_s, self._bar = workers, expected_s, bar
+        self._progress = BatchProgress(0, workers, expected_s)
+        self._task = None if bar is None else bar.add_task("reading", total=1.0, left="")
+        self._count, self._began = 0, time.monotonic()
+
+    @classmethod
+    @contextmanager
+    def opened(cls, workers: int, tasks: "Sequence[BatchTask]") -> "Iterator[BatchDisplay]":
+        """A display for as long as the block runs."""
+        expected_s = max((sum(task.expected_s.values()) for task in tasks), default=0.0)
+        if not sys.stderr.isatty():
+            yield cls(workers, expected_s)
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
+        )
+        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+            yield cls(workers, expected_s, bar)
+
+    def prepare(self, tasks: "Sequence[BatchTask]") -> None:
+        """Compiles the loops that are missing once, before every worker would for itself."""
+        from pipeline.settings import settings_from_document
+        from server.tasks.prepare import prepare_kernels
+
+        kinds = {task.settings_sha256: task.settings for task in tasks}
+        for settings in kinds.values():
+            prepare_kernels(self._prepared, settings_from_document(settings))
+
+    def begin(self, pending: int) -> None:
+        self._count, self._progress = pending, BatchProgress(pending, self._workers, self._expected_s)
+        self._show()
+
+    def start(self, name: str) -> None:
+        self._progress.start(name)
+
+    def report(self, name: str, share: float) -> None:
+        self._progress.report(name, share)
+        self._show()
+
+    def leave(self, name: str) -> None:
+        self._progress.leave(name)
+        self._show()
+
+    def end(self, outcome: Outcome) -> None:
+        self._progress.end(outcome.name, failed=outcome.state == "failed")
+        self._show()
+        if outcome.failure is not None:
+            self._say(f"eigenhead: {outcome.name}: {outcome.failure.message}")
+        elif self._bar is None and outcome.state == "made":
+            ended, left = self._progress.ended, told_time(self._progress.remaining_s())
+            self._say(f"{ended} of {self._count}: {outcome.name} in {outcome.seconds:.0f} s, about {left} left")
+
+    def seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def _prepared(self, stage: str, share: float) -> None:
+        if self._bar is not None:
+            self._bar.update(self._task, description=stage, completed=share)
+
+    def _show(self) -> None:
+        if self._bar is None:
+            return
+        progress = self._progress
+        failed = f", {progress.failed} failed" if progress.failed else ""
+        told = f"{progress.ended} of {self._count}{failed}"
+        left = f"about {told_time(progress.remaining_s())} left"
+        self._bar.update(self._task, description=told, completed=progress.share(), left=left)
+
+    def _say(self, line: str) -> None:
+        if self._bar is not None:
+            self._bar.console.print(line, markup=False, highlight=False)
+        else:
+            print(line, file=sys.stderr, flush=True)

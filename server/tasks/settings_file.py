@@ -1,0 +1,38 @@
+"""The settings of a job as somebody wrote them down: a TOML or JSON file, and options over it."""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+from rig.errors import InputError
+from rig.messages.message import compose
+
+
+def read_settings_file(path: Path) -> dict[str, object]:
+    """Reads a table of settings. Raises InputError."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
+        braced = path.suffix == ".json" or (path.suffix != ".toml" and text.lstrip().startswith("{"))
+        document = json.loads(text) if braced else tomllib.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(path.name, [compose("settings-unreadable", reason=str(error))]) from error
+    if not isinstance(document, dict):
+        raise InputError(path.name, [compose("settings-no-table")])
+    return document
+
+
+def settings_document(path: Path | None, **given: str | Mapping[str, object] | None) -> dict[str, object]:
+    """Settings from a TOML or JSON file, then from options; tables are merged. Raises InputError."""
+    return merged_settings({} if path is None else read_settings_file(path), given)
+
+
+def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:
+    """Returns ``document`` with what ``over`` says; tables of both are merged, and None says nothing."""
+    merged = dict(document)
+    for name, value in over.items():
+        old = merged.get(name)
+        if value is not None:
+            both = isinstance(old, Mapping) and isinstance(value, Mapping)
+            merged[name] = {**old, **value} if both else value
+    return merged
