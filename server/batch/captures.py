@@ -35,7 +35,7 @@ class BatchCapture:
     path: Path
     subject: str = ""
     session: str = ""
-    settings: Mapping[str, object] = field(default=NO_SETTINGS)
+    settings: Mapping[str, object] = field(default_factory=lambda: NO_SETTINGS)
 
 
 def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:

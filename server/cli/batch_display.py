@@ -33,12 +33,8 @@ class BatchDisplay:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-        )
+        told, left = TextColumn("{task.description}"), TextColumn("{task.fields[left]}")
+        columns = (told, BarColumn(), TimeElapsedColumn(), left)
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
             yield cls(workers, expected_s, bar)
 

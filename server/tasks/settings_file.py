@@ -33,6 +33,7 @@ def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) 
     for name, value in over.items():
         old = merged.get(name)
         if value is not None:
-            both = isinstance(old, Mapping) and isinstance(value, Mapping)
-            merged[name] = {**old, **value} if both else value
+            merged[name] = value
+            if isinstance(old, Mapping) and isinstance(value, Mapping):
+                merged[name] = {**old, **value}
     return merged
