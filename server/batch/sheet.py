@@ -145,7 +145,8 @@ def _content(card: Card) -> Iterator[str]:
         yield f'<div class="of">{html.escape(line)}</div>'
     if card.told:
         yield "<ul>"
-        for message in card.told:
+        ranks = ("severe", "warning", "remark")
+        for message in sorted(card.told, key=lambda message: ranks.index(severity(message["code"]))):
             kind = "failed" if card.state == "failed" else severity(message["code"])
             code, text = html.escape(message["code"]), html.escape(message["message"])
             yield f'<li class="{kind}"><code>{code}</code> {text}</li>'

@@ -1,0 +1,163 @@
+"""A batch at work: every capture ends once, whatever happens to workers, to this process or to others."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rig.messages.message import compose
+from server.batch.claims import Claims
+from server.batch.folder import BatchFolder, FailureRecord, file_name
+from server.batch.shards import Shard
+from tests.support.pinned_batch import Silent, everything_in, pinned_capture, pinned_captures, run_pinned
+from tests.support.pinned_work import LOG, SECONDS
+from tests.support.services import ROOT
+
+COMMAND = [sys.executable, "-m", "tests.support.pinned_batch"]
+
+
+def states(outcomes: list) -> dict[str, str]:
+    return {outcome.name: outcome.state for outcome in outcomes}
+
+
+def test_each_capture_becomes_a_folder_and_a_second_run_makes_nothing(tmp_path: Path) -> None:
+    shots, out = pinned_captures(tmp_path / "shots", 3), tmp_path / "heads"
+    assert states(run_pinned(shots, out)) == {"s0000": "made", "s0001": "made", "s0002": "made"}
+    names = {path.relative_to(out).as_posix() for path in out.rglob("*")}
+    assert {"heads.csv", "heads.parquet", "sheet.html", "s0001/head.ply", "s0001/batch.json"} <= names
+    assert not [name for name in names if name.startswith(".")]
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/*")}
+    observer = Silent()
+    assert set(states(run_pinned(shots, out, observer=observer)).values()) == {"kept"}
+    assert (observer.pending, observer.told) == (0, [])
+    assert {path: path.stat().st_mtime_ns for path in out.glob("*/*")} == before
+
+
+def test_another_input_or_setting_and_a_lost_file_are_made_again_and_the_rest_is_kept(tmp_path: Path) -> None:
+    shots, out = pinned_captures(tmp_path / "shots", 3), tmp_path / "heads"
+    run_pinned(shots, out)
+    (shots / "s0000" / "images" / "seed.txt").write_text("77\n")
+    (out / "s0001" / "head.ply").unlink()
+    assert states(run_pinned(shots, out)) == {"s0000": "made", "s0001": "made", "s0002": "kept"}
+    again = run_pinned(shots, out, settings={"detail": "span"})
+    assert set(states(again).values()) == {"made"}
+    assert not (out / ".batch").exists()
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind", "words"),
+    [
+        ("fail", "input", "names no capture"),
+        ("bug", "bug", "ZeroDivisionError: planted"),
+        ("memory", "out-of-memory", "fewer --workers"),
+        ("segfault", "crash", "signal 11"),
+        ("killed", "crash", "fewer --workers"),
+        ("changed", "input", "files changed while it was at work"),
+    ],
+)
+def test_whatever_happens_to_one_capture_is_its_own_failure(tmp_path: Path, mode: str, kind: str, words: str) -> None:
+    shots, out = pinned_captures(tmp_path / "shots", 2), tmp_path / "heads"
+    pinned_capture(shots / "bad", 9, mode)
+    outcomes = {outcome.name: outcome for outcome in run_pinned(shots, out, workers=1)}
+    assert {name: outcome.state for name, outcome in outcomes.items()} == {
+        "bad": "failed",
+        "s0000": "made",
+        "s0001": "made",
+    }
+    failure = outcomes["bad"].failure
+    assert failure is not None
+    assert (failure.kind, words in failure.message.text) == (kind, True)
+    assert ("planted" in failure.trace) == (mode == "bug")
+    assert not (out / "bad").exists()
+    assert [path.name for path in (out / ".batch").iterdir()] == ["failures"]
+    row = next(line for line in (out / "heads.csv").read_text().splitlines() if line.startswith("bad,"))
+    assert f",failed,{kind}," in row
+    (shots / "bad" / "mode").unlink()
+    assert states(run_pinned(shots, out))["bad"] == "made"
+    assert not (out / ".batch").exists()
+
+
+def test_files_that_somebody_laid_into_a_result_are_not_thrown_away(tmp_path: Path) -> None:
+    shots, out = pinned_captures(tmp_path / "shots", 1), tmp_path / "heads"
+    run_pinned(shots, out)
+    (out / "s0000" / "notes.txt").write_text("mine")
+    (shots / "s0000" / "images" / "seed.txt").write_text("5\n")
+    (outcome,) = run_pinned(shots, out)
+    assert outcome.failure is not None
+    assert "notes.txt" in outcome.failure.message.text
+    assert (out / "s0000" / "notes.txt").read_text() == "mine"
+
+
+def test_shards_are_one_whole(tmp_path: Path) -> None:
+    shots, out = pinned_captures(tmp_path / "shots", 7), tmp_path / "heads"
+    shares = [states(run_pinned(shots, out, shard=Shard(k, 3))) for k in (1, 2, 3)]
+    assert sorted(name for share in shares for name in share) == [f"s{k:04}" for k in range(7)]
+    assert all(state == "made" for share in shares for state in share.values())
+    assert (out / "heads.csv").read_text().count(",done,") == 7  # the last one's table has the others' heads
+
+
+def test_what_another_process_has_is_waited_for_and_taken_as_it_comes(tmp_path: Path) -> None:
+    """Two processes with the same share, started at once: nobody begins what another has begun."""
+    shots, out, log = pinned_captures(tmp_path / "shots", 12), tmp_path / "heads", tmp_path / "log"
+    environment = os.environ | {SECONDS: "0.15", LOG: str(log)}
+    command = [*COMMAND, str(shots), str(out), "2", "1/1"]
+    both = [subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE) for _ in range(2)]
+    told = [json.loads(process.communicate(timeout=120)[0]) for process in both]
+    assert [process.returncode for process in both] == [0, 0]
+    for name in (f"s{k:04}" for k in range(12)):
+        assert sorted(states[name] for states in told) == ["kept", "made"]
+    begun = [line.split()[2] for line in log.read_text().splitlines() if "begins" in line]
+    assert sorted(begun) == [f"s{k:04}" for k in range(12)]
+    assert not (out / ".batch").exists()
+
+
+def test_a_failure_of_another_process_is_told_and_not_tried_twice(tmp_path: Path) -> None:
+    """This process begins while another one has the capture, which then fails."""
+    shots, out, log = tmp_path / "shots", tmp_path / "heads", tmp_path / "log"
+    pinned_capture(shots / "bad", 1, "fail")
+    folder = BatchFolder(out)
+    other = Claims(folder.claims)
+    with other.beating():
+        assert other.take(file_name("bad"))
+        command, environment = [*COMMAND, str(shots), str(out)], os.environ | {LOG: str(log)}
+        running = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE)
+        deadline = time.monotonic() + 60
+        while len(list((folder.claims / "owners").glob("*.json"))) < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        time.sleep(0.5)
+        folder.note_failure("bad", FailureRecord(other.token, "refused", compose("batch-list-empty"), (), None))
+        other.release(file_name("bad"))
+        told = running.communicate(timeout=60)[0]
+    assert json.loads(told) == {"bad": "failed"}
+    assert not log.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", [1, 2])
+def test_kills_at_any_moment_change_no_byte(tmp_path: Path, processes: int) -> None:
+    """SIGKILL at twenty random moments, to every process of the batch; then one run to its end."""
+    rng = random.Random(20 + processes)
+    shots = pinned_captures(tmp_path / "shots", 60)
+    run_pinned(shots, tmp_path / "undisturbed")
+    out, log = tmp_path / "heads", tmp_path / "log"
+    environment = os.environ | {SECONDS: "0.1", LOG: str(log)}
+    command = [*COMMAND, str(shots), str(out), "2"]
+    for _ in range(20):
+        quiet = {"cwd": ROOT, "env": environment, "stdout": subprocess.DEVNULL}
+        running = [subprocess.Popen(command, **quiet) for _ in range(processes)]
+        time.sleep(rng.uniform(0.0, 2.5))
+        for process in running:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    last = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, timeout=240, check=True)
+    assert set(json.loads(last.stdout).values()) <= {"made", "kept"}
+    assert everything_in(out) == everything_in(tmp_path / "undisturbed")
+    ended = [line.split()[2] for line in log.read_text().splitlines() if "ends" in line]
+    assert set(ended) == {f"s{k:04}" for k in range(60)}

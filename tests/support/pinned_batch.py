@@ -1,0 +1,94 @@
+"""Batches of ``pinned_work``: in this process, or as one of their own.
+
+python -m tests.support.pinned_batch FOLDER OUT [WORKERS] [K/N]
+"""
+
+import hashlib
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from server.batch.captures import find_captures
+from server.batch.folder import BatchFolder
+from server.batch.plan import BatchTask, plan_batch
+from server.batch.run import BatchRun, Outcome
+from server.batch.shards import WHOLE, Shard, read_shard
+from server.batch.summary import write_summary
+from tests.support.pinned_work import work
+
+
+def pinned_capture(folder: Path, seed: int, mode: str = "") -> Path:
+    (folder / "images").mkdir(parents=True)
+    (folder / "images" / "seed.txt").write_text(f"{seed}\n")
+    if mode:
+        (folder / "mode").write_text(mode)
+    return folder
+
+
+def pinned_captures(folder: Path, count: int) -> Path:
+    for seed in range(count):
+        pinned_capture(folder / f"s{seed:04}", seed)
+    return folder
+
+
+class Silent:
+    """An observer that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.pending = -1
+        self.told: list[tuple[str, str]] = []
+
+    def begin(self, pending: int) -> None:
+        self.pending = pending
+
+    def start(self, name: str) -> None:
+        self.told.append(("start", name))
+
+    def report(self, name: str, share: float) -> None:
+        assert 0 <= share <= 1
+
+    def leave(self, name: str) -> None:
+        self.told.append(("leave", name))
+
+    def end(self, outcome: Outcome) -> None:
+        self.told.append((outcome.state, outcome.name))
+
+
+def plan(folder: Path, out: Path, settings: Mapping[str, object] | None = None) -> tuple[BatchTask, ...]:
+    return plan_batch(find_captures(folder, out), settings or {}, None)
+
+
+def run_pinned(folder: Path, out: Path, *, workers: int = 2, shard: Shard = WHOLE, **given: Any) -> list[Outcome]:
+    """A batch of pinned captures in this process; ``given``: as ``BatchRun`` takes it, or ``settings``."""
+    tasks = plan(folder, out, given.pop("settings", None))
+    target = BatchFolder(out)
+    own = [task for task in tasks if shard.takes(task.capture.name)]
+    given = {"observer": Silent(), "variables": {}, "work": work, **given}
+    run = BatchRun(target, own, workers=workers, **given)
+    return run.run(lambda: write_summary(target, tasks))
+
+
+def everything_in(out: Path) -> dict[str, str]:
+    """sha256 of every file of a batch, without what tells seconds: report.json, and of the table that column."""
+    found = {path.relative_to(out).as_posix(): path for path in out.rglob("*") if path.is_file() or path.is_symlink()}
+    plain = {name: path for name, path in found.items() if not name.endswith(("report.json", "heads.parquet"))}
+    told = {name: hashlib.sha256(_without_seconds(path)).hexdigest() for name, path in plain.items()}
+    return told | {name: "" for name in found.keys() - plain.keys()}
+
+
+def _without_seconds(path: Path) -> bytes:
+    data = path.read_bytes()
+    if path.name != "heads.csv":
+        return data
+    rows = [line.split(",") for line in data.decode().splitlines()]
+    at = rows[0].index("seconds")
+    return "\n".join(",".join(cells[:at] + cells[at + 1 :]) for cells in rows).encode()
+
+
+if __name__ == "__main__":
+    folder, out, *more = sys.argv[1:]
+    shard = read_shard(more[1]) if len(more) > 1 else WHOLE
+    ended = run_pinned(Path(folder), Path(out), workers=int(more[0]) if more else 2, shard=shard)
+    print(json.dumps({outcome.name: outcome.state for outcome in ended}))  # noqa: T201
