@@ -18,12 +18,13 @@ from rig.formats.picture_names import is_junk
 from rig.formats.shot_files import BESIDE_PICTURES, listed_pictures
 from rig.messages.message import Message, compose
 from rig.text import suggest
-from server.tasks.settings_file import read_settings_file
+from server.tasks.settings_file import read_settings_file, reason_of
 
 ARCHIVES = (".tar.gz", ".tgz", ".tar", ".zip")
 COLUMNS = ("capture", "name", "subject", "session", "settings")
 MIN_PICTURES = 3  # of a folder of photographs alone: fewer are no capture, and perhaps somebody's notes
 TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html")  # of OUT itself
+MORE = "more"  # of a row: how many cells it has beyond the columns
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
 
@@ -72,32 +73,35 @@ def read_list(path: Path) -> tuple[BatchCapture, ...]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        raise InputError(path.name, [compose("batch-list-unreadable", reason=str(error))]) from error
+        raise InputError(path.name, [compose("batch-list-unreadable", reason=reason_of(error))]) from error
     faults: list[Message] = []
     rows = list(_csv_rows(text, faults) if _is_csv(path, text) else _text_rows(text))
-    found, lines = [], []
+    found: dict[int, BatchCapture] = {}
     for line, row in rows:
         wrong: list[Message] = []
-        found.append(_capture_of(row, path.parent, wrong))
-        lines.append(line)
+        if MORE in row:
+            wrong.append(compose("batch-cells-many", cells=len(row) - 1 + int(row[MORE]), columns=len(row) - 1))
+        else:
+            found[line] = _capture_of(row, path.parent, wrong)
         faults += [compose("batch-line", line=line, fault=fault) for fault in wrong]
     if not rows and not faults:
         faults.append(compose("batch-list-empty"))
-    told = [compose("batch-line-number", line=line) for line in lines]
-    faults += _name_faults([capture for capture in found if capture.name], [message.text for message in told])
+    named = {line: capture for line, capture in found.items() if capture.name}
+    places = [compose("batch-line-number", line=line).text for line in named]
+    faults += _name_faults(list(named.values()), places)
     if faults:
         raise InputError(path.name, faults)
-    return tuple(found)
+    return tuple(found.values())
 
 
 def _walk(folder: Path, out: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
-        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth"):
+        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth") or path.name in BESIDE_PICTURES:
             continue
         if is_capture(path):
             yield path
         elif path.is_dir() and not path.is_symlink() and not (path / "report.json").is_file():
-            yield from () if path.name in BESIDE_PICTURES else _walk(path, out)
+            yield from _walk(path, out)
 
 
 def _name(path: Path, folder: Path) -> str:
@@ -123,6 +127,8 @@ def _text_rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
 
 
 def _csv_rows(text: str, faults: list[Message]) -> Iterator[tuple[int, dict[str, str]]]:
+    if not text.strip():
+        return
     reader = csv.reader(text.splitlines(keepends=True), skipinitialspace=True)
     header = [cell.strip() for cell in next(reader, [])]
     faults += _header_faults(header)
@@ -131,11 +137,9 @@ def _csv_rows(text: str, faults: list[Message]) -> Iterator[tuple[int, dict[str,
     for cells in reader:
         if not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#"):
             continue
-        if len(cells) > len(header):
-            fault = compose("batch-cells-many", cells=len(cells), columns=len(header))
-            faults.append(compose("batch-line", line=reader.line_num, fault=fault))
-            continue
-        yield reader.line_num, {name: cell.strip() for name, cell in zip(header, cells, strict=False)}
+        row = {name: cell.strip() for name, cell in zip(header, cells, strict=False)}
+        more = len(cells) - len(header)
+        yield reader.line_num, row | ({MORE: str(more)} if more > 0 else {})
 
 
 def _header_faults(header: list[str]) -> list[Message]:
@@ -187,7 +191,7 @@ def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Messag
     """Of names that cannot be folders below OUT, or would be one folder, or one within the other."""
     faults: list[Message] = []
     folded: dict[str, list[str]] = {}
-    for capture, place in zip(captures, places, strict=False):
+    for capture, place in zip(captures, places, strict=True):
         folded.setdefault(capture.name.casefold(), []).append(place)
         parts = capture.name.split("/")
         if any(not part or part.startswith(".") or "\0" in part or "\\" in part for part in parts) or (

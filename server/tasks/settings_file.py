@@ -16,10 +16,15 @@ def read_settings_file(path: Path) -> dict[str, object]:
         braced = path.suffix == ".json" or (path.suffix != ".toml" and text.lstrip().startswith("{"))
         document = json.loads(text) if braced else tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(path.name, [compose("settings-unreadable", reason=str(error))]) from error
+        raise InputError(path.name, [compose("settings-unreadable", reason=reason_of(error))]) from error
     if not isinstance(document, dict):
         raise InputError(path.name, [compose("settings-no-table")])
     return document
+
+
+def reason_of(error: OSError | ValueError | RecursionError) -> str:
+    """Returns why a file cannot be read, without its path, which is said beside it."""
+    return getattr(error, "strerror", None) or str(error)
 
 
 def settings_document(path: Path | None, **given: str | Mapping[str, object] | None) -> dict[str, object]:

@@ -1,0 +1,146 @@
+"""Captures below a folder and in lists, and every fault of a list at once."""
+
+from pathlib import Path
+
+import pytest
+
+from rig.errors import InputError
+from rig.formats.archive import pack_folder
+from rig.messages.message import texts_of
+from server.batch.captures import BatchCapture, find_captures, read_list
+from tests.support.services import small_capture
+
+
+def faults_of(path: Path) -> list[str]:
+    with pytest.raises(InputError) as caught:
+        read_list(path)
+    return texts_of(caught.value.faults)
+
+
+@pytest.fixture
+def shots(tmp_path: Path) -> Path:
+    """Two captures in one session, one packed, photographs alone, and much that is none."""
+    folder = tmp_path / "shots"
+    small_capture(folder / "monday" / "anna")
+    small_capture(folder / "monday" / "bert", seed=1)
+    small_capture(folder / "packed")
+    pack_folder(folder / "packed", folder / "carl.tar.gz")
+    (folder / "packed").rename(tmp_path / "elsewhere")
+    (folder / "photos").mkdir()
+    for picture in ("a.jpg", "b.jpg", "c.jpg"):
+        (folder / "photos" / picture).write_bytes(b"")
+    (folder / "notes").mkdir()
+    (folder / "notes" / "lamp.jpg").write_bytes(b"")
+    (folder / "anna.truth").mkdir()
+    (folder / "anna.truth" / "cameras.json").write_text("{}")
+    (folder / "background").mkdir()
+    for picture in ("a.png", "b.png", "c.png"):
+        (folder / "background" / picture).write_bytes(b"")
+    (folder / "old-result" / "overlays").mkdir(parents=True)
+    (folder / "old-result" / "report.json").write_text("{}")
+    (folder / ".hidden").mkdir()
+    (folder / ".hidden" / "cameras.json").write_text("{}")
+    return folder
+
+
+def test_captures_are_found_below_a_folder_and_nothing_else(shots: Path) -> None:
+    (shots / "heads" / "images").mkdir(parents=True)
+    found = find_captures(shots, shots / "heads")
+    assert [capture.name for capture in found] == ["carl", "monday/anna", "monday/bert", "photos"]
+    assert found[1] == BatchCapture("monday/anna", shots / "monday" / "anna")
+
+
+def test_a_folder_without_captures_and_one_that_is_a_capture_are_refused(shots: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is a capture itself: name the folder above it"):
+        find_captures(shots / "monday" / "anna", tmp_path / "out")
+    with pytest.raises(InputError, match="notes: holds no capture"):
+        find_captures(shots / "notes", tmp_path / "out")
+
+
+def test_a_folder_and_its_archive_would_be_one_result(shots: Path) -> None:
+    small_capture(shots / "carl")
+    with pytest.raises(InputError, match="carl, carl.tar.gz have the same name, carl"):
+        find_captures(shots, shots / "heads")
+
+
+def test_a_plain_list_counts_from_where_it_lies(shots: Path) -> None:
+    (shots / "list.txt").write_text("# the first day\nmonday/bert\n\n  carl.tar.gz  \n")
+    assert [(c.name, c.path) for c in read_list(shots / "list.txt")] == [
+        ("monday/bert", shots / "monday" / "bert"),
+        ("carl", shots / "carl.tar.gz"),
+    ]
+
+
+def test_a_csv_says_subject_session_name_and_settings(shots: Path, tmp_path: Path) -> None:
+    (shots / "deep.toml").write_text('detail = "photo"\n')
+    (shots / "study.csv").write_text(
+        "subject,capture,settings,session,name\n"
+        "S01,monday/anna,deep.toml,day 1,\n"
+        f'"S02, twin",{tmp_path / "elsewhere"},"{{""front"": ""cam01""}}",day 2,twins/s02\n'
+        "# S03 did not come,,,,\n"
+        "S04,carl.tar.gz\n",
+        encoding="utf-8-sig",
+    )
+    anna, twin, carl = read_list(shots / "study.csv")
+    assert (anna.name, anna.subject, anna.session, dict(anna.settings)) == (
+        "monday/anna", "S01", "day 1", {"detail": "photo"},
+    )  # fmt: skip
+    assert (twin.name, twin.subject, dict(twin.settings)) == ("twins/s02", "S02, twin", {"front": "cam01"})
+    assert (carl.name, carl.subject, carl.session, dict(carl.settings)) == ("carl", "S04", "", {})
+
+
+def test_every_fault_of_a_list_is_named_with_its_line(shots: Path) -> None:
+    (shots / "study.csv").write_text(
+        "capture,subject,name,settings\n"
+        "monday/anna,S01,,\n"
+        "monday/gone,S02,,\n"
+        "notes/lamp.jpg,S03,,\n"
+        ",S04,,\n"
+        "monday/bert,S05,monday/anna,{\n"
+        "carl.tar.gz,S06,../up,no.toml\n"
+        "photos,S07,,,,\n"
+        "photos,S08,monday/anna/deep,[]\n"
+    )
+    told = faults_of(shots / "study.csv")
+    for line, words in [
+        (3, f"{shots / 'monday/gone'} is not there"),
+        (4, "lamp.jpg is no capture"),
+        (5, "names no capture"),
+        (6, "settings: cannot be read"),
+        (7, "no.toml: cannot be read"),
+        (8, "6 cells, and the first row names 4 columns"),
+        (9, "[]: cannot be read"),
+    ]:
+        assert [fault for fault in told if fault.startswith(f"line {line}: ") and words in fault], (line, told)
+    assert "line 2, line 6 have the same name, monday/anna: say another one in the column name" in told
+    assert [fault for fault in told if fault.startswith("line 7: '../up' cannot name a folder")]
+    assert [fault for fault in told if fault.startswith("monday/anna/deep would lie within the result of monday/anna")]
+    assert len(told) == 10
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("capture,sesion\n.,x\n", "no column 'sesion' is known; did you mean session?"),
+        ("capture,zzz\n.,x\n", "no column 'zzz' is known; there are capture, name, subject, session, settings"),
+        ("subject,name\nx,y\n", "no column is called capture; the first row names subject, name"),
+        ("capture,capture\n.,.\n", "the column capture is named twice"),
+        ("", "names no capture"),
+        ("capture\n", "names no capture"),
+    ],
+)
+def test_a_wrong_first_row_is_named(tmp_path: Path, text: str, fault: str) -> None:
+    (tmp_path / "study.csv").write_text(text)
+    assert fault in faults_of(tmp_path / "study.csv")
+
+
+@pytest.mark.parametrize("name", ["heads.csv", "sheet.html", ".batch", "a//b", "a/.b", "a\\b", "/a"])
+def test_names_that_would_be_other_files_are_refused(tmp_path: Path, name: str) -> None:
+    small_capture(tmp_path / "anna")
+    (tmp_path / "study.csv").write_text(f"capture,name\nanna,{name}\n")
+    assert "cannot name a folder of results" in " ".join(faults_of(tmp_path / "study.csv"))
+
+
+def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "study.csv").write_bytes(b"\xff\xfe\x00")
+    assert "cannot be read" in faults_of(tmp_path / "study.csv")[0]

@@ -1,0 +1,117 @@
+"""Results complete or absent, and what a record says of them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rig.messages.message import compose
+from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, file_name
+
+ORIGIN = Origin("11" * 32, "22" * 32, "33" * 32, "0.1.0")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> BatchFolder:
+    return BatchFolder(tmp_path / "heads")
+
+
+def publish(folder: BatchFolder, name: str, content: bytes = b"mesh", origin: Origin = ORIGIN) -> None:
+    attempt = folder.new_attempt("token")
+    (attempt / "result" / "head.ply").write_bytes(content)
+    (attempt / "result" / "overlays").mkdir()
+    (attempt / "result" / "overlays" / "cam00.png").write_bytes(b"png")
+    (attempt / "result" / "report.json").write_text('{"seconds": 1}')
+    folder.publish(name, attempt, origin)
+
+
+def test_a_published_result_says_what_it_follows_from(folder: BatchFolder) -> None:
+    publish(folder, "monday/anna")
+    assert folder.origin("monday/anna") == ORIGIN
+    assert folder.report("monday/anna") == {"seconds": 1}
+    assert folder.origin("monday") is None
+    record = json.loads((folder.result("monday/anna") / "batch.json").read_text())
+    assert record["files"] == {"head.ply": 4, "overlays/cam00.png": 3}
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda result: (result / "head.ply").unlink(),
+        lambda result: (result / "head.ply").write_bytes(b"me"),
+        lambda result: (result / "report.json").unlink(),
+        lambda result: (result / "batch.json").write_text("{"),
+        lambda result: (result / "batch.json").write_text('{"format": "eigenhead-batch-result/2"}'),
+        lambda result: (result / "overlays" / "cam00.png").unlink(),
+    ],
+)
+def test_a_damaged_result_is_none(folder: BatchFolder, damage) -> None:  # noqa: ANN001
+    publish(folder, "anna")
+    damage(folder.result("anna"))
+    assert folder.origin("anna") is None
+
+
+def test_a_new_result_takes_the_place_of_the_old_one_as_a_whole(folder: BatchFolder) -> None:
+    publish(folder, "anna")
+    (folder.result("anna") / "head.obj").write_bytes(b"asked for once")
+    other = replace(ORIGIN, input_sha256="44" * 32)
+    publish(folder, "anna", b"another", other)
+    assert folder.origin("anna") == other
+    assert not (folder.result("anna") / "head.obj").exists()
+
+
+def test_of_two_who_publish_the_second_is_refused(folder: BatchFolder) -> None:
+    """Where both found nothing there; a folder with files is never replaced by a rename."""
+    first, second = folder.new_attempt("a"), folder.new_attempt("b")
+    for attempt in (first, second):
+        (attempt / "result" / "report.json").write_text("{}")
+    folder.publish("anna", first, ORIGIN)
+    with pytest.raises(OSError, match="not empty"):
+        (second / "result").rename(folder.result("anna"))
+
+
+def test_files_of_nobody_stop_a_replacement(folder: BatchFolder) -> None:
+    publish(folder, "anna")
+    folder.check_replaceable("anna")
+    folder.check_replaceable("nobody")
+    (folder.result("anna") / "notes.txt").write_text("mine")
+    with pytest.raises(ForeignFiles, match=r"holds what is no result \(notes.txt\)"):
+        publish(folder, "anna", b"another")
+    assert (folder.result("anna") / "head.ply").read_bytes() == b"mesh"
+
+
+def test_the_version_is_no_reason_to_make_a_head_again() -> None:
+    assert ORIGIN.is_of(replace(ORIGIN, version="0.2.0"))
+    for other in ("input_sha256", "settings_sha256", "model_sha256"):
+        assert not ORIGIN.is_of(replace(ORIGIN, **{other: "44" * 32}))
+
+
+def test_a_failure_is_kept_until_the_capture_is_done(folder: BatchFolder) -> None:
+    failure = FailureRecord("token", "input", compose("batch-list-empty"), (compose("settings-no-table"),), ORIGIN)
+    folder.note_failure("anna", failure)
+    assert folder.failure("anna") == failure
+    assert folder.failure("bert") is None
+    publish(folder, "anna")
+    assert folder.failure("anna") is None
+
+
+def test_attempts_of_the_dead_and_empty_folders_go(folder: BatchFolder) -> None:
+    one, two = folder.new_attempt("a"), folder.new_attempt("a")
+    three = folder.new_attempt("b")
+    assert len({one, two, three}) == 3
+    folder.remove_attempts(lambda token: token == "b")
+    assert list(folder.attempts.iterdir()) == [three]
+    folder.remove_empty_folders()
+    assert folder.work.exists()
+    folder.remove_attempts(lambda token: False)
+    folder.remove_empty_folders()
+    assert not folder.work.exists()
+
+
+def test_file_names_are_short_readable_and_apart() -> None:
+    names = ["monday/anna", "monday-anna", "monday.anna", "x" * 300, "x" * 301, "Ä/Ö", "\udcff"]
+    files = [file_name(name) for name in names]
+    assert len(set(files)) == len(names)
+    assert all(len(file.encode("utf-8", "surrogateescape")) < 140 and "/" not in file for file in files)
+    assert files[0].startswith("monday-anna.")
