@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rig.atomic_write import write_atomically
+from rig.text import printable
 from server.batch.table import Column, Row, Value
 
 CSV, PARQUET = "heads.csv", "heads.parquet"
@@ -38,7 +39,7 @@ def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
     writer = csv.writer(stream)
     writer.writerow([column.name for column in columns])
     writer.writerows([_cell(row[column.name]) for column in columns] for row in rows)
-    return stream.getvalue().encode("utf-8", "backslashreplace")
+    return stream.getvalue().encode()
 
 
 def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
@@ -51,9 +52,8 @@ def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
         pyarrow.field(column.name, kinds[column.kind], metadata={"unit": column.unit, "description": column.words})
         for column in columns
     ]
-    arrays = [
-        pyarrow.array([row[column.name] for row in rows], kinds[column.kind], from_pandas=False) for column in columns
-    ]
+    cells = [[_encodable(row[column.name]) for row in rows] for column in columns]
+    arrays = [pyarrow.array(values, kinds[column.kind]) for values, column in zip(cells, columns, strict=True)]
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(pyarrow.table(arrays, pyarrow.schema(fields)), sink)
     return sink.getvalue().to_pybytes()
@@ -62,4 +62,9 @@ def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
 def _cell(value: Value) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    return "" if value is None else repr(value) if isinstance(value, float) else str(value)
+    return "" if value is None else repr(value) if isinstance(value, float) else str(_encodable(value))
+
+
+def _encodable(value: Value) -> Value:
+    """Names of files need not be UTF-8."""
+    return printable(value) if isinstance(value, str) else value

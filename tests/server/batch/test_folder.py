@@ -46,7 +46,7 @@ def test_a_published_result_says_what_it_follows_from(folder: BatchFolder) -> No
         lambda result: (result / "overlays" / "cam00.png").unlink(),
     ],
 )
-def test_a_damaged_result_is_none(folder: BatchFolder, damage) -> None:  # noqa: ANN001
+def test_a_damaged_result_is_none(folder: BatchFolder, damage) -> None:
     publish(folder, "anna")
     damage(folder.result("anna"))
     assert folder.origin("anna") is None
