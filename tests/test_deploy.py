@@ -2,6 +2,7 @@
 
 import configparser
 import importlib.util
+import os
 import re
 import shutil
 import subprocess
@@ -104,3 +105,30 @@ def test_a_debian_is_tried_only_where_one_can_be_made(step: str, status: int, to
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == status
     assert told in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("variables", "share"),
+    [
+        ({}, "1/1"),
+        ({"ID": "3", "MIN": "1", "COUNT": "8", "STEP": "1"}, "3/8"),
+        ({"ID": "0", "MIN": "0", "COUNT": "8", "STEP": "1"}, "1/8"),
+        ({"ID": "9", "MIN": "1", "COUNT": "8", "STEP": "2"}, "5/8"),
+    ],
+)
+def test_an_array_of_slurm_is_one_share_a_job(tmp_path: Path, variables: dict[str, str], share: str) -> None:
+    (tmp_path / "eigenhead").write_text('#!/bin/sh\nprintf "%s|" "$@"\n')
+    (tmp_path / "eigenhead").chmod(0o755)
+    told = {f"SLURM_ARRAY_TASK_{name}": value for name, value in variables.items()}
+    done = subprocess.run(
+        [DEPLOY / "batch.slurm", "a study.csv", "heads", "--detail", "photo"],
+        env=os.environ | told | {"EIGENHEAD": str(tmp_path / "eigenhead")},
+        capture_output=True, text=True, timeout=20, check=True,
+    )  # fmt: skip
+    assert done.stdout == f"batch|a study.csv|--out|heads|--shard|{share}|--detail|photo|"
+
+
+def test_the_job_of_slurm_says_what_it_needs() -> None:
+    done = subprocess.run([DEPLOY / "batch.slurm"], capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode != 0
+    assert "name a folder of captures or a list: sbatch" in done.stderr

@@ -1,15 +1,21 @@
 """Processes of the service run this checkout's code, wherever they start."""
 
+import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
-from server.processes import python_command, python_environment
-from server.tasks.child import Child
+from rig.progress import Progress
+from server.processes import process_identity, process_started, python_command, python_environment
+from server.tasks.child import Bench, Child
 from server.tasks.egl import try_egl
 from tests.support.hostile_folder import hostile_folder
+from tests.support.services import ROOT
 
 
 @pytest.fixture
@@ -42,3 +48,51 @@ def test_the_command_of_the_checkout_runs_beside_foreign_packages(marker: Path) 
     done = subprocess.run([command, "--help"], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     assert not marker.exists()
+
+
+def test_who_a_process_is() -> None:
+    machine, host, pid, started = process_identity()
+    assert (process_identity()[0], pid, bool(host)) == (machine, os.getpid(), True)
+    assert process_started(pid) == started > 0
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    assert gone.wait() == 0
+    assert process_started(gone.pid) == 0
+
+
+CHILD = "import os, time\nfrom server.processes import end_with_parent\nend_with_parent({parent})\ntime.sleep(60)"
+PARENT = """
+import os, subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", {child!r}.format(parent=os.getpid())])
+print(child.pid, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_process_ends_with_the_one_that_started_it() -> None:
+    """Also by SIGKILL, of which the parent can tell nobody; and where the parent was gone before."""
+    command = [sys.executable, "-c", PARENT.format(child=CHILD)]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        await_true(lambda: b"end_with_parent" in Path(f"/proc/{child}/cmdline").read_bytes())
+        time.sleep(0.3)
+        parent.kill()
+    await_true(lambda: process_started(child) == 0)
+    orphan = subprocess.run([sys.executable, "-c", CHILD.format(parent=1)], cwd=ROOT, timeout=20, check=False)
+    assert orphan.returncode == 1
+
+
+def await_true(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_child_has_the_variables_that_it_was_given() -> None:
+    with closing(Child(variables={"EIGENHEAD_THREADS": "3"})) as child:
+        assert child.remote(thread_variable)() == "3"
+
+
+def thread_variable(bench: Bench, report: Progress) -> str:
+    return os.environ["EIGENHEAD_THREADS"]

@@ -3,12 +3,15 @@
 python -m tests.support.pinned_batch FOLDER OUT [WORKERS] [K/N]
 """
 
+import csv
 import hashlib
 import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import pyarrow.parquet
 
 from server.batch.captures import find_captures
 from server.batch.folder import BatchFolder
@@ -71,20 +74,22 @@ def run_pinned(folder: Path, out: Path, *, workers: int = 2, shard: Shard = WHOL
 
 
 def everything_in(out: Path) -> dict[str, str]:
-    """sha256 of every file of a batch, without what tells seconds: report.json, and of the table that column."""
+    """sha256 of every file of a batch, without the seconds that report.json and the tables tell."""
     found = {path.relative_to(out).as_posix(): path for path in out.rglob("*") if path.is_file() or path.is_symlink()}
-    plain = {name: path for name, path in found.items() if not name.endswith(("report.json", "heads.parquet"))}
-    told = {name: hashlib.sha256(_without_seconds(path)).hexdigest() for name, path in plain.items()}
-    return told | {name: "" for name in found.keys() - plain.keys()}
+    return {name: hashlib.sha256(_without_seconds(path)).hexdigest() for name, path in sorted(found.items())}
 
 
 def _without_seconds(path: Path) -> bytes:
-    data = path.read_bytes()
-    if path.name != "heads.csv":
-        return data
-    rows = [line.split(",") for line in data.decode().splitlines()]
-    at = rows[0].index("seconds")
-    return "\n".join(",".join(cells[:at] + cells[at + 1 :]) for cells in rows).encode()
+    if path.name == "report.json":
+        report = json.loads(path.read_text())
+        return json.dumps({key: value for key, value in report.items() if key != "seconds"}).encode()
+    if path.name == "heads.parquet":
+        rows = pyarrow.parquet.read_table(path).drop_columns("seconds").to_pylist()
+        return json.dumps(rows).encode()
+    if path.name == "heads.csv":
+        with path.open(newline="", encoding="utf-8") as file:
+            return json.dumps([row | {"seconds": ""} for row in csv.DictReader(file)]).encode()
+    return path.read_bytes()
 
 
 if __name__ == "__main__":

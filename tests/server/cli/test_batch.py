@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -12,11 +13,13 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from rig.render.renderer import Renderer
 from server.batch import run as batch_run
 from server.cli.main import app
-from tests.support.pinned_batch import pinned_capture, pinned_captures
+from tests.support.pinned_batch import everything_in, pinned_capture, pinned_captures
 from tests.support.pinned_work import LOG, SECONDS, work
 from tests.support.services import ROOT
+from tests.support.small_studio import small_studio_captures
 
 
 @pytest.fixture
@@ -142,3 +145,29 @@ def test_a_scheduler_and_ctrl_c_end_it_and_leave_nothing(shots: Path, tmp_path: 
         assert running.wait(20) == 130
     assert list(out.iterdir()) == []
     assert not [child for child in children if Path(f"/proc/{child}").exists()]
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path, renderer: Renderer) -> None:
+    """Three heads of the studio, the command as it is typed, SIGKILL four times within the time that it needs."""
+    rng = random.Random(37)
+    shots = small_studio_captures(tmp_path / "shots", 3, renderer)
+    command = [sys.executable, "-m", "server.cli", "batch", str(shots), "--detail", "span", "--surface", "head"]
+
+    def run(out: Path) -> "subprocess.Popen[bytes]":
+        return subprocess.Popen([*command, "--workers", "2", "--out", str(out)], cwd=ROOT, stdout=subprocess.DEVNULL)
+
+    began = time.monotonic()
+    with run(tmp_path / "undisturbed" / "heads") as whole:
+        assert whole.wait(240) == 0
+    seconds, out, left = time.monotonic() - began, tmp_path / "heads", []
+    for _ in range(4):
+        with run(out) as running:
+            time.sleep(rng.uniform(0.3, 0.8) * seconds)
+            running.kill()
+        left.append(sorted(path.name for path in out.iterdir()))
+    with run(out) as last:
+        assert last.wait(240) == 0
+    assert everything_in(out) == everything_in(tmp_path / "undisturbed" / "heads")
+    assert any(".batch" in names for names in left)  # one of them at least was hit at work

@@ -1,0 +1,30 @@
+"""Small captures of the simulated studio: real heads where seconds count."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.eigenheads.model import load_model
+from rig.formats.capture_folder import write_capture
+from rig.formats.work_size import work_rig
+from rig.render.renderer import Renderer
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import simulate
+from rig.studio.sensor.preset import CLEAN
+from server.tasks.subjects import drawn_subject
+
+CAMERAS = ("cam00", "cam03", "cam04", "cam07", "cam08", "cam01")
+PIXELS = 320 * 240
+
+
+def small_studio_captures(folder: Path, count: int, renderer: Renderer) -> Path:
+    """Captures ``s0``, ``s1`` ... of bald heads before an even backdrop; returns the folder."""
+    model = load_model()
+    rig = work_rig(default_layout().subset(list(CAMERAS)), PIXELS)
+    preset = replace(CLEAN, noise=0.01, plates=2, texture=False)
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        taken = simulate(drawn_subject(model, rng), rig, preset, rng, renderer=renderer)
+        write_capture(folder / f"s{seed}", replace(taken.capture, features={}), taken.rig)
+    return folder
