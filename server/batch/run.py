@@ -94,7 +94,7 @@ class BatchRun:
         self._failed_before: dict[str, str] = {}
         self._outcomes: dict[str, Outcome] = {}
 
-    def run(self, publish_table: Callable[[], None]) -> list[Outcome]:
+    def run(self, publish_table: Callable[[], object]) -> list[Outcome]:
         """Makes what is missing and returns how each capture ended, in the order of the tasks.
 
         ``publish_table`` is called at the end, by one process of all at a time. Raises OSError where the folder cannot

@@ -83,6 +83,7 @@ def test_thumbnails_are_the_right_side_the_front_and_the_left(tmp_path: Path) ->
     data = views_of(tmp_path / "turntable.png")
     assert data is not None
     small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert small is not None
     assert small.shape == (PANEL_PX[1], 3 * PANEL_PX[0])
     means = [float(panel.mean()) for panel in np.split(small, 3, axis=1)]
     assert means == pytest.approx([20, 20 + 20 * (count // 2), 20 * count], abs=2)
