@@ -18,6 +18,7 @@ from rig.errors import EigenheadError
 
 FORMAT = "eigenhead-model/2"  # 2: with expressions
 READABLE = ("eigenhead-model/1", FORMAT)
+DAMAGE = (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 class BadModel(EigenheadError):
@@ -27,6 +28,13 @@ class BadModel(EigenheadError):
         super().__init__(
             f"{path} cannot be used as a head model: {why}. A foreign model is read by `eigenhead model import`"
         )
+
+
+class Damaged(BadModel):
+    """A file of which a part is missing or cannot be read."""
+
+    def __init__(self, path: Path | str, fault: Exception) -> None:
+        super().__init__(path, f"damaged or incomplete ({fault})")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,8 +110,8 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
             if meta.get("format") not in READABLE:
                 raise BadModel(path, f"format {meta.get('format')!r}, wanted {FORMAT!r}")
             parts = _parts(meta, file)
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
-        raise BadModel(path, f"damaged or incomplete ({fault})") from None
+    except DAMAGE as fault:
+        raise Damaged(path, fault) from None
     return parts, hashlib.sha256(raw).hexdigest()
 
 
@@ -112,8 +120,8 @@ def expression_names(path: Path) -> tuple[str, ...]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return tuple(json.loads(file["meta"].tobytes()).get("expressions", ()))
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
-        raise BadModel(path, f"damaged or incomplete ({fault})") from None
+    except DAMAGE as fault:
+        raise Damaged(path, fault) from None
 
 
 def _parts(meta: dict, file: Mapping[str, np.ndarray]) -> ModelParts:

@@ -71,9 +71,9 @@ def _distance_transforms(
 
 
 def _distance_transform(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """``D(S)`` to the last bit. OpenCV's own differs by a unit in the last place from call to call, by where its buffers
-    lie, in pictures of less than 16384 pixels and on one core (it then calls IPP). Squares of distances between pixels
-    are integers, which the nearest one gives back up to 1400 px."""
+    """``D(S)`` to the last bit. OpenCV's own differs by a unit in the last place from call to call, by where its
+    buffers lie, in pictures of less than 16384 pixels and on one core (it then calls IPP). Squares of distances between
+    pixels are integers, which the nearest one gives back up to 1400 px."""
     distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     squares = np.square(distance, dtype=np.float64)
     return np.sqrt(np.rint(squares, out=squares), out=squares).astype(np.float32)

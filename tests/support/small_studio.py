@@ -19,7 +19,7 @@ PIXELS = 320 * 240
 
 
 def small_studio_captures(folder: Path, count: int, renderer: Renderer) -> Path:
-    """Captures ``s0``, ``s1`` ... of bald heads before an even backdrop; returns the folder."""
+    """Captures s0, s1 ... of bald heads before an even backdrop; returns the folder."""
     model = load_model()
     rig = work_rig(default_layout().subset(list(CAMERAS)), PIXELS)
     preset = replace(CLEAN, noise=0.01, plates=2, texture=False)
