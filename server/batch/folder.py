@@ -162,7 +162,7 @@ class BatchFolder:
         return self.work / "failures" / f"{file_name(name)}.json"
 
     def forget_failures_but_of(self, names: set[str]) -> None:
-        """Removes failures of captures that are in no list any more, and torn writes."""
+        """Removes failures of captures that the batch has no more, and writes that a kill tore."""
         retained = {self.failure_file(name).name for name in names}
         with suppress(FileNotFoundError):
             for path in (self.work / "failures").iterdir():

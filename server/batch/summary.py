@@ -21,6 +21,7 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     """Writes table and sheet of all captures of a batch, those of other shards too, and returns the files.
 
     Raises OSError."""
+    folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(_expressions(tasks))
     rows, cards = [], []
     for task in tasks:

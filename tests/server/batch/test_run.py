@@ -6,6 +6,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from rig.messages.message import compose
 from server.batch.claims import Claims
 from server.batch.folder import BatchFolder, FailureRecord, file_name
+from server.batch.run import Outcome
 from server.batch.shards import Shard
 from tests.support.pinned_batch import Silent, everything_in, pinned_capture, pinned_captures, run_pinned
 from tests.support.pinned_work import LOG, SECONDS
@@ -137,6 +139,36 @@ def test_a_failure_of_another_process_is_told_and_not_tried_twice(tmp_path: Path
         told = running.communicate(timeout=60)[0]
     assert json.loads(told) == {"bad": "failed"}
     assert not log.exists()
+
+
+def test_a_process_that_was_taken_for_dead_lays_nothing_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that was stopped for long: another has its capture when its work is done."""
+    shots, out, log = pinned_captures(tmp_path / "shots", 1), tmp_path / "heads", tmp_path / "log"
+    monkeypatch.setenv(SECONDS, "1.0")
+    monkeypatch.setenv(LOG, str(log))
+    folder, claim, ended = BatchFolder(out), file_name("s0000"), list[Outcome]()
+    runner = threading.Thread(target=lambda: ended.extend(run_pinned(shots, out)))
+    other = Claims(folder.claims)
+    with other.beating():
+        runner.start()
+        await_line(log, "begins s0000")
+        (folder.claims / claim).unlink()
+        assert other.take(claim)
+        await_line(log, "ends s0000")
+        time.sleep(0.5)
+        assert not folder.result("s0000").exists()
+        assert not list(folder.attempts.iterdir())
+        other.release(claim)
+        runner.join(60)
+    assert states(ended) == {"s0000": "made"}  # nobody had made it meanwhile
+    assert log.read_text().count("ends s0000") == 2
+
+
+def await_line(log: Path, words: str) -> None:
+    deadline = time.monotonic() + 60
+    while not log.exists() or words not in log.read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 @pytest.mark.slow

@@ -53,3 +53,12 @@ def test_every_expression_of_the_model_has_its_column(done: tuple[Path, Path]) -
     assert float(row["expression_jawOpen"]) > 0.1
     assert {float(row[name]) for name in shown} == {0.0, float(row["expression_jawOpen"])}
     assert rows(out)["bad"]["expression_jawOpen"] == ""
+
+
+def test_failures_of_captures_that_are_gone_are_forgotten(done: tuple[Path, Path]) -> None:
+    shots, out = done
+    folder = BatchFolder(out)
+    assert folder.failure("bad") is not None
+    write_summary(folder, [task for task in plan(shots, out) if task.capture.name != "bad"])
+    assert folder.failure("bad") is None
+    assert "bad" not in rows(out)

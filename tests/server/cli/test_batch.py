@@ -151,7 +151,7 @@ def test_a_scheduler_and_ctrl_c_end_it_and_leave_nothing(shots: Path, tmp_path: 
 @pytest.mark.gl
 @pytest.mark.timeout(900)
 def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path, renderer: Renderer) -> None:
-    """Two heads of the studio by one worker, the command as it is typed, SIGKILL thrice within the time that it needs."""
+    """Two heads of the studio by one worker, the command as it is typed, SIGKILL thrice while it is at work."""
     rng = random.Random(37)
     shots = small_studio_captures(tmp_path / "shots", 2, renderer)
     command = [sys.executable, "-m", "server.cli", "batch", str(shots), "--detail", "span", "--surface", "head"]
