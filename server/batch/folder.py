@@ -91,12 +91,11 @@ class BatchFolder:
 
     def new_attempt(self, token: str) -> Path:
         """Makes an empty folder for a result on its way, ``result`` and ``scratch`` within."""
-        self.attempts.mkdir(parents=True, exist_ok=True)
-        number = sum(path.name.startswith(f"{token}.") for path in self.attempts.iterdir())
+        number = 0
         while True:
             attempt = self.attempts / f"{token}.{number}"
             try:
-                attempt.mkdir()
+                attempt.mkdir(parents=True)  # whoever leaves may take the empty folder above away meanwhile
             except FileExistsError:
                 number += 1
                 continue
@@ -170,9 +169,13 @@ class BatchFolder:
                     path.unlink(missing_ok=True)
 
     def remove_empty_folders(self) -> None:
-        """Removes what is empty of ``.batch``."""
-        inner = (self.claims / "owners", self.claims, self.attempts, self.work / "failures", self.work)
-        for folder in inner:
+        """Removes what is empty of ``.batch``, unless others are at work in it."""
+        with suppress(OSError):
+            for folder in (self.claims / "owners", self.claims):
+                folder.rmdir()
+        if self.claims.exists():
+            return
+        for folder in (self.attempts, self.work / "failures", self.work):
             with suppress(OSError):
                 folder.rmdir()
 

@@ -109,6 +109,19 @@ def test_attempts_of_the_dead_and_empty_folders_go(folder: BatchFolder) -> None:
     assert not folder.work.exists()
 
 
+def test_empty_folders_stay_while_somebody_is_at_work(folder: BatchFolder) -> None:
+    owner = folder.claims / "owners" / "other.json"
+    for path in (owner.parent, folder.attempts, folder.work / "failures"):
+        path.mkdir(parents=True)
+    owner.write_text("{}")
+    folder.remove_empty_folders()
+    assert folder.attempts.exists()
+    assert (folder.work / "failures").exists()
+    owner.unlink()
+    folder.remove_empty_folders()
+    assert not folder.work.exists()
+
+
 def test_file_names_are_short_readable_and_apart() -> None:
     names = ["monday/anna", "monday-anna", "monday.anna", "x" * 300, "x" * 301, "Ä/Ö", "\udcff"]
     files = [file_name(name) for name in names]
