@@ -1,8 +1,6 @@
 """Every tunable of the pipeline, with its source. Values are frozen; unknown keys of a document are refused."""
 
 import dataclasses
-import hashlib
-import json
 import math
 import re
 import types
@@ -308,11 +306,6 @@ def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
 def document_from_settings(settings: Settings) -> dict[str, object]:
     """Settings as nested dictionaries, the form that ``settings_from_document`` reads."""
     return dataclasses.asdict(settings)
-
-
-def document_sha256(document: Mapping[str, Any]) -> str:
-    """Computes the sha256 of a document's canonical JSON, by which results name their settings and inputs."""
-    return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def _read(kind: type[T], document: Any, where: str, faults: list[Message]) -> T:

@@ -5,7 +5,8 @@ from importlib.metadata import version
 from typing import Any
 
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.settings import document_from_settings, document_sha256
+from pipeline.settings import document_from_settings
+from rig.digest import document_sha256
 
 
 def ply_comments(result: Reconstruction) -> list[str]:

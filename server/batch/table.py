@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pipeline.eigenheads.landmarks import NAMES
 from pipeline.evidence.measurements import DISTANCES
-from pipeline.settings import document_sha256
+from rig.digest import document_sha256
 from server.batch.captures import BatchCapture
 from server.batch.folder import FailureRecord, Origin
 

@@ -8,7 +8,7 @@ import pytest
 from pipeline.eigenheads.landmarks import NAMES
 from pipeline.eigenheads.model_file import expression_names
 from pipeline.eigenheads.model_names import model_path
-from pipeline.settings import document_sha256
+from rig.digest import document_sha256
 from rig.messages.message import compose
 from server.batch.captures import BatchCapture
 from server.batch.folder import FailureRecord, Origin

@@ -1,0 +1,11 @@
+"""By what files and documents are told apart."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+
+def document_sha256(document: Mapping[str, Any]) -> str:
+    """Computes the sha256 of a document's canonical JSON, by which results name their settings and inputs."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
