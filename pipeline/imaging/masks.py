@@ -26,6 +26,13 @@ def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"
     return cv2.dilate(mask.view(np.uint8), _disc(steps)).view(bool)
 
 
+def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The mask and what it encloses: background that does not reach the image's border."""
+    _, labels = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
+    reaching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    return mask | ~np.isin(labels, reaching)
+
+
 def spread(
     values: Float32[np.ndarray, "h w c"], weight: Float32[np.ndarray, "h w"], sigma: float
 ) -> Float32[np.ndarray, "h w c"]:

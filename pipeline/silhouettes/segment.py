@@ -38,7 +38,6 @@ UNDECIDED = 0.3  # from one half: share of a cut's windows that is neither yes n
 UNDECIDED_PX = 15  # side of a window ...
 UNDECIDED_FILLED = 0.6  # ... and its part that is undecided where the outline is a guess
 NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
-SEEDED_VIEWS = 8  # fewer do not tell the subject by each other, and begin with its face
 BODY_FILLS = 0.75  # of the subject's width is on the border where shoulders leave; a cut above the brow leaves less
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
@@ -88,7 +87,7 @@ def _without_plates(
     from pipeline.silhouettes.without_plates.decide import decide_without_plates  # packages that few captures need
     from pipeline.silhouettes.without_plates.head_seed import find_head_seed
 
-    head = find_head_seed(capture.images, rig) if len(rig) < SEEDED_VIEWS else None
+    head = find_head_seed(capture.images, rig)
     found = decide_without_plates(
         capture.images, rig, settings, head=head, report=lambda share: report("segmentation", 0.8 * share)
     )

@@ -64,7 +64,10 @@ def decide_without_plates(
     }
     told = partial(_between, report, POINTS_SHARE, MASKS_SHARE)
     found = search_masks(small, rig, volume, background, bounded=plane is not None, head=head, report=told)
-    decisions = {name: decision_without_plate(images[name], small[name], found[name], settings) for name in rig.names}
+    decisions = {
+        name: decision_without_plate(images[name], small[name], found[name], settings, solid=head is not None)
+        for name in rig.names
+    }
     cluttered = {n for n, one in decisions.items() if plane is not None or plate_noise(one) > PLATE_NOISE_MOST}
     if not cluttered:
         return WithoutPlates(decisions, {})

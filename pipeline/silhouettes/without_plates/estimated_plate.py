@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.imaging.masks import dilated, eroded, spread
+from pipeline.imaging.masks import dilated, eroded, spread, without_holes
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import Background
 from pipeline.silhouettes.foreground import CONCLUSIVE, Decision, colours_apart, find_mixtures, whole_subject
@@ -18,6 +18,7 @@ from pipeline.silhouettes.without_plates.mask_search import CoarseMask
 MARGIN = 2  # coarse pixels beyond the mask in which the subject may still be
 NEARBY_PX = 2.5  # coarse pixels: sigma of the window that the plate is taken from
 NOISE_WINDOW_PX = 6.0  # of the window in which the guess is judged
+SOLID_ODDS = np.float32(4.0)  # of what a head encloses
 NOISE_LEAST = 0.7  # levels: what a sensor and 8 bits leave
 
 
@@ -26,9 +27,16 @@ def decision_without_plate(
     coarse: Float32[np.ndarray, "h w 3"],
     found: CoarseMask,
     settings: SegmentationSettings,
+    *,
+    solid: bool = False,
 ) -> Decision:
-    """The decision that the present matting refines."""
+    """The decision that the present matting refines. ``solid``: a head, in which no backdrop is seen: what is enclosed
+    is skin or hair of the wall's colour."""
     mask, others = whole_subject(found.mask, found.odds < -1, settings)
+    odds = found.odds
+    if solid:
+        holes = without_holes(mask) & ~mask
+        mask, odds = mask | holes, np.where(holes, np.maximum(odds, SOLID_ODDS), odds)
     outside = ~dilated(mask, MARGIN)
     background = estimated_background(image, coarse, outside)
     tolerance = settings.tolerance_levels + settings.tolerance_share * background.coarse
@@ -37,9 +45,9 @@ def decision_without_plate(
     paint = spread(coarse, eroded(mask, 1) * away / (1 + mixture**2), 2.0)
     clear = colours_apart(paint, background.coarse, variance) > CONCLUSIVE
     mixed = (mixture > 1) & (away > (2 * background.noise.mean(axis=2)) ** 2)
-    probability = 1 / (1 + np.exp(-found.odds.astype(np.float64)))
+    probability = 1 / (1 + np.exp(-odds.astype(np.float64)))
     plain = outside & False
-    return Decision(coarse, background, found.odds, probability, mask, others, paint, found.odds, clear, plain, mixed)
+    return Decision(coarse, background, odds, probability, mask, others, paint, odds, clear, plain, mixed)
 
 
 def estimated_background(

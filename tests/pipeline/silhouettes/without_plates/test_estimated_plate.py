@@ -64,3 +64,20 @@ def test_the_matting_finds_the_edge_to_a_fraction_of_a_pixel() -> None:
     inside = np.zeros(away.shape, bool)
     inside[matte.box] = matte.alpha > 0.5
     assert np.count_nonzero(inside ^ (away < 0)) < 0.3 * 2 * np.pi * RADIUS  # 0.3 px all around
+
+
+def test_a_head_encloses_no_backdrop() -> None:
+    """Skin of the wall's colour is a hole of the coarse mask, and was one of the outline."""
+    image, _, away = photograph(0.0)
+    small, from_edge = coarse_of(image, away)
+    row, column = np.mgrid[:240, :320]
+    hole = np.hypot(column - 170, row - 120) < 15
+    odds = np.where(hole, -6.0, np.clip(-3.0 * from_edge, -10, 10)).astype(np.float32)
+    nothing = np.zeros_like(odds)
+    found = CoarseMask(odds, (from_edge < 0) & ~hole, OtherViews(nothing, nothing > 1))
+    settings = SegmentationSettings()
+    assert not decision_without_plate(image, small, found, settings).mask[hole].all()
+    solid = decision_without_plate(image, small, found, settings, solid=True)
+    assert solid.mask[hole].all()
+    assert (solid.probability[hole] > 0.95).all()
+    assert np.array_equal(solid.mask & ~hole, decision_without_plate(image, small, found, settings).mask & ~hole)
