@@ -5,6 +5,7 @@ Two stages, since what the pixels show is decided in between: ``fit_outlines``, 
 
 from dataclasses import dataclass
 
+from pipeline.dense.highlights import without_highlights
 from pipeline.diagnostics import Detail
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.model_basis import basis_of, model_basis
@@ -93,7 +94,8 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
         return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))
     detail = Detail("span" if settings.detail == "span" else "kernel", compose("level-asked"))
     if settings.detail in PHOTO_LEVELS:
-        images, hair = views.capture.images, labels.hair_probability()
+        hair = labels.hair_probability()
+        images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
         solved, detail = refine_with_photographs(solved, images, settings.photo, hair=hair)
     eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
     relief_mm = settings.photo.fine_amplitude_mm
