@@ -8,6 +8,7 @@ The paper says only "background subtraction". A view whose mask cannot be truste
 False where it would hurt a fit, and ``quality.warnings`` say why. Operator masks override everything.
 """
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -25,6 +26,7 @@ from pipeline.silhouettes.cross_view import count_rejecting_cameras
 from pipeline.silhouettes.foreground import Decision, decide, doubtful, reconsider
 from pipeline.silhouettes.matting import Matte, solve_matte
 from pipeline.silhouettes.view_consistency import judge_agreement
+from pipeline.silhouettes.without_plates.head_seed import HeadSeed, find_head_seed
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.image import ImageRgb
@@ -38,6 +40,9 @@ UNDECIDED = 0.3  # from one half: share of a cut's windows that is neither yes n
 UNDECIDED_PX = 15  # side of a window ...
 UNDECIDED_FILLED = 0.6  # ... and its part that is undecided where the outline is a guess
 NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
+SEEDED_VIEWS = 8  # fewer do not tell the subject by each other, and begin with its face
+ENOUGH_USABLE = 0.7  # of the views: 1 of 11 where skin and wall are alike, all of them in scan-a and draw-b, which a
+# face as the beginning makes no better
 BODY_FILLS = 0.75  # of the subject's width is on the border where shoulders leave; a cut above the brow leaves less
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
@@ -84,10 +89,27 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
 def _without_plates(
     capture: Capture, rig: Rig, settings: SegmentationSettings, report: Progress
 ) -> dict[str, Silhouette]:
-    from pipeline.silhouettes.without_plates.decide import decide_without_plates  # packages that few captures need
-    from pipeline.silhouettes.without_plates.head_seed import find_head_seed
+    """Finds the subject as views tell it by each other; where they are few, or hardly any tells it, as its face does."""
+    few = len(rig) < SEEDED_VIEWS
+    found = _searched(capture, rig, settings, find_head_seed(capture.images, rig) if few else None, report)
+    if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):
+        head = find_head_seed(capture.images, rig)
+        seeded = found if head is None else _searched(capture, rig, settings, head, report)
+        found = max(found, seeded, key=_usable_count)
+    report("segmentation", 1.0)
+    return found
 
-    head = find_head_seed(capture.images, rig)
+
+def _usable_count(silhouettes: Mapping[str, Silhouette]) -> int:
+    return sum(silhouette.quality.usable for silhouette in silhouettes.values())
+
+
+def _searched(
+    capture: Capture, rig: Rig, settings: SegmentationSettings, head: HeadSeed | None, report: Progress
+) -> dict[str, Silhouette]:
+    """The silhouettes of a search that begins at ``head``, or where all cameras look."""
+    from pipeline.silhouettes.without_plates.decide import decide_without_plates  # packages that few captures need
+
     found = decide_without_plates(
         capture.images, rig, settings, head=head, report=lambda share: report("segmentation", 0.8 * share)
     )
@@ -95,9 +117,7 @@ def _without_plates(
         jobs = {n: pool.submit(_refined, capture.images[n], one, settings) for n, one in found.decisions.items()}
         jobs |= {n: pool.submit(_as_cut, share, settings) for n, share in found.shares.items()}
         silhouettes = {name: _doubted(jobs[name].result(), settings) for name in rig.names}
-    agreed = judge_agreement(silhouettes, rig, settings)
-    report("segmentation", 1.0)
-    return agreed
+    return judge_agreement(silhouettes, rig, settings)
 
 
 def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouette:
