@@ -89,7 +89,7 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
 def _without_plates(
     capture: Capture, rig: Rig, settings: SegmentationSettings, report: Progress
 ) -> dict[str, Silhouette]:
-    """Finds the subject as views tell it by each other; where they are few, or hardly any tells it, as its face does."""
+    """Finds the subject as views tell it by each other; where few do, as its face does."""
     few = len(rig) < SEEDED_VIEWS
     found = _searched(capture, rig, settings, find_head_seed(capture.images, rig) if few else None, report)
     if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):
