@@ -42,8 +42,8 @@ class PoseEvidence:
 
     @property
     def is_on_face(self) -> bool:
-        """Whether two views or more show the face where the head has it, and none elsewhere."""
-        return len(self.off) >= MIN_VIEWS and max(self.off.values()) <= ELSEWHERE
+        """Whether the face was found, and in every view where the head has it."""
+        return bool(self.off) and max(self.off.values()) <= ELSEWHERE
 
 
 def judge_pose(

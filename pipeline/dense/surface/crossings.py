@@ -10,6 +10,7 @@ from pipeline.parallel_for import in_threads
 from rig.mesh import Mesh
 
 ROUNDS_MOST = 40
+APART_SHARE = 0.05  # of the way to the middle of a vertex's neighbours: some 0.03 mm
 SIZES = 4  # classes of triangles, each half as wide as the last
 HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of it, and take their neighbours along
 
@@ -84,3 +85,19 @@ def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh,
         moved |= back
         active = np.asarray(back[faces].any(axis=1))
     return Mesh(vertices, faces), int(moved.sum())
+
+
+def without_coincidences(mesh: Mesh) -> Mesh:
+    """Moves vertices that lie at one place, to the precision of a file, towards their own neighbours: a program that
+    merges vertices by place would join sheets there, and find the surface open."""
+    stored = mesh.vertices.astype(np.float32)
+    _, same, count = np.unique(stored, axis=0, return_inverse=True, return_counts=True)
+    rows = np.flatnonzero(count[same.ravel()] > 1)
+    if not len(rows):
+        return mesh
+    vertices = mesh.vertices.copy()
+    corners = mesh.faces[np.isin(mesh.faces, rows).any(axis=1)]
+    for row in rows:
+        beside = np.setdiff1d(corners[(corners == row).any(axis=1)], row)
+        vertices[row] += APART_SHARE * (mesh.vertices[beside].mean(axis=0) - mesh.vertices[row])
+    return Mesh(vertices, mesh.faces, mesh.colours)

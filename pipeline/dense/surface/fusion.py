@@ -17,7 +17,7 @@ from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.part_codes import Part
 from pipeline.dense.part_votes import PartVotes, part_codes, part_shares
 from pipeline.dense.surface.contradiction import silence_contradicted
-from pipeline.dense.surface.crossings import without_crossings
+from pipeline.dense.surface.crossings import without_coincidences, without_crossings
 from pipeline.dense.surface.net_kernels import component_of, compose_well
 from pipeline.dense.surface.quality import deviation_mm, without_islands
 from pipeline.dense.surface.refinement import refine_vertices
@@ -100,6 +100,7 @@ def fuse(
         skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, Part.SKIN.channel]
         mesh = drawn_to_skin(mesh, seen * skin, head_skin_world)
     mesh, _ = without_crossings(mesh, safe)
+    mesh = without_coincidences(mesh)
     report("bust", 0.9)
     shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
