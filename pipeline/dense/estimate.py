@@ -34,6 +34,9 @@ from rig.rig import Rig
 
 FIRST, LEAST = 2, 3  # levels of the search and of its bounds: quarter and eighth of the photographs' size
 STEPS_PX = {2: (1, 3), 1: (1,), 0: ()}  # how far planes are taken over from, by level
+# Surface of so few pixels is a chance match; the same area at both sizes. Of what two views see beside the face of an
+# oily head, 8.1 % lay 2 mm off without it, 6.0 % do now; with 200 at the first, ears go.
+SPECKS_PX = {2: 60, 1: 240, 0: 0}
 ROUNDS = {2: 2, 1: 2, 0: 1}  # of least squares
 DONE = {2: 0.4, 1: 0.6, 0: 0.95}  # share of the work
 
@@ -74,7 +77,8 @@ def estimate_depth(
         if level < FIRST:
             stack = stack_crops(crops, level)
             fields = doubled(fields, stack, settings)
-        fields = refined(fields, stack, neighbours, pattern, settings, steps_px=STEPS_PX[level], rounds=ROUNDS[level])
+        given = (fields, stack, neighbours, pattern, settings)
+        fields = refined(*given, steps_px=STEPS_PX[level], rounds=ROUNDS[level], speck_px=SPECKS_PX[level])
         report("dense", DONE[level])
     found = depth_maps(crops, stack, fields, settings)
     report("dense", 1.0)

@@ -15,6 +15,7 @@ from pipeline.dense.field import Field
 from pipeline.dense.field_kernels import double, fit_planes
 from pipeline.dense.matching_kernels import make_scratch
 from pipeline.dense.refine_kernels import propagate, slide
+from pipeline.dense.speck_kernels import fill_specks, mark_specks
 from pipeline.dense.stack import Stack
 from pipeline.parallel_for import map_in_threads
 from pipeline.settings import DenseSettings
@@ -23,6 +24,9 @@ STEEPEST = 3.0  # slope against the image plane: 72 degrees
 RADIUS_PX = 2  # of the neighbourhood that a plane is laid through
 LEAST_INFORMATION = 1e-4  # 1 / mm^2: a standard deviation of 100 mm
 SAME_PX = 0.1  # planes that differ by less are one: a slide takes either to its place
+SPECK_GAP_PX = 1.0  # between the planes of two pixels of one piece
+SPECK_ROUNDS = 2  # of planes and specks: what takes a speck's place is tried against its neighbours, too
+SPECK_SWEEPS = 30  # a speck of 60 pixels is 8 wide
 MOST_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
@@ -52,11 +56,13 @@ def refined(
     *,
     steps_px: Sequence[int],
     rounds: int,
+    speck_px: int,
 ) -> list[Field]:
-    """The fields after planes of neighbours ``steps_px`` away were tried (odd; empty: none), and ``rounds`` slides."""
+    """The fields after planes of neighbours ``steps_px`` away were tried (odd; empty: none), without pieces of
+    ``speck_px`` pixels or fewer, and after ``rounds`` slides."""
 
     def work(view: int) -> Field:
-        return _refined(fields[view], stack, view, neighbours[view], pattern, settings, steps_px, rounds)
+        return _refined(fields[view], stack, view, neighbours[view], pattern, settings, steps_px, rounds, speck_px)
 
     return map_in_threads(work, len(fields))
 
@@ -70,16 +76,22 @@ def _refined(
     settings: DenseSettings,
     steps_px: Sequence[int],
     rounds: int,
+    speck_px: int,
 ) -> Field:
     sight = stack.sight(view, neighbours, pattern, settings.contrast_levels)
     scratch = make_scratch(sight)
     depth, slopes, live = field.depth.copy(), field.slopes.copy(), field.depth > 0.0
     pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
+    specks = np.zeros(depth.shape, bool)
     if steps_px:
         cost = np.full(depth.shape, -1.0, np.float32)
-        for parity in (0, 1):
-            propagate(sight, scratch, parity, np.array(steps_px), SAME_PX * pixel_mm, depth, slopes, cost)
-    before, known = depth, field.information + LEAST_INFORMATION
+        for _ in range(SPECK_ROUNDS):
+            cost[specks] = -1.0
+            for parity in (0, 1):
+                propagate(sight, scratch, parity, np.array(steps_px), SAME_PX * pixel_mm, depth, slopes, cost)
+            mark_specks(depth, slopes, SPECK_GAP_PX * pixel_mm, speck_px, specks)
+            fill_specks(depth, slopes, specks, SPECK_SWEEPS)
+    before, known = depth, np.where(specks, np.float32(0.0), field.information) + LEAST_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
     for _ in range(rounds):
         place, seen, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)

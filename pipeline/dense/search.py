@@ -14,8 +14,8 @@ from pipeline.parallel_for import map_in_threads
 from pipeline.settings import DenseSettings
 
 # Costs are 1 minus a correlation. A step of one label is a slope that the room's bounds do not have; a wider step is an
-# edge, which two or three pixels of clear texture pay for.
-STEP_COST, EDGE_COST = np.float32(0.05), np.float32(0.4)
+# edge, which three or four pixels of clear texture pay for.
+STEP_COST, EDGE_COST = np.float32(0.1), np.float32(0.8)
 
 
 def first_fields(
