@@ -22,7 +22,7 @@ from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.neighbours import choose_neighbours
 from pipeline.dense.refinement import doubled, refined
 from pipeline.dense.room import find_rooms
-from pipeline.dense.search import first_fields
+from pipeline.dense.search import find_search_level, first_fields
 from pipeline.dense.stack import stack_crops
 from pipeline.dense.window import square_pattern
 from pipeline.imaging.silhouette import Silhouette
@@ -32,13 +32,14 @@ from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.rig import Rig
 
-FIRST, LEAST = 2, 3  # levels of the search and of its bounds: quarter and eighth of the photographs' size
-STEPS_PX = {2: (1, 3), 1: (1,), 0: ()}  # how far planes are taken over from, by level
+LEAST = 3  # level of the search's bounds: an eighth of the photographs' size
+# By how often the size was doubled since the search:
+STEPS_PX = ((1, 3), (1,), ())  # how far planes are taken over from
 # Surface of so few pixels is a chance match; the same area at both sizes. Of what two views see beside the face of an
 # oily head, 8.1 % lay 2 mm off without it, 6.0 % do now; with 200 at the first, ears go.
-SPECKS_PX = {2: 60, 1: 240, 0: 0}
-ROUNDS = {2: 2, 1: 2, 0: 1}  # of least squares
-DONE = {2: 0.4, 1: 0.6, 0: 0.95}  # share of the work
+SPECKS_PX = (60, 240, 0)
+ROUNDS = (2, 2, 1)  # of least squares
+DONE = {2: 0.4, 1: 0.6, 0: 0.95}  # share of the work, by level
 
 
 def estimate_depth(
@@ -68,17 +69,20 @@ def estimate_depth(
         return ()
     neighbours = choose_neighbours([crop.camera for crop in crops], extent[0], settings)
     pattern = square_pattern(2)
-    stack = stack_crops(crops, FIRST)
+    first = find_search_level([crop.camera for crop in crops], extent[0])
+    stack = stack_crops(crops, first)
     rooms = find_rooms(crops, stack_crops(crops, LEAST), stack, head_world, extent, settings)
     report("dense", 0.1)
     fields = first_fields(stack, rooms, neighbours, pattern, settings)
     report("dense", 0.3)
-    for level in range(FIRST, -1, -1):
-        if level < FIRST:
+    for doublings in range(first + 1):
+        level = first - doublings
+        if doublings:
             stack = stack_crops(crops, level)
             fields = doubled(fields, stack, settings)
         given = (fields, stack, neighbours, pattern, settings)
-        fields = refined(*given, steps_px=STEPS_PX[level], rounds=ROUNDS[level], speck_px=SPECKS_PX[level])
+        steps_px, rounds, speck_px = STEPS_PX[doublings], ROUNDS[doublings], SPECKS_PX[doublings]
+        fields = refined(*given, steps_px=steps_px, rounds=rounds, speck_px=speck_px)
         report("dense", DONE[level])
     found = depth_maps(crops, stack, fields, settings)
     report("dense", 1.0)

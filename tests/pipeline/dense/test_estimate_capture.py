@@ -9,7 +9,9 @@ from pipeline.dense.depth_map import DepthMap, points_world
 from pipeline.dense.estimate import estimate_depth
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import DenseSettings
+from rig.capture import Capture
 from rig.formats.capture_folder import read_capture
+from tests.support.noisy_captures import noisier
 from tests.support.shared_data import shared
 
 HEAD, HAIR = 0, 1
@@ -36,15 +38,36 @@ def test_depth_of_a_scan_is_precise_and_states_its_deviation() -> None:
 def test_smooth_skin_leaves_no_chance_matches() -> None:
     """An oily, path-traced head as it was photographed, highlights and all: what is told of it lies on the surface, and
     much is told. With chance matches left in, 93.5 % and 72.3 %; without them 94.8 % and 75.4 %."""
+    precise, told = smooth_skin(1.0, 0.0)
+    assert precise > 0.943
+    assert told > 0.745
+
+
+@pytest.mark.slow
+def test_small_noisy_photographs_are_searched_at_the_size_that_skin_needs() -> None:
+    """The same at 512 x 384 with noise of 6 levels: 89.1 %, searched at a quarter of that size 87.3 %."""
+    precise, told = smooth_skin(0.5, 6.0)
+    assert precise > 0.882
+    assert told > 0.43
+
+
+def smooth_skin(factor: float, noise_levels: float) -> tuple[float, float]:
+    """Returns the share of what is told of scan-a-skin's head that is true to 2 mm, and that of the subject's pixels
+    which are told: from its photographs reduced, and with noise added."""
     folder, truth = shared("data/captures/scan-a-skin"), shared("data/captures/scan-a-skin.truth")
     capture, rig = read_capture(folder)
+
+    def reduced(image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1.0 else image
+
+    shot = noisier(Capture({name: reduced(image) for name, image in capture.images.items()}), noise_levels)
     masks = {name: cv2.imread(str(truth / "silhouettes" / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in rig.names}
-    silhouettes = {name: silhouette_from_mask(mask > 127) for name, mask in masks.items() if mask is not None}
-    maps = estimate_depth(capture.images, silhouettes, rig, None, DenseSettings(), report=lambda stage, share: None)
+    silhouettes = {name: silhouette_from_mask(reduced(mask) > 127) for name, mask in masks.items() if mask is not None}
+    given = (shot.images, silhouettes, rig.scaled(factor), None, DenseSettings())
+    maps = estimate_depth(*given, report=lambda stage, share: None)
     distance, _, part = errors(maps, np.load(truth / "visible.npz"))
     told = sum(int(each.known.sum()) for each in maps) / sum(int((each.mask > 0.5).sum()) for each in maps)
-    assert np.mean(distance[part == HEAD] < 2.0) > 0.943
-    assert told > 0.745
+    return float(np.mean(distance[part == HEAD] < 2.0)), told
 
 
 def errors(
