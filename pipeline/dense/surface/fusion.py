@@ -19,7 +19,7 @@ from pipeline.dense.part_votes import PartVotes, part_codes, part_shares
 from pipeline.dense.surface.contradiction import silence_contradicted
 from pipeline.dense.surface.crossings import without_coincidences, without_crossings
 from pipeline.dense.surface.net_kernels import component_of, compose_well
-from pipeline.dense.surface.quality import deviation_mm, without_islands
+from pipeline.dense.surface.quality import deviation_mm, seen_deviation_mm, without_islands
 from pipeline.dense.surface.refinement import refine_vertices
 from pipeline.dense.surface.signed_distance import Level, NoSurface, solve
 from pipeline.dense.surface.skin import drawn_to_skin
@@ -98,7 +98,7 @@ def fuse(
     mesh = without_bias(mesh, seen, bias)
     if head_skin_world is not None:
         skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, Part.SKIN.channel]
-        mesh = drawn_to_skin(mesh, seen * skin, head_skin_world)
+        mesh = drawn_to_skin(mesh, seen * skin, head_skin_world, seen_deviation_mm(measured))
     mesh, _ = without_crossings(mesh, safe)
     mesh = without_coincidences(mesh)
     report("bust", 0.9)

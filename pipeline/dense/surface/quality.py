@@ -36,11 +36,19 @@ def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
     out = np.full(len(seen), MOST_MM)
     if not seen.any():
         return out
-    views = measured.views[seen].astype(float)
-    variance = np.maximum(1.0 / measured.information[seen], measured.scatter[seen] / np.maximum(views - 1.0, 1.0))
-    variance += np.where(views < 2, ALONE_MM**2, 0.0) + LEAST_MM**2
-    out[seen] = np.minimum(np.sqrt(variance), MOST_MM)
+    out[seen] = seen_deviation_mm(measured)[seen]
     known = mesh.vertices[seen][::EVERY]
     far = KDTree(known, balanced_tree=False, compact_nodes=False).query(mesh.vertices[~seen])[0]
     out[~seen] = np.minimum(EDGE_MM + SLOPE * far, MOST_MM)
+    return out
+
+
+def seen_deviation_mm(measured: Measured) -> Float[np.ndarray, " v"]:
+    """Returns the standard deviation along the normal of what some view sees; 0 of the rest."""
+    seen = measured.views > 0
+    views = measured.views[seen].astype(float)
+    variance = np.maximum(1.0 / measured.information[seen], measured.scatter[seen] / np.maximum(views - 1.0, 1.0))
+    variance += np.where(views < 2, ALONE_MM**2, 0.0) + LEAST_MM**2
+    out = np.zeros(len(seen))
+    out[seen] = np.minimum(np.sqrt(variance), MOST_MM)
     return out
