@@ -25,6 +25,7 @@ from pipeline.experiments.outcome import Outcome
 from pipeline.experiments.people import people
 from pipeline.experiments.planted import planted
 from pipeline.experiments.posterior_check import posterior_check
+from pipeline.experiments.relief import relief
 from pipeline.experiments.repeat import repeat
 from pipeline.experiments.robustness import robustness
 from pipeline.experiments.surfaces import surfaces
@@ -58,8 +59,8 @@ class Options:
     """What some experiments take alone.
 
     ``simplex``: how many subjects of a table the simplex fits too; ``captures``: whether those of the shared folder
-    count beside the studio's heads; ``openmvs``: that peer's programs. Of people ``folders`` are its captures, ``only``
-    says which of its rows, ``detail`` how deep.
+    count beside the studio's heads; ``openmvs``: that peer's programs. Of people and
+    relief ``folders`` are the captures, of people ``only`` says which of its rows, ``detail`` how deep.
     """
 
     simplex: int | None = None
@@ -233,6 +234,18 @@ def _people(task: Task) -> Outcome:
         )
 
 
+def _relief(task: Task) -> Outcome:
+    folders = list(task.options.folders) or [path.with_suffix("") for path in _truths(task.shared).values()]
+    with Renderer.create() as renderer:
+        return relief(
+            task.head,
+            {path.name: path for path in folders},
+            renderer=renderer,
+            report=task.report,
+            folder=task.folder,
+        )
+
+
 def _templates(task: Task) -> Outcome:
     count = {"draws": task.subjects} if task.subjects else {}
     facekit = _facekit(task.shared)
@@ -261,6 +274,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "posterior": _drawn(posterior_check),
     "views": _drawn(views),
     "repeat": _drawn(repeat),
+    "relief": _relief,
     "span": _span,
     "detail": _detail,
     "hidden": _hidden,

@@ -22,6 +22,12 @@ def directions_from_head(rig: Rig, world_from_head: Similarity) -> Float[np.ndar
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
+def azimuths_deg(rig: Rig, world_from_head: Similarity) -> Float[np.ndarray, " n"]:
+    """Computes where each camera stands around the head."""
+    x, _, z = directions_from_head(rig, world_from_head).T
+    return np.degrees(np.arctan2(x, z))
+
+
 def frontal_views(rig: Rig, world_from_head: Similarity, count: int) -> tuple[str, ...]:
     """Returns the ``count`` cameras that look at the face most frontally, in the rig's order."""
     facing = directions_from_head(rig, world_from_head)[:, 2]
@@ -30,8 +36,7 @@ def frontal_views(rig: Rig, world_from_head: Similarity, count: int) -> tuple[st
 
 def even_views(rig: Rig, world_from_head: Similarity, count: int) -> tuple[str, ...]:
     """Returns ``count`` cameras spread evenly over a circle's azimuths, the most frontal one among them."""
-    x, _, z = directions_from_head(rig, world_from_head).T
-    azimuth = np.arctan2(x, z)
+    azimuth = np.radians(azimuths_deg(rig, world_from_head))
     around = np.argsort(azimuth, kind="stable")
     first = int(np.argmin(np.abs(azimuth[around])))
     places = [(first + round(i * len(around) / count)) % len(around) for i in range(count)]
@@ -40,8 +45,7 @@ def even_views(rig: Rig, world_from_head: Similarity, count: int) -> tuple[str, 
 
 def is_circle(rig: Rig, world_from_head: Similarity) -> bool:
     """Tells whether cameras stand all around the head."""
-    x, _, z = directions_from_head(rig, world_from_head).T
-    azimuth = np.sort(np.degrees(np.arctan2(x, z)))
+    azimuth = np.sort(azimuths_deg(rig, world_from_head))
     return bool(np.diff(azimuth, append=azimuth[0] + 360.0).max() <= MAX_GAP_DEG)
 
 

@@ -20,15 +20,15 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, span, detail, hidden, expressions, visible, people, "
-            "planted, surfaces, texture, light, templates or real."
+            "exchanges, false-alarms, posterior, views, repeat, relief, span, detail, hidden, expressions, visible, "
+            "people, planted, surfaces, texture, light, templates or real."
         ),
     ],
     folders: Annotated[
         list[Path] | None,
         typer.Argument(
             help="real: captures, or photographs alone, of more views than are used. people: captures with a truth "
-            "beside them, those of --shared by default."
+            "beside them, relief: any captures; those of --shared by default."
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
@@ -60,8 +60,8 @@ def experiments(
     if name == "real":
         _experiment_real(folders or [], model, front, outlines, out, json_out)
         return
-    if folders and name != "people":
-        raise typer.BadParameter("only real and people take folders", param_hint="FOLDERS")
+    if folders and name not in ("people", "relief"):
+        raise typer.BadParameter("only real, people and relief take folders", param_hint="FOLDERS")
     if (only or detail) and name != "people":
         raise typer.BadParameter("only people takes it", param_hint="--only" if only else "--detail")
     from pipeline.experiments.runner import Options, run_experiment
