@@ -126,7 +126,7 @@ def _reconstructed(
         backgrounds=kept(capture.backgrounds),
         masks=kept(capture.masks),
         soft_masks=kept(capture.soft_masks),
-        features={name: kept(points) for name, points in capture.features.items()},
+        features=capture.features if names == rig.names else {},  # clicked in two views, of which a half has one
     )
     return reconstruct(ReconstructionContext(seen, rig.subset(names), model, Settings(), renderer))
 
