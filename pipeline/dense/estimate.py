@@ -35,8 +35,8 @@ from rig.rig import Rig
 LEAST = 3  # level of the search's bounds: an eighth of the photographs' size
 # By how often the size was doubled since the search:
 STEPS_PX = ((1, 3), (1,), ())  # how far planes are taken over from
-# Surface of so few pixels is a chance match; the same area at both sizes. Of what two views see beside the face of an
-# oily head, 8.1 % lay 2 mm off without it, 6.0 % do now; with 200 at the first, ears go.
+# Surface of so few pixels is a chance match where other surface encloses it; the same area at both sizes. Of what is
+# told of an oily head, 6.5 % lay 2 mm off without it, 5.9 % do now; with 200 at the first, ears go.
 SPECKS_PX = (60, 240, 0)
 ROUNDS = (2, 2, 1)  # of least squares
 DONE = {2: 0.4, 1: 0.6, 0: 0.95}  # share of the work, by level

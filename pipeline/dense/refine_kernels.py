@@ -19,22 +19,27 @@ BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken f
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
-def propagate(sight, scratch, parity, steps, same_mm, depth, slopes, cost):
+def propagate(sight, scratch, parity, steps, same_mm, fresh, depth, slopes, cost):
     """Every pixel of one colour of the chequerboard tries the planes of its neighbours of the other colour, ``steps``
     pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known. Planes that differ by
-    less than ``same_mm``, in depth and a pixel beside it, are the same."""
+    less than ``same_mm``, in depth and a pixel beside it, are the same.
+
+    ``fresh``: planes that their neighbours did not try yet; a pixel of known cost tries no others. Those taken over
+    here become fresh.
+    """
     height, width = depth.shape
     window, scores, place = scratch.window, scratch.scores, scratch.place
     reach = farthest(sight.pattern)
     for row in range(height):
         for column in range((row + parity) % 2, width, 2):
-            if depth[row, column] <= 0.0:
+            best = cost[row, column]
+            if depth[row, column] <= 0.0 or (best >= 0.0 and not _is_beside(fresh, row, column, steps)):
                 continue
             total, energy = load_window(sight, width, height, column, row, window)
             loaded = Loaded(column, row, window, total, energy)
-            best, best_z = cost[row, column], depth[row, column]
-            best_x, best_y = slopes[row, column, 0], slopes[row, column, 1]
-            if best < 0.0:
+            best_z, best_x, best_y = depth[row, column], slopes[row, column, 0], slopes[row, column, 1]
+            known = best >= 0.0
+            if not known:
                 best = cost_of(sight, loaded, best_z, best_x, best_y, reach, place, scores)
             for step in steps:
                 for side in range(4):
@@ -43,7 +48,7 @@ def propagate(sight, scratch, parity, steps, same_mm, depth, slopes, cost):
                     if not (0 <= column + i < width and 0 <= row + j < height):
                         continue
                     there = depth[row + j, column + i]
-                    if there <= 0.0:
+                    if there <= 0.0 or (known and not fresh[row + j, column + i]):
                         continue
                     z_x, z_y = slopes[row + j, column + i, 0], slopes[row + j, column + i, 1]
                     z = there - i * z_x - j * z_y
@@ -52,10 +57,25 @@ def propagate(sight, scratch, parity, steps, same_mm, depth, slopes, cost):
                     value = cost_of(sight, loaded, z, z_x, z_y, reach, place, scores)
                     if value < best:
                         best, best_z, best_x, best_y = value, z, z_x, z_y
+                        fresh[row, column] = True
             cost[row, column] = best
             depth[row, column] = best_z
             slopes[row, column, 0] = best_x
             slopes[row, column, 1] = best_y
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _is_beside(fresh, row, column, steps):
+    height, width = fresh.shape
+    for step in steps:
+        if (
+            (column + step < width and fresh[row, column + step])
+            or (column >= step and fresh[row, column - step])
+            or (row + step < height and fresh[row + step, column])
+            or (row >= step and fresh[row - step, column])
+        ):
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)

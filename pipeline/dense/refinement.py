@@ -15,7 +15,7 @@ from pipeline.dense.field import Field
 from pipeline.dense.field_kernels import double, fit_planes
 from pipeline.dense.matching_kernels import make_scratch
 from pipeline.dense.refine_kernels import propagate, slide
-from pipeline.dense.speck_kernels import fill_specks, mark_specks
+from pipeline.dense.specks import take_specks_off
 from pipeline.dense.stack import Stack
 from pipeline.parallel_for import map_in_threads
 from pipeline.settings import DenseSettings
@@ -24,9 +24,7 @@ STEEPEST = 3.0  # slope against the image plane: 72 degrees
 RADIUS_PX = 2  # of the neighbourhood that a plane is laid through
 LEAST_INFORMATION = 1e-4  # 1 / mm^2: a standard deviation of 100 mm
 SAME_PX = 0.1  # planes that differ by less are one: a slide takes either to its place
-SPECK_GAP_PX = 1.0  # between the planes of two pixels of one piece
-SPECK_ROUNDS = 2  # of planes and specks: what takes a speck's place is tried against its neighbours, too
-SPECK_SWEEPS = 30  # a speck of 60 pixels is 8 wide
+PLANE_ROUNDS = 2  # what takes a speck's place is tried against its neighbours, too
 MOST_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
@@ -84,13 +82,14 @@ def _refined(
     pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
     specks = np.zeros(depth.shape, bool)
     if steps_px:
-        cost = np.full(depth.shape, -1.0, np.float32)
-        for _ in range(SPECK_ROUNDS):
-            cost[specks] = -1.0
-            for parity in (0, 1):
-                propagate(sight, scratch, parity, np.array(steps_px), SAME_PX * pixel_mm, depth, slopes, cost)
-            mark_specks(depth, slopes, SPECK_GAP_PX * pixel_mm, speck_px, specks)
-            fill_specks(depth, slopes, specks, SPECK_SWEEPS)
+        cost, fresh = np.full(depth.shape, -1.0, np.float32), live.copy()
+        black = np.indices(depth.shape).sum(axis=0) % 2 == 0
+        for _ in range(PLANE_ROUNDS):
+            for parity, tried in ((0, ~black), (1, black)):
+                propagate(sight, scratch, parity, np.array(steps_px), SAME_PX * pixel_mm, fresh, depth, slopes, cost)
+                fresh[tried] = False
+            specks = take_specks_off(depth, slopes, pixel_mm, speck_px)
+            cost[specks], fresh[specks] = -1.0, True
     before, known = depth, np.where(specks, np.float32(0.0), field.information) + LEAST_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
     for _ in range(rounds):

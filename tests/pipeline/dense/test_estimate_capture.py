@@ -37,9 +37,10 @@ def test_depth_of_a_scan_is_precise_and_states_its_deviation() -> None:
 @pytest.mark.slow
 def test_smooth_skin_leaves_no_chance_matches() -> None:
     """An oily, path-traced head as it was photographed, highlights and all: what is told of it lies on the surface, and
-    much is told. With chance matches left in, 93.5 % and 72.3 %; without them 94.8 % and 75.4 %."""
+    much is told. With chance matches left in, 93.5 % and 72.3 %; without those that the surface encloses 94.1 % and
+    75.0 %. (Without those at outlines and beside each other 94.8 % and 75.4 %, and 6 % of draw-b's clothes go.)"""
     precise, told = smooth_skin(1.0, 0.0)
-    assert precise > 0.943
+    assert precise > 0.938
     assert told > 0.745
 
 
