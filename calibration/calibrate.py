@@ -327,11 +327,11 @@ def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np
     every = residuals(fit.solution.state, fit.seen)
     table, first = {}, 0
     for index, view in enumerate(fit.views):
-        own = fit.kept[first : first + len(view.found.ids)]
+        retained = fit.kept[first : first + len(view.found.ids)]
         first += len(view.found.ids)
-        if own.any():
+        if retained.any():
             span = slice(fit.seen.starts[index], fit.seen.starts[index + 1])
-            table[view.camera, view.shot] = (view.found.ids[own], view.found.corners[own], every[span])
+            table[view.camera, view.shot] = (view.found.ids[retained], view.found.corners[retained], every[span])
     return table
 
 

@@ -135,9 +135,9 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _camera_pictures(calibration: Calibration, camera: Camera) -> str:
-    own = [miss for (name, _), miss in calibration.misses.items() if name == camera.name]
-    pixels = np.concatenate([corners for _, corners, _ in own])
-    misses = np.concatenate([miss for _, _, miss in own])
+    observed = [miss for (name, _), miss in calibration.misses.items() if name == camera.name]
+    pixels = np.concatenate([corners for _, corners, _ in observed])
+    misses = np.concatenate([miss for _, _, miss in observed])
     return f"<h3>{escape(camera.name)}</h3>{_vectors(camera, pixels, misses)}{_coverage(camera, pixels)}"
 
 

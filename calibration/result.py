@@ -130,12 +130,12 @@ class Calibration:
         everything = np.concatenate([miss for _, _, miss in self.misses.values()])
         cameras: dict[str, CameraFigures] = {}
         for camera in self.rig:
-            own = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
+            residuals = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
             cameras[camera.name] = {
-                "rms_px": _rms(np.concatenate(own)),
+                "rms_px": _rms(np.concatenate(residuals)),
                 "alone_rms_px": self.lenses[camera.name].rms_px,
-                "views": len(own),
-                "corners": int(sum(len(miss) for miss in own)),
+                "views": len(residuals),
+                "corners": int(sum(len(miss) for miss in residuals)),
                 "pose_sigma_px": self.pose_sigma_px[camera.name],
                 "focal_sigma_px": float(self.intrinsics_sigma[camera.name][0]),
                 "focal_share": float(self.intrinsics_sigma[camera.name][0]) / camera.intrinsics.fx,

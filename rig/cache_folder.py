@@ -8,7 +8,7 @@ CACHE = "EIGENHEAD_CACHE"
 
 def cache_folder() -> Path:
     """EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. It need not exist."""
-    given = os.environ.get(CACHE)
-    if given:
-        return Path(given)
+    configured = os.environ.get(CACHE)
+    if configured:
+        return Path(configured)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "eigenhead"

@@ -48,18 +48,18 @@ def refiled(
         points: the same of the feature points that were picked in its image.
     """
 
-    def given(filed: Mapping[str, Filed], source: Mapping[str, str]) -> dict[str, Filed]:
+    def reassigned(filed: Mapping[str, Filed], source: Mapping[str, str]) -> dict[str, Filed]:
         wanted = {name: source.get(name, name) for name in filed.keys() | source.keys()}
         return {name: filed[wanted[name]] for name in sorted(wanted) if wanted[name] in filed}
 
     return Capture(
-        given(capture.images, pictures),
-        given(capture.backgrounds, plates),
-        given(capture.masks, pictures),
-        {landmark: given(views, points) for landmark, views in capture.features.items()},
+        reassigned(capture.images, pictures),
+        reassigned(capture.backgrounds, plates),
+        reassigned(capture.masks, pictures),
+        {landmark: reassigned(views, points) for landmark, views in capture.features.items()},
         _renamed(capture.digests, {"images": pictures, "masks": pictures, "background": plates}),
         capture.remarks,
-        given(capture.soft_masks, pictures),
+        reassigned(capture.soft_masks, pictures),
     )
 
 

@@ -31,8 +31,8 @@ class JobLog:
 
     def __call__(self, logger: object, method: str, event: EventDict) -> EventDict:
         if "job" in event and log_file(self._jobs, str(event["job"])).parent.is_dir():
-            told = {key: value for key, value in event.items() if key not in NOT_FOR_CALLERS}
-            words = " ".join(f"{key}={value}" for key, value in told.items())
+            public = {key: value for key, value in event.items() if key not in NOT_FOR_CALLERS}
+            words = " ".join(f"{key}={value}" for key, value in public.items())
             with suppress(OSError), log_file(self._jobs, str(event["job"])).open("a", encoding="utf-8") as stream:
                 stream.write(" ".join(filter(None, [event["timestamp"], event["level"], event["event"], words])) + "\n")
         return event

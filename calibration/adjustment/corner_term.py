@@ -84,13 +84,13 @@ class CornersAt:
         seen, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
         for view, at in enumerate(places(seen, len(self.state.intrinsics), size)):
-            own = slice(seen.starts[view], seen.starts[view + 1])
-            whole[own, :, at] = rows[own]
+            of_view = slice(seen.starts[view], seen.starts[view + 1])
+            whole[of_view, :, at] = rows[of_view]
         return whole
 
 
 def places(seen: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
     """Where each view's parameters stand among all: its camera's, its board's, its camera's time offset."""
-    own = seen.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
+    of_camera = seen.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
     board = cameras * PER_CAMERA + seen.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)
-    return np.concatenate([own, board, size - cameras + seen.camera[:, None]], axis=1)
+    return np.concatenate([of_camera, board, size - cameras + seen.camera[:, None]], axis=1)

@@ -48,9 +48,9 @@ class LensPriorAt:
 
     def add_to(self, equations: NormalEquations) -> None:
         for camera, (information, away) in enumerate(zip(self.prior.information, self.away, strict=True)):
-            own = slice(camera * PER_CAMERA, camera * PER_CAMERA + len(INTRINSICS))
-            equations.matrix[own, own] += information
-            equations.gradient[own] += information @ away
+            block = slice(camera * PER_CAMERA, camera * PER_CAMERA + len(INTRINSICS))
+            equations.matrix[block, block] += information
+            equations.gradient[block] += information @ away
 
 
 class AspectTerm:
@@ -81,9 +81,9 @@ class AspectsAt:
 
     def add_to(self, equations: NormalEquations) -> None:
         for camera, (slope, residual) in enumerate(zip(self.slopes(), self.residual, strict=True)):
-            own = slice(camera * PER_CAMERA, camera * PER_CAMERA + 2)
-            equations.matrix[own, own] += np.outer(slope, slope)
-            equations.gradient[own] += slope * residual
+            block = slice(camera * PER_CAMERA, camera * PER_CAMERA + 2)
+            equations.matrix[block, block] += np.outer(slope, slope)
+            equations.gradient[block] += slope * residual
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:

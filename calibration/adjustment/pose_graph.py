@@ -294,9 +294,9 @@ def _fits_when_mirrored(
     board, size = detections.board, detections.sizes[name]
     if board.kind == "charuco":
         return False  # a mirrored marker is not detected in the first place
-    own = [view for view in detections.views if view.camera == name]
-    lens = estimate_lens([replace(view, found=_mirror(view.found, board, size[0])) for view in own], size, board)
-    flipped = {view.shot: replace(view, found=_mirror(view.found, board, size[0])) for view in own}
+    views = [view for view in detections.views if view.camera == name]
+    lens = estimate_lens([replace(view, found=_mirror(view.found, board, size[0])) for view in views], size, board)
+    flipped = {view.shot: replace(view, found=_mirror(view.found, board, size[0])) for view in views}
     trial = dict(options) | {(name, shot): _candidates(view, lens, board) for shot, view in flipped.items()}
     checked = [_edge(name, other, trial, board) for other in sorted(main)]
     found = [edge for edge in checked if edge is not None and edge.shared >= 2]

@@ -138,8 +138,8 @@ def board_from_document(document: Mapping[str, Any], subject: str = "board.toml"
     for key in ("columns", "rows"):
         value = document.get(key, SQUARES_LEAST)
         if isinstance(value, bool) or not isinstance(value, int) or not SQUARES_LEAST <= value <= SQUARES_MOST:
-            given = f"{value!r}"
-            faults.append(compose("board-squares", key=key, value=given, least=SQUARES_LEAST, most=SQUARES_MOST))
+            printed = f"{value!r}"
+            faults.append(compose("board-squares", key=key, value=printed, least=SQUARES_LEAST, most=SQUARES_MOST))
     ranges = {"square_mm": (0.5, 1000.0), "marker_ratio": (0.3, 0.95)}
     ranges |= {key: (1.0, 1e5) for key in ("measured_width_mm", "measured_height_mm")}
     for key, (least, most) in ranges.items():

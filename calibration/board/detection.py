@@ -156,7 +156,7 @@ def _with_measured_pattern(
     if found_share >= FEW_FOUND:
         layout = find_layout(markers, board)
         if layout is not None and abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
-            raise WrongBoard([told] if (told := explain_markers(markers, board)) else [])
+            raise WrongBoard([explanation] if (explanation := explain_markers(markers, board)) else [])
         return detections
     layout = find_layout(markers, board)
     measured = None if layout is None else board_of(layout, board)

@@ -164,7 +164,7 @@ def board_scale(
     spread = np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum())
     size = float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()) / spread)
     place = rigid_fit(size * flat, points)
-    misses = [camera.project(place.apply(size * own)) - pixels for camera, own, pixels in triples]
+    misses = [camera.project(place.apply(size * corners)) - pixels for camera, corners, pixels in triples]
     squares = np.concatenate([(m**2).sum(axis=1) for m in misses])
     return size, float(np.sqrt(squares.mean())) if np.isfinite(squares).all() else np.inf
 

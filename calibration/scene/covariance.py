@@ -105,12 +105,12 @@ def lens_misfit(structure: Structure, noise_px: float) -> float:
         return 1.0
     falls = []
     for one in (True, False):
-        given = replace(structure, one_lens=one)
-        system, gradient = _reduced(given, noise_px)
-        places = camera_places(given)
+        variant = replace(structure, one_lens=one)
+        system, gradient = _reduced(variant, noise_px)
+        places = camera_places(variant)
         free = np.unique(np.hstack([places[:, : structure.estimated], places[:, LENS:]]))
         motions = np.zeros((len(gradient), 7))
-        motions[places[:, LENS:]] = world_motions(given.rig, scale=True).reshape(len(given.rig), 6, 7)
+        motions[places[:, LENS:]] = world_motions(variant.rig, scale=True).reshape(len(variant.rig), 6, 7)
         step = _inverse(system[np.ix_(free, free)], motions[free]) @ gradient[free]
         falls.append(float(gradient[free] @ step))
     return (falls[1] - falls[0]) / (structure.estimated * (len(structure.rig) - 1))
@@ -126,16 +126,16 @@ def _reduced(structure: Structure, noise_px: float) -> tuple[Float[np.ndarray, "
     slope, pull = np.zeros(size), np.zeros((count, 3))
     good = (np.abs(misses) < OUTLIER_SIGMAS).all(axis=1)
     for index, camera in enumerate(structure.rig):
-        own = good & (structure.camera_of == index)
-        seen = structure.point_of[own]
+        of_camera = good & (structure.camera_of == index)
+        seen = structure.point_of[of_camera]
         points = structure.points[seen]
         by_lens = intrinsics_jacobian(camera, points) @ LENS_FROM_NINE
         by_camera = np.concatenate([by_lens, pose_jacobian(camera, points)], axis=2) / noise_px
         by_point = camera.project_with_jacobian(points)[1] / noise_px
         u[np.ix_(places[index], places[index])] += np.einsum("nki,nkj->ij", by_camera, by_camera)
         np.add.at(v, seen, np.einsum("nki,nkj->nij", by_point, by_point))
-        slope[places[index]] += np.einsum("nki,nk->i", by_camera, misses[own])
-        np.add.at(pull, seen, np.einsum("nki,nk->ni", by_point, misses[own]))
+        slope[places[index]] += np.einsum("nki,nk->i", by_camera, misses[of_camera])
+        np.add.at(pull, seen, np.einsum("nki,nk->ni", by_point, misses[of_camera]))
         shape = (len(seen), LENS + 6, 3)
         values.append(np.einsum("nki,nkj->nij", by_camera, by_point).ravel())
         rows.append(np.broadcast_to(places[index][None, :, None], shape).ravel())

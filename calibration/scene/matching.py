@@ -121,7 +121,7 @@ def _extract(photographs: Photographs, scratch: Path, report: Progress) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu, options.max_image_size = 1, False, SIDE_MOST_PX
     options.sift.max_num_features, options.sift.peak_threshold = FEATURES_MOST, PEAK_LEAST
-    files = [f"{camera}/{shot}.png" for camera, own in photographs.files.items() for shot in own]
+    files = [f"{camera}/{shot}.png" for camera, shots in photographs.files.items() for shot in shots]
     for number, file in enumerate(files):
         report("features", number / len(files))
         pycolmap.set_random_seed(SEED)
@@ -142,7 +142,7 @@ def _match_shots(photographs: Photographs, scratch: Path, report: Progress) -> N
     options.num_threads, options.use_gpu, options.skip_geometric_verification = 1, False, True
     for number, shot in enumerate(photographs.shots):
         report("matches", 0.8 * number / len(photographs.shots))
-        seen = [f"{camera}/{shot}.png" for camera, own in photographs.files.items() if shot in own]
+        seen = [f"{camera}/{shot}.png" for camera, shots in photographs.files.items() if shot in shots]
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = _pairs_file(scratch / "shot.pairs", combinations(seen, 2))
         pycolmap.match_image_pairs(
@@ -157,7 +157,7 @@ def _pairs_file(path: Path, pairs: Iterator[tuple[str, str]]) -> Path:
 
 def _first(photographs: Photographs) -> list[str]:
     """The picture under whose name a camera stands among images."""
-    return [f"{camera}/{next(iter(own))}.png" for camera, own in photographs.files.items()]
+    return [f"{camera}/{next(iter(shots))}.png" for camera, shots in photographs.files.items()]
 
 
 def _merge(photographs: Photographs, scratch: Path, name: str, *, one_lens: bool) -> Path:
@@ -174,10 +174,10 @@ def _merge(photographs: Photographs, scratch: Path, name: str, *, one_lens: bool
         source = {image.name: image.image_id for image in shots.read_all_images()}
         target = {Path(image.name).parts[0]: image.image_id for image in cameras.read_all_images()}
         first: dict[tuple[str, str], int] = {}
-        for camera, own in photographs.files.items():
-            keypoints = [shots.read_keypoints(source[f"{camera}/{shot}.png"])[:, :2] for shot in own]
+        for camera, camera_shots in photographs.files.items():
+            keypoints = [shots.read_keypoints(source[f"{camera}/{shot}.png"])[:, :2] for shot in camera_shots]
             starts = np.cumsum([0, *map(len, keypoints)])
-            first.update({(camera, shot): int(start) for shot, start in zip(own, starts, strict=False)})
+            first.update({(camera, shot): int(start) for shot, start in zip(camera_shots, starts, strict=False)})
             cameras.write_keypoints(target[camera], np.concatenate(keypoints))
         for one, other in combinations(photographs.files, 2):
             found = []

@@ -49,8 +49,8 @@ def find_photographs(folder: Path) -> Photographs:
     folders = {path.name: _pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:
-        told = compose("photographs-beside-folders")
-        raise InputError(folder.name, [told])
+        mixed = compose("photographs-beside-folders")
+        raise InputError(folder.name, [mixed])
     files = folders or {path.stem: [path] for path in flat}
     faults = [compose("camera-rename", fault=fault) for name in files if (fault := name_fault(name))]
     if len(files) < CAMERAS_LEAST:

@@ -23,7 +23,9 @@ def scene_page(calibration: SceneCalibration) -> str:
         f"2D residual RMS <b>{figures['rms_px']:.3f} px</b>. Front camera: {escape(calibration.front)} (a guess unless "
         "it was named)."
     )
-    told = f"Scale: <span class='{mark}'>{escape(scale.told.text)}</span>, good to {100 * scale.share:.2g} %."
+    scale_line = (
+        f"Scale: <span class='{mark}'>{escape(scale.provenance.text)}</span>, good to {100 * scale.share:.2g} %."
+    )
     refined = "" if calibration.refinement is None else f"<p>Silhouettes: {escape(calibration.refinement.text)}.</p>"
     head = ("camera", "points", "RMS px", "uncertainty at the subject px", "focal length px", "centre mm")
     rows = [
@@ -40,7 +42,7 @@ def scene_page(calibration: SceneCalibration) -> str:
     return "\n".join(
         [
             "<!doctype html><html lang='en'><meta charset='utf-8'><title>Calibration from the scene</title>",
-            f"<style>{STYLE}</style><h1>Calibration from the scene</h1><p>{summary}</p><p>{told}</p>{refined}",
+            f"<style>{STYLE}</style><h1>Calibration from the scene</h1><p>{summary}</p><p>{scale_line}</p>{refined}",
             listed("Views that did not join", calibration.absences()),
             listed("Warnings", calibration.warnings),
             "<h2>Cameras</h2>",

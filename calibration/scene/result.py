@@ -80,11 +80,11 @@ class SceneCalibration:
         misses = self.structure.residuals()
         cameras: dict[str, SceneCameraFigures] = {}
         for index, camera in enumerate(self.rig):
-            own = self.structure.camera_of == index
+            of_camera = self.structure.camera_of == index
             cameras[camera.name] = {
-                "rms_px": _rms(misses[own]),
+                "rms_px": _rms(misses[of_camera]),
                 "features": self.features[camera.name],
-                "points": int(own.sum()),
+                "points": int(of_camera.sum()),
                 "pose_sigma_px": float(self.uncertainty.pose_sigma_px[index]),
                 "focal_px": camera.intrinsics.fx,
                 "focal_sigma_px": float(self.uncertainty.focal_sigma_px[index]),
@@ -107,7 +107,7 @@ class SceneCalibration:
             "scale": {
                 "source": self.scale.source,
                 "assumed": self.scale.assumed,
-                "told": self.scale.told.text,
+                "told": self.scale.provenance.text,
                 "share_sigma": self.scale.share,
             },
             "left_out": {name: f"{name}: {why}" for name, why in self.left_out.items()},

@@ -39,7 +39,7 @@ def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) 
     scale = _scale(capture, rig, full, known)
     if abs(np.log(scale.factor)) <= max(AGREES_LEAST, AGREES_SHARES * scale.share):
         return rig, []
-    return times(rig, scale.factor), [compose("cameras-scaled", factor=scale.factor, scale=scale.told)]
+    return times(rig, scale.factor), [compose("cameras-scaled", factor=scale.factor, scale=scale.provenance)]
 
 
 def times(rig: Rig, factor: float) -> Rig:

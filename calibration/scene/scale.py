@@ -41,7 +41,7 @@ class Scale:
     factor: float
     share: float
     source: str
-    told: Message
+    provenance: Message
 
     @property
     def assumed(self) -> bool:
@@ -71,8 +71,10 @@ def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
         raise InputError("scale.json", [compose("scale-camera-lost", camera=name) for name in lost])
     one, other = (rig[name].centre_world for name in known.cameras)
     factor = known.distance_mm / float(np.linalg.norm(one - other))
-    told = compose("scale-by-cameras", distance_mm=known.distance_mm, first=known.cameras[0], second=known.cameras[1])
-    return Scale(factor, 2.0 / known.distance_mm, "cameras", told)
+    provenance = compose(
+        "scale-by-cameras", distance_mm=known.distance_mm, first=known.cameras[0], second=known.cameras[1]
+    )
+    return Scale(factor, 2.0 / known.distance_mm, "cameras", provenance)
 
 
 def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
@@ -94,12 +96,12 @@ def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
     return _between(ends, known.distance_mm, "points", compose("scale-by-points", distance_mm=known.distance_mm))
 
 
-def _between(ends: list[TriangulatedPoint], length_mm: float, source: str, told: Message) -> Scale:
+def _between(ends: list[TriangulatedPoint], length_mm: float, source: str, provenance: Message) -> Scale:
     across = ends[1].position_world - ends[0].position_world
     length = float(np.linalg.norm(across))
     along = across / length
     share = float(np.sqrt(along @ (ends[0].covariance + ends[1].covariance) @ along)) / length
-    return Scale(length_mm / length, share, source, told)
+    return Scale(length_mm / length, share, source, provenance)
 
 
 Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
@@ -109,8 +111,8 @@ def find_tags(photographs: Photographs, known: TagSize) -> Tags:
     """Corners (px) of the tags of a dictionary, by shot and number, then by camera."""
     detector = _tag_detector(known)
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
-    for camera, own in photographs.files.items():
-        for shot, path in own.items():
+    for camera, shots in photographs.files.items():
+        for shot, path in shots.items():
             pixels, _, _ = decode_image_file(path, path.name, "grey")
             assert pixels is not None  # matching has read it
             for number, corners in _tags_in(pixels, detector).items():
@@ -164,20 +166,20 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
             found.append((np.mean([side.factor for side in sides]), np.mean([side.share for side in sides]), number[1]))
     if not found:
         seen = sorted({camera for views in tags.values() for camera in views})
-        told = compose("scale-tag-seen", cameras=seen) if seen else compose("scale-tag-unseen")
-        raise InputError("scale.json", [told])
+        provenance = compose("scale-tag-seen", cameras=seen) if seen else compose("scale-tag-unseen")
+        raise InputError("scale.json", [provenance])
     factor = float(np.median([factor for factor, _, _ in found]))
     numbers = sorted({number for *_, number in found})
-    told = compose("scale-by-tags", count=len(numbers), size_mm=known.size_mm, numbers=numbers)
-    return Scale(factor, float(np.median([share for _, share, _ in found])), "tag", told)
+    provenance = compose("scale-by-tags", count=len(numbers), size_mm=known.size_mm, numbers=numbers)
+    return Scale(factor, float(np.median([share for _, share, _ in found])), "tag", provenance)
 
 
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
     """From the median distance of points from their middle, as in ``head`` (mm)."""
     points = _looked_at(structure)
     ratio = _spread(head) / _spread(points)
-    told = compose("scale-by-head")
-    return Scale(ratio, HEAD_SHARE, ASSUMED, told)
+    provenance = compose("scale-by-head")
+    return Scale(ratio, HEAD_SHARE, ASSUMED, provenance)
 
 
 def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:

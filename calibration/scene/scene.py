@@ -82,8 +82,8 @@ def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, di
     left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
     if structure is None or len(joined) < max(CAMERAS_LEAST, JOINED_LEAST * len(names)):
         few = compose("scene-views-join", joined=len(joined), all=len(names))
-        told = few if joined else compose("scene-no-view-joins", all=len(names))
-        raise CalibrationRefused([told, *(compose("located", where=n, fault=why) for n, why in left_out.items())])
+        reason = few if joined else compose("scene-no-view-joins", all=len(names))
+        raise CalibrationRefused([reason, *(compose("located", where=n, fault=why) for n, why in left_out.items())])
     return structure, left_out
 
 
@@ -100,7 +100,7 @@ def placed(
     reasons = (compose("located", where=name, fault=why) for name, why in left_out.items())
     warnings = [compose("left-out", what=reason) for reason in reasons]
     if scale.assumed:
-        warnings.append(compose("scale-good-to", scale=scale.told, share=HEAD_SHARE))
+        warnings.append(compose("scale-good-to", scale=scale.provenance, share=HEAD_SHARE))
     warnings += [
         compose("pose-known-to", camera=name, px=px)
         for name, px in zip(here.rig.names, spread.pose_sigma_px, strict=True)
@@ -130,8 +130,8 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
     known = [name for name in rig.names if name in masks]
     if len(known) < VIEWS_LEAST:
         return calibration
-    own = Capture({}, masks={name: masks[name] for name in known})
-    silhouettes = segment(own, rig.subset(known), SegmentationSettings(), report=lambda stage, share: None)
+    masked = Capture({}, masks={name: masks[name] for name in known})
+    silhouettes = segment(masked, rig.subset(known), SegmentationSettings(), report=lambda stage, share: None)
     done = refine_one(silhouettes, rig)
     return calibration if done is None else replace(calibration, rig=done.rig, refinement=done.reason)
 

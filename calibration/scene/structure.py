@@ -53,8 +53,8 @@ class Structure:
         """Projected less observed, px."""
         projected = np.empty_like(self.pixels)
         for index, camera in enumerate(self.rig):
-            own = self.camera_of == index
-            projected[own] = camera.project(self.points[self.point_of[own]])
+            of_camera = self.camera_of == index
+            projected[of_camera] = camera.project(self.points[self.point_of[of_camera]])
         return projected - self.pixels
 
 

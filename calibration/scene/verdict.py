@@ -12,7 +12,7 @@ def judge_scene(calibration: SceneCalibration) -> Verdict:
     loose = [name for name, px in sigma.items() if POSE_GOOD_PX < px <= POSE_POOR_PX]
     mild = [_loose(loose, POSE_GOOD_PX)] if loose else []
     if calibration.scale.assumed:
-        mild.append(compose("scale-assumed", scale=calibration.scale.told))
+        mild.append(compose("scale-assumed", scale=calibration.scale.provenance))
     mild += calibration.absences()
     severe = [_loose(poor, POSE_POOR_PX)] if poor else []
     return Verdict("poor" if severe else "usable" if mild else "good", (*severe, *mild))

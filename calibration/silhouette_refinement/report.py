@@ -145,12 +145,12 @@ def _histogram(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " m"]) 
     top = max(1, *(int(count.max()) for count in counts))
     step = HISTOGRAM_WIDTH / BINS
     bars = []
-    for count, looks in zip(counts, ("fill='none' stroke='#b3261e'", "fill='#1f4e8c' fill-opacity='0.6'"), strict=True):
+    for count, style in zip(counts, ("fill='none' stroke='#b3261e'", "fill='#1f4e8c' fill-opacity='0.6'"), strict=True):
         for i, number in enumerate(count.tolist()):
             height = (HISTOGRAM_HEIGHT - 20.0) * number / top
             bars.append(
                 f"<rect x='{i * step:.1f}' y='{HISTOGRAM_HEIGHT - 20.0 - height:.1f}' width='{step - 1:.1f}' "
-                f"height='{height:.1f}' {looks}/>"
+                f"height='{height:.1f}' {style}/>"
             )
     for at, text in ((0.0, f"{-most:.2f} px"), (0.5, "0"), (1.0, f"{most:.2f} px")):
         anchor = {0.0: "start", 0.5: "middle", 1.0: "end"}[at]

@@ -51,11 +51,11 @@ def rim_equations(
     whole = head_problem(problem, solved.evidence, stage, scale_px)
     equations = whole.equations(whole.at(solved.state))
     matrix, gradient = equations.matrix, equations.gradient
-    own = len(gradient) - PER_CAMERA * len(problem.views.names)
-    head = scipy.linalg.cho_factor(matrix[:own, :own])
-    across = matrix[own:, :own]
-    reduced = matrix[own:, own:] - across @ scipy.linalg.cho_solve(head, across.T)
-    slope = gradient[own:] - across @ scipy.linalg.cho_solve(head, gradient[:own])
+    head_size = len(gradient) - PER_CAMERA * len(problem.views.names)
+    head = scipy.linalg.cho_factor(matrix[:head_size, :head_size])
+    across = matrix[head_size:, :head_size]
+    reduced = matrix[head_size:, head_size:] - across @ scipy.linalg.cho_solve(head, across.T)
+    slope = gradient[head_size:] - across @ scipy.linalg.cho_solve(head, gradient[:head_size])
     at = np.concatenate([PER_CAMERA * rig.names.index(name) + np.arange(PER_CAMERA) for name in problem.views.names])
     full, full_slope = np.zeros((PER_CAMERA * len(rig),) * 2), np.zeros(PER_CAMERA * len(rig))
     full[np.ix_(at, at)], full_slope[at] = 0.5 * (reduced + reduced.T), slope

@@ -46,14 +46,16 @@ def judge(
 ) -> list[Fault]:
     """The faults that can be seen in the pictures of a shot."""
     levels = {name: plate_level(plates.first.get(name)) for name in checks}
-    return judge_checks(checks, levels, shot, lambda name, own: _whose_view(name, images[name], own, plates))
+    return judge_checks(
+        checks, levels, shot, lambda name, registration: _whose_view(name, images[name], registration, plates)
+    )
 
 
 def judge_checks(
     checks: Mapping[str, PictureCheck],
     levels: Mapping[str, float],
     shot: ShotConfig,
-    whose_view: OtherView = lambda name, own: None,
+    whose_view: OtherView = lambda name, registration: None,
 ) -> list[Fault]:
     """The faults that measured pictures have.
 
@@ -105,8 +107,8 @@ def _view_faults(name: str, found: Registration, lit: bool, shot: ShotConfig, wh
     return []
 
 
-def _whose_view(name: str, image: ImageRgb, own: Registration, plates: Plates) -> str | None:
+def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: Plates) -> str | None:
     """The camera whose clean plate fits the picture far better than the own one does."""
     others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
     best = max(others, key=lambda other: others[other], default=None)
-    return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * own.found) else None
+    return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * registration.found) else None

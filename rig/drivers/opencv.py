@@ -47,8 +47,10 @@ class MjpegDriver:
             raise CameraNotFound(self._camera, _reason(error, compose("no-answer"))) from error
 
     def configure(self) -> tuple[Message, ...]:
-        asked = [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None]
-        return tuple(compose("not-set-over-http", setting=key) for key in asked)
+        requested = [
+            key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
+        ]
+        return tuple(compose("not-set-over-http", setting=key) for key in requested)
 
     def grab(self, timeout_s: float) -> Arrival:
         if self._stream is None:

@@ -45,8 +45,10 @@ class SimulatedDriver:
         self._pace = Pace(self._camera.fps or _FPS)
 
     def configure(self) -> tuple[Message, ...]:
-        asked = [key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None]
-        return tuple(compose("no-setting-of-simulated", setting=key) for key in asked)
+        requested = [
+            key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
+        ]
+        return tuple(compose("no-setting-of-simulated", setting=key) for key in requested)
 
     def grab(self, timeout_s: float) -> Arrival:
         if self._pace is None:

@@ -91,14 +91,14 @@ class _Faults:
         others = {name: value for name, value in fault.parameters.items() if name != "member"}
         self.by_cause.setdefault((fault.code, *others.items()), []).append(fault)
 
-    def told(self) -> list[Message]:
-        told: list[Message] = []
+    def summarise(self) -> list[Message]:
+        messages: list[Message] = []
         for faults in self.by_cause.values():
             if len(faults) < SAME_LEAST:
-                told += faults
+                messages += faults
             else:
-                told.append(compose("same-of-members", fault=faults[0], count=len(faults) - 1))
-        return _first(told)
+                messages.append(compose("same-of-members", fault=faults[0], count=len(faults) - 1))
+        return _first(messages)
 
 
 def is_archive(path: Path) -> bool:
@@ -162,8 +162,8 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
     kind = _format(path)
     if kind is None:
         foreign = _foreign_kind(path)
-        told = compose("archive-foreign", packer=foreign) if foreign else compose("archive-unknown")
-        raise InputError("archive", [told])
+        fault = compose("archive-foreign", packer=foreign) if foreign else compose("archive-unknown")
+        raise InputError("archive", [fault])
     try:
         if kind == "zip":
             _check_directory_size(path)
@@ -236,7 +236,7 @@ def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
         elif info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
             faults.add(compose("member-method", member=member.shown, method=info.compress_type))
     if faults.by_cause:
-        raise InputError("archive", faults.told())
+        raise InputError("archive", faults.summarise())
     return members
 
 
@@ -310,14 +310,14 @@ def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, pa
                 faults.add(fault)
             written.append(name)
     around = _common_folder(written)
-    for parts, told in odd.items():
+    for parts, messages in odd.items():
         if parts != around[: len(parts)]:
-            for fault in told:
+            for fault in messages:
                 faults.add(fault)
     if not written and not faults.by_cause:
         faults.add(compose("archive-empty"))
     if faults.by_cause:
-        raise InputError("archive", faults.told())
+        raise InputError("archive", faults.summarise())
     return tuple(written)
 
 

@@ -60,7 +60,7 @@ def rig_files(folder: Path) -> Iterator[Path]:
     beside the pictures or at the top, or its CSV.
     """
     names = ("cameras.json", *(f"{inner}/cameras{end}" for inner in COLMAP_FOLDERS for end in (".bin", ".txt")))
-    own, *colmap = (folder / name for name in names)
+    native, *colmap = (folder / name for name in names)
     caliscope, nerfstudio, easymocap = (folder / n for n in ("camera_array.toml", "transforms.json", "intri.yml"))
     aniposelib = (path for path in sorted(folder.glob("*.toml")) if path != caliscope and looks_like_aniposelib(path))
     yaml = sorted({*folder.glob("*.yml"), *folder.glob("*.yaml")} - {easymocap})
@@ -74,7 +74,7 @@ def rig_files(folder: Path) -> Iterator[Path]:
     )
     tables = (path for path in sorted(folder.glob("*.csv")) if _head(path).startswith(",".join(COLUMNS[:8]).encode()))
     for found in (
-        [own],
+        [native],
         colmap,
         [caliscope],
         aniposelib,
@@ -100,7 +100,7 @@ def read_cameras(path: Path) -> CamerasRead:
     if path.name == "transforms.json":
         return read_transforms(path)
     if path.suffix == ".json":
-        return CamerasRead(read_rig(path), tuple(compose("unknown-key", remark=told) for told in unread_keys(path)))
+        return CamerasRead(read_rig(path), tuple(compose("unknown-key", remark=remark) for remark in unread_keys(path)))
     if path.suffix in (".bin", ".txt"):
         return read_colmap(path.parent, path.suffix)
     if path.suffix == ".xmp":

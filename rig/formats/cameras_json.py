@@ -100,8 +100,8 @@ def _shared_serials(cameras: list[Camera]) -> list[Message]:
     for camera in cameras:
         if camera.serial is not None:
             owners.setdefault(camera.serial, []).append(camera.name)
-    shared = {serial: own for serial, own in owners.items() if len(own) > 1}
-    return [compose("serial-shared", cameras=own, serial=f"{serial!r}") for serial, own in shared.items()]
+    shared = {serial: names for serial, names in owners.items() if len(names) > 1}
+    return [compose("serial-shared", cameras=names, serial=f"{serial!r}") for serial, names in shared.items()]
 
 
 def name_fault(name: Any) -> Message | None:
@@ -178,8 +178,8 @@ def _read_camera(entry: Any, where: str, faults: list[Message]) -> Camera | None
         faults += _rotation_faults(rotation, where)
     serial = entry.get("serial")
     if serial is not None and not (isinstance(serial, str) and 0 < len(serial) <= SERIAL_MOST):
-        told, value = f"{where}.serial", f"{serial!r:.80}"
-        faults.append(compose("no-text-of", key=told, value=value, most=SERIAL_MOST))
+        serial_key, value = f"{where}.serial", f"{serial!r:.80}"
+        faults.append(compose("no-text-of", key=serial_key, value=value, most=SERIAL_MOST))
     if len(faults) == before and not (fx > 0 and fy > 0):
         faults.append(compose("focal-lengths-positive", key=f"{where}.intrinsics"))
     if len(faults) > before or rotation is None or translation is None or not width or not height:

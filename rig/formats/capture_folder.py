@@ -92,22 +92,22 @@ def read_rig_of(rig_file: Path) -> CamerasRead:
 
 def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
     """Pictures that belong to no camera, and folders of pictures that are nobody's."""
-    told = [stray_sentence(files.strays, rig)] if files.strays else []
+    remarks = [stray_sentence(files.strays, rig)] if files.strays else []
     known = ("images", *BESIDE_PICTURES, *rig.names)
     for path in sorted(folder.iterdir()):
         is_other = path.is_dir() and path.name not in known and not is_junk(path.name)
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
         if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
-            told.append(compose("folder-unread", folder=path.name))
-    return [compose("file-unread", remark=message) for message in told]
+            remarks.append(compose("folder-unread", folder=path.name))
+    return [compose("file-unread", remark=message) for message in remarks]
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
     """Cameras of another program: files that do nothing here."""
     read, *others = (path.relative_to(folder).as_posix() for path in rigs)
     others += _other_models(folder, rigs[0])
-    told = [compose("cameras-unread", file=other, read=read) for other in others]
-    return [compose("file-unread", remark=message) for message in told]
+    remarks = [compose("cameras-unread", file=other, read=read) for other in others]
+    return [compose("file-unread", remark=message) for message in remarks]
 
 
 def _other_models(folder: Path, rig_file: Path) -> list[str]:

@@ -53,8 +53,8 @@ def mask_subjects(
         elif reading.soft:
             soft[name] = share
             soft[name].setflags(write=False)
-    told = _by_cause({files[name]: reading.remark for name, reading in usable.items()})
-    remarks = [compose("mask-undecided", remark=remark) for remark in told]
+    grouped = _by_cause({files[name]: reading.remark for name, reading in usable.items()})
+    remarks = [compose("mask-undecided", remark=remark) for remark in grouped]
     if inverted:
         remarks.append(compose("mask-inverted", remark=_inverted([files[name] for name in inverted], len(planes))))
     return MaskSubjects(masks, soft, tuple(remarks))
@@ -83,10 +83,10 @@ def _middles(rig: Rig) -> dict[str, np.ndarray]:
     return {name: pixel for name, pixel in pixels.items() if np.isfinite(pixel).all()}
 
 
-def _by_cause(told: Mapping[str, Message | None]) -> list[Message]:
+def _by_cause(messages: Mapping[str, Message | None]) -> list[Message]:
     """One message for all files of which the same is true."""
     files: dict[Message, list[str]] = {}
-    for file, message in told.items():
+    for file, message in messages.items():
         if message is not None:
             files.setdefault(message, []).append(file)
     return [compose("of-file", file=_of_masks(names), fault=message) for message, names in files.items()]

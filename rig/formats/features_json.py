@@ -37,13 +37,13 @@ def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Fe
         faults.append(compose("of-file", file=FILE, fault=compose("features-no-points")))
         return {}
     if document.get("format") != FEATURES_FORMAT:
-        given = f"{document.get('format')!r:.80}"
+        observed = f"{document.get('format')!r:.80}"
         faults.append(
-            compose("located", where=FILE, fault=compose("format-is", format=given, wanted=f"{FEATURES_FORMAT!r}"))
+            compose("located", where=FILE, fault=compose("format-is", format=observed, wanted=f"{FEATURES_FORMAT!r}"))
         )
     if len(document["points"]) > POINTS_MOST:
-        told = compose("features-many", count=len(document["points"]), most=POINTS_MOST)
-        faults.append(compose("located", where=FILE, fault=told))
+        fault = compose("features-many", count=len(document["points"]), most=POINTS_MOST)
+        faults.append(compose("located", where=FILE, fault=fault))
         return {}
     features: dict[str, dict[str, np.ndarray]] = {}
     for landmark, views in document["points"].items():

@@ -83,8 +83,8 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
     except (TypeError, ValueError, OverflowError):
         array = np.zeros(())
     if array.ndim == 0 or (shape is not None and array.shape != shape):
-        told = " x ".join(map(str, shape or ()))
-        faults.append(compose("no-list-of", key=where, shape=told) if told else compose("no-number-list", key=where))
+        axes = " x ".join(map(str, shape or ()))
+        faults.append(compose("no-list-of", key=where, shape=axes) if axes else compose("no-number-list", key=where))
         return np.full(shape or (3, 3), np.nan)
     return array
 

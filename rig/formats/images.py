@@ -131,9 +131,9 @@ def decode_image_file(
 
 
 @contextmanager
-def _faults_of(where: str, told: Message | None = None) -> Iterator[None]:
+def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
     """What decoders raise for a damaged file, as InputError."""
-    said = told or compose("no-picture")
+    said = fault or compose("no-picture")
     try:
         yield
     except Image.DecompressionBombError as error:

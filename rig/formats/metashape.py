@@ -203,11 +203,11 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
     kind = sensor.get("type") or found.get("type") or "frame"
     if kind not in TYPES:
         faults.append(compose("camera-type", camera=name, kind=shown(kind), known=[*TYPES]))
-    given = dict(found.attrib)
-    if given.get("type") == kind:
-        del given["type"]
+    attributes = dict(found.attrib)
+    if attributes.get("type") == kind:
+        del attributes["type"]
     below = {f"/{node.tag}": node.text for node in found}
-    reading.judge(METASHAPE, {f"@{key}": value for key, value in given.items()} | below, name, place="calibration")
+    reading.judge(METASHAPE, {f"@{key}": value for key, value in attributes.items()} | below, name, place="calibration")
     size = found.find("resolution")
     if size is not None and (_whole(size, "width"), _whole(size, "height")) != (entry["width"], entry["height"]):
         of_lens = f"{shown(size.get('width'), 20)} x {shown(size.get('height'), 20)}".replace("'", "")

@@ -40,14 +40,14 @@ def read_toml(path: Path) -> CamerasRead:
         if not isinstance(table, dict):
             reading.faults.append(compose("no-table", key=name))
             continue
-        own = table["name"] if isinstance(table.get("name"), str) else name
-        if "ignore" in keys and _switch(table, "ignore", own, reading.faults):
-            reading.leave_out(own, compose("left-switched-off", key="ignore = true"))
+        camera = table["name"] if isinstance(table.get("name"), str) else name
+        if "ignore" in keys and _switch(table, "ignore", camera, reading.faults):
+            reading.leave_out(camera, compose("left-switched-off", key="ignore = true"))
         elif keys is CALISCOPE and not {"rotation", "translation"} & table.keys():
-            reading.leave_out(own, compose("left-without-pose"))
+            reading.leave_out(camera, compose("left-without-pose"))
         else:
-            reading.judge(keys, table, own)
-            entries.append(_toml_entry(own, table, millimetres, reading.faults))
+            reading.judge(keys, table, camera)
+            entries.append(_toml_entry(camera, table, millimetres, reading.faults))
     return reading.finish(entries)
 
 
@@ -101,8 +101,8 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
         rotation = rotation_from_vector(rotation) if np.isfinite(rotation).all() else np.full((3, 3), np.nan)
     names = COEFFICIENTS["kannala-brandt" if fisheye else "rational"]
     if lens.ndim != 1 or not 1 <= len(lens) <= 14 or lens[len(names) :].any():
-        told = f"{name}.distortions"
-        faults.append(compose("coefficients-at-most", key=told, most=len(names), names=" ".join(names)))
+        list_key = f"{name}.distortions"
+        faults.append(compose("coefficients-at-most", key=list_key, most=len(names), names=" ".join(names)))
     if matrix.shape == (3, 3) and abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
         faults.append(compose("matrix-skewed", key=f"{name}.matrix"))
     size = table.get("size")

@@ -55,8 +55,8 @@ def read_yaml(path: Path) -> CamerasRead:
         if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
             faults.append(compose("matrix-skewed", key=f"K_{name}"))
         turned = poses.get(f"Rot_{name}")
-        if turned is None and (given := poses.get(f"R_{name}")) is not None:
-            turned = rotation_from_vector(given.ravel()) if given.size == 3 else given
+        if turned is None and (rodrigues := poses.get(f"R_{name}")) is not None:
+            turned = rotation_from_vector(rodrigues.ravel()) if rodrigues.size == 3 else rodrigues
         rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
         _check_alike(poses, name, faults)
         translation = number_array(poses.get(f"T_{name}", np.zeros(0)).ravel(), (3,), f"T_{name}", faults)
@@ -84,17 +84,17 @@ def read_yaml(path: Path) -> CamerasRead:
     return reading.finish(entries)
 
 
-def _taking_part(held: list[str], given: list[str] | None, reading: Reading) -> list[str]:
+def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:
     """The cameras that ``names`` has, where there is one; those of it that the file does not hold are a fault."""
-    if not given:
+    if not listed:
         return held
-    lacking = [name for name in given if name not in held]
+    lacking = [name for name in listed if name not in held]
     if lacking:
         reading.faults.append(compose("yaml-names-lacking", cameras=some_of(lacking)))
     for name in held:
-        if name not in given:
+        if name not in listed:
             reading.leave_out(name, compose("left-not-named"))
-    return [name for name in held if name in given]
+    return [name for name in held if name in listed]
 
 
 def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) -> None:

@@ -72,10 +72,10 @@ def match_names(names: Iterable[str], cameras: Sequence[str], *, several: bool =
     matched: dict[str, list[str]] = {}
     for rule in (_equal, _alike_about, _naming_one, _numbered):
         found = rule(strays, words)
-        for camera, own in found.items():
-            if camera in lacking and camera not in matched and (several or len(own) == 1):
-                matched[camera] = sorted(own)
-        taken = {name for own in matched.values() for name in own}
+        for camera, pictures in found.items():
+            if camera in lacking and camera not in matched and (several or len(pictures) == 1):
+                matched[camera] = sorted(pictures)
+        taken = {name for pictures in matched.values() for name in pictures}
         strays = {name: said for name, said in strays.items() if name not in taken}
     return matched
 
@@ -102,15 +102,15 @@ def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> F
     """Files that say the same before and after the words of each camera, where one such pair fits most cameras."""
     fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
     for name, words in strays.items():
-        for camera, own in cameras.items():
-            for start in _places(own, words):
-                about = words[:start], words[start + len(own) :]
+        for camera, known in cameras.items():
+            for start in _places(known, words):
+                about = words[:start], words[start + len(known) :]
                 fitting.setdefault(about, {}).setdefault(camera, []).append(name)
     if not fitting:
         return {}
     most = max(len(found) for found in fitting.values())
     best = [found for found in fitting.values() if len(found) == most]
-    owners = Counter((camera, name) for found in best for camera, own in found.items() for name in own)
+    owners = Counter((camera, name) for found in best for camera, known in found.items() for name in known)
     claimed = Counter(name for _, name in owners)
     if most == 1 and any(not _is_telling(cameras[camera]) for camera, _ in owners):
         return {}  # a number in one file's name may be anything
@@ -121,7 +121,7 @@ def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Fo
     """Files that name one camera alone, whatever else each says: times, exposures, counters."""
     pairs = []
     for name, words in strays.items():
-        said = [camera for camera, own in cameras.items() if _is_telling(own) and _places(own, words)]
+        said = [camera for camera, known in cameras.items() if _is_telling(known) and _places(known, words)]
         longest = [camera for camera in said if not any(_within(cameras[camera], cameras[other]) for other in said)]
         pairs += [(longest[0], name)] if len(longest) == 1 else []
     return _by_owner(pairs)
@@ -138,13 +138,13 @@ def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Foun
     return found if len(owners) == len(cameras) == len(found) else {}
 
 
-def _places(own: Words, words: Words) -> list[int]:
+def _places(known: Words, words: Words) -> list[int]:
     """Where the words of a camera stand among those of a file."""
-    return [i for i in range(len(words) - len(own) + 1) if own and words[i : i + len(own)] == own]
+    return [i for i in range(len(words) - len(known) + 1) if known and words[i : i + len(known)] == known]
 
 
-def _within(own: Words, other: Words) -> bool:
-    return own != other and bool(_places(own, other))
+def _within(known: Words, other: Words) -> bool:
+    return known != other and bool(_places(known, other))
 
 
 def _is_telling(words: Words) -> bool:

@@ -122,15 +122,15 @@ class _Reading:
             return
         for corner in named:
             self.corners.append(self._row(number, corner[0], len(self.vertices)))
-            given = corner[1] if len(corner) > 1 else None
-            self.corner_uv.append(-1 if given is None else self._row(number, given, len(self.uv)))
+            index = corner[1] if len(corner) > 1 else None
+            self.corner_uv.append(-1 if index is None else self._row(number, index, len(self.uv)))
         self.sizes.append(len(named))
 
-    def _row(self, number: int, given: int | None, count: int) -> int:
+    def _row(self, number: int, index: int | None, count: int) -> int:
         """OBJ counts from 1, and backwards from -1. What lies ahead in the file is checked at its end."""
-        row = -1 if given is None else given - 1 if given > 0 else count + given
-        if not given or row < 0:
-            self.faults.append(compose("line-strange-row", line=number, row=f"{given}"))
+        row = -1 if index is None else index - 1 if index > 0 else count + index
+        if not index or row < 0:
+            self.faults.append(compose("line-strange-row", line=number, row=f"{index}"))
             return 0
         return row
 

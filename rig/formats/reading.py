@@ -51,19 +51,21 @@ class Reading:
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
         """The rig of ``eigenhead-cameras/1`` entries. Raises InputError naming every fault."""
-        told: list[Message] = []
+        warnings: list[Message] = []
         for (key, rule), cases in self._meant.items():
             whose, value = _whose([name for name, _ in cases], key), shown(cases[0][1])
             sentence = compose("key-is", whose=whose, value=value, why=rule.why)
             if rule.treatment == "refused":
                 self.faults.append(sentence)
             else:
-                told.append(compose("unknown-key", remark=compose("key-not-used", file=self.subject, told=sentence)))
+                warnings.append(
+                    compose("unknown-key", remark=compose("key-not-used", file=self.subject, told=sentence))
+                )
         if self._unknown:
             keys = some_of([shown(key) for key in self._unknown])
             remark = compose("keys-unknown", file=self.subject, count=len(self._unknown), keys=keys)
-            told.append(compose("unknown-key", remark=remark))
-        told += [compose("view-left-out", remark=sentence) for sentence in self._left_out()]
+            warnings.append(compose("unknown-key", remark=remark))
+        warnings += [compose("view-left-out", remark=sentence) for sentence in self._left_out()]
         names = [str(entry.get("name")) for entry in entries]
         try:
             rig = rig_from_document({"format": FORMAT, "unit": "mm", "cameras": list(entries)}, self.subject)
@@ -72,7 +74,7 @@ class Reading:
             raise InputError(self.subject, [*say_once(faults, names), *self._left_out()]) from None
         if self.faults:
             raise InputError(self.subject, say_once(self.faults, names))
-        return CamerasRead(rig, tuple(told), MappingProxyType(dict(self.left_out)))
+        return CamerasRead(rig, tuple(warnings), MappingProxyType(dict(self.left_out)))
 
     def _left_out(self) -> list[Message]:
         reasons: dict[Message, list[str]] = {}
@@ -94,14 +96,14 @@ def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Mess
     for fault in dict.fromkeys(message_of(fault) for fault in faults):
         masked = plate.sub(r"\1", fault.text)
         groups.setdefault(masked if name is None else name.sub("\0", masked), []).append(fault)
-    told = []
+    grouped = []
     for group in groups.values():
         if len(group) < SAME_LEAST or name is None:
-            told += group
+            grouped += group
             continue
         others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault.text)))
-        told.append(compose("same-of-more", fault=group[0], count=len(group) - 1, names=some_of([*others])))
-    return told
+        grouped.append(compose("same-of-more", fault=group[0], count=len(group) - 1, names=some_of([*others])))
+    return grouped
 
 
 def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Message:
@@ -120,7 +122,7 @@ def shown(value: object, most: int = VALUE_MOST) -> str:
 
 def _whose(names: Sequence[str], key: str) -> str | Message:
     """A key and the cameras that have it, or the key alone where it is the whole file's."""
-    own = [name for name in names if name]
-    if len(own) == 1:
-        return key.replace("<name>", own[0]) if "<name>" in key else f"{own[0]}.{key}"
-    return compose("key-of-cameras", cameras=len(own), names=some_of(own), key=key) if own else key
+    cameras = [name for name in names if name]
+    if len(cameras) == 1:
+        return key.replace("<name>", cameras[0]) if "<name>" in key else f"{cameras[0]}.{key}"
+    return compose("key-of-cameras", cameras=len(cameras), names=some_of(cameras), key=key) if cameras else key

@@ -288,8 +288,8 @@ def _read_value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         if value not in arguments or isinstance(value, bool):
-            told = compose("value-not-allowed", key=where, value=f"{value!r}")
-            faults.append(_hinted(compose("one-of", fault=told, known=_allowed(hint)), value, arguments))
+            fault = compose("value-not-allowed", key=where, value=f"{value!r}")
+            faults.append(_hinted(compose("one-of", fault=fault, known=_allowed(hint)), value, arguments))
         return value
     if origin in (types.UnionType, typing.Union):
         return _read_value(arguments[0], value, where, faults)

@@ -61,15 +61,15 @@ def read_scale(path: Path, cameras: Collection[str]) -> KnownLength:
 
 def scale_from_document(document: Any, cameras: Collection[str], subject: str = "scale.json") -> KnownLength:
     """The length in a decoded ``scale.json``. Raises InputError naming every fault."""
-    given = [kind for kind in KINDS if isinstance(document, dict) and kind in document]
-    if len(given) != 1:
-        several = compose("scale-kinds", kinds=KINDS, held=given)
-        raise InputError(subject, [several if given else compose("scale-kind", kinds=KINDS)])
+    present = [kind for kind in KINDS if isinstance(document, dict) and kind in document]
+    if len(present) != 1:
+        several = compose("scale-kinds", kinds=KINDS, held=present)
+        raise InputError(subject, [several if present else compose("scale-kind", kinds=KINDS)])
     faults: list[Message] = []
-    unknown = sorted(set(document) - {given[0], "distance_mm"} - {"format"})
+    unknown = sorted(set(document) - {present[0], "distance_mm"} - {"format"})
     faults += [compose("no-key-of-it", key=f"{key!r:.80}") for key in unknown]
     readers = {"points": _points, "tag": _tag, "cameras": _cameras}
-    known = readers[given[0]](document, cameras, faults)
+    known = readers[present[0]](document, cameras, faults)
     if faults or known is None:
         raise InputError(subject, faults)
     return known

@@ -59,9 +59,9 @@ def _exif(data: bytes) -> Image.Exif:
 def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
     """The rig with the serial of each camera's picture, unless two of them share it: then one body took both."""
     serials = {name: camera_serial(path) for name, path in pictures.items()}
-    told = [serial for serial in serials.values() if serial is not None]
-    own = {name: serial for name, serial in serials.items() if serial is not None and told.count(serial) == 1}
-    return Rig(tuple(replace(camera, serial=own.get(camera.name, camera.serial)) for camera in rig))
+    recorded = [serial for serial in serials.values() if serial is not None]
+    unique = {name: serial for name, serial in serials.items() if serial is not None and recorded.count(serial) == 1}
+    return Rig(tuple(replace(camera, serial=unique.get(camera.name, camera.serial)) for camera in rig))
 
 
 def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:

@@ -56,9 +56,9 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
     missing, cause = _missing(folder, rig, images, masks, plates, places, strays)
     if places["images"] != folder:
         strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
-    told = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
-    faults += missing + ([stray_sentence(told, rig)] if missing and told and not cause else [])
-    return ShotFiles(images, masks, plates, tuple(told), tuple(faults))
+    stray_names = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
+    faults += missing + ([stray_sentence(stray_names, rig)] if missing and stray_names and not cause else [])
+    return ShotFiles(images, masks, plates, tuple(stray_names), tuple(faults))
 
 
 def picture_folder(folder: Path) -> Path:
@@ -88,12 +88,12 @@ def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[
     folders = [path for path in _folders(inner) if path.name not in beside and listed_pictures(path)]
     found: dict[str, list[Path]] = {}
     for path in [*pictures, *folders]:
-        own = path.stem if path in pictures and path.stem in names else path.name
-        if own in names:
-            found.setdefault(own, []).append(path)
+        camera = path.stem if path in pictures and path.stem in names else path.name
+        if camera in names:
+            found.setdefault(camera, []).append(path)
     paths = {path.name: path for path in [*pictures, *folders]}
     spelled = match_names(paths, names, several=kind == "background")
-    found |= {name: [paths[file] for file in own] for name, own in spelled.items()}
+    found |= {name: [paths[file] for file in camera] for name, camera in spelled.items()}
     if not spelled and kind != "masks":
         found |= {name: [path] for name, path in pictures_by_serial(inner, rig, faults).items()}
     return found
@@ -127,7 +127,7 @@ def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | Non
 
 def _flat(paths: Sequence[Path]) -> list[Path]:
     """Files, and the pictures in folders."""
-    return [path for own in paths for path in (listed_pictures(own) if own.is_dir() else [own])]
+    return [path for entry in paths for path in (listed_pictures(entry) if entry.is_dir() else [entry])]
 
 
 def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> list[Path]:
@@ -202,7 +202,7 @@ def _cause(
 def _doubt(strangers: Sequence[Path], rig: Rig) -> Message | None:
     """Why names that do hold the cameras' cannot be told: there are several of each."""
     several = match_names([path.name for path in strangers], rig.names, several=True)
-    if len(several) < len(rig) or all(len(own) == 1 for own in several.values()):
+    if len(several) < len(rig) or all(len(pictures) == 1 for pictures in several.values()):
         return None
-    own = several[rig.names[0]]
-    return compose("several-of-each", camera=rig.names[0], count=len(own), files=some_of(own, 2))
+    pictures = several[rig.names[0]]
+    return compose("several-of-each", camera=rig.names[0], count=len(pictures), files=some_of(pictures, 2))

@@ -39,13 +39,13 @@ def unread_keys(path: Path) -> tuple[Message, ...]:
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
     """The same of a decoded file of this format. What many cameras have alike is said once, with their number."""
     counts = Counter(_unread(document))
-    told = []
+    faults = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:
         where = repr(f"{place}.{key}" if place else key)  # its signs may be none that a terminal shows
-        told.append(compose("key-unread", count=times, key=f"{where:.80}"))
+        faults.append(compose("key-unread", count=times, key=f"{where:.80}"))
     if len(counts) > TOLD_MOST:
-        told.append(compose("keys-unread-more", more=len(counts) - TOLD_MOST))
-    return tuple(compose("located", where=subject, fault=fault) for fault in told)
+        faults.append(compose("keys-unread-more", more=len(counts) - TOLD_MOST))
+    return tuple(compose("located", where=subject, fault=fault) for fault in faults)
 
 
 def _unread(document: Any) -> Iterator[tuple[str, str]]:

@@ -44,8 +44,8 @@ def work_features(features: Features, rig: Rig, work: Rig) -> Features:
     """Points of the files, in the pictures as they were read."""
 
     def moved(name: str, pixel: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
-        full, own = rig[name].intrinsics, work[name].intrinsics
-        return (pixel + 0.5) * (own.width / full.width, own.height / full.height) - 0.5
+        full, scaled = rig[name].intrinsics, work[name].intrinsics
+        return (pixel + 0.5) * (scaled.width / full.width, scaled.height / full.height) - 0.5
 
     return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
 

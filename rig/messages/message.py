@@ -67,9 +67,9 @@ def verbatim(text: str) -> Message:
     return Message(VERBATIM, {"text": text}, text)
 
 
-def message_of(told: Message | str) -> Message:
+def message_of(message: Message | str) -> Message:
     """Returns the message; a text becomes a verbatim one."""
-    return told if isinstance(told, Message) else verbatim(told)
+    return message if isinstance(message, Message) else verbatim(message)
 
 
 def read_message(document: object) -> Message:

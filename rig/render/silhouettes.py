@@ -185,21 +185,21 @@ class SilhouetteSet:
         return np.frombuffer(raw, np.float32).reshape(surface.blocks.height, surface.blocks.width).astype(float)
 
     def _surface(self, page: Page) -> _Surface:
-        gl, own = self._context.gl, self._owned
+        gl, owned = self._context.gl, self._owned
         size, block_size = (page.width, page.height), (page.width // BLOCK_PX, page.height // BLOCK_PX)
-        mask = own(gl.texture(size, 1, alignment=1))
-        blocks = own(gl.framebuffer([own(gl.texture(block_size, 1, dtype="f4"))]))
-        weights, block_sums = own(gl.texture(size, 1, dtype="f4")), own(gl.texture(block_size, 2, dtype="f4"))
-        cameras = own(gl.buffer(instances(self.rig.cameras, page, self._origin).tobytes()))
-        boxes = own(gl.buffer(reserve=16 * len(page.cameras)))
+        mask = owned(gl.texture(size, 1, alignment=1))
+        blocks = owned(gl.framebuffer([owned(gl.texture(block_size, 1, dtype="f4"))]))
+        weights, block_sums = owned(gl.texture(size, 1, dtype="f4")), owned(gl.texture(block_size, 2, dtype="f4"))
+        cameras = owned(gl.buffer(instances(self.rig.cameras, page, self._origin).tobytes()))
+        boxes = owned(gl.buffer(reserve=16 * len(page.cameras)))
         drawing = self._context.program("silhouette.vert", "silhouette.frag")
         reducing = self._context.program("box.vert", "xor.frag")
         for unit, name in enumerate(("model", "signed_weight", "block_sums")):
             reducing[name] = unit
         content = [(self._positions, "3f", "position"), (cameras, INSTANCE_FORMAT, *INSTANCE_NAMES)]
-        draw = own(gl.vertex_array(drawing, content, index_buffer=self._indices))
-        reduce = own(gl.vertex_array(reducing, [(boxes, "4f/i", "box")]))
-        return _Surface(page, own(gl.framebuffer([mask])), blocks, mask, weights, block_sums, boxes, draw, reduce)
+        draw = owned(gl.vertex_array(drawing, content, index_buffer=self._indices))
+        reduce = owned(gl.vertex_array(reducing, [(boxes, "4f/i", "box")]))
+        return _Surface(page, owned(gl.framebuffer([mask])), blocks, mask, weights, block_sums, boxes, draw, reduce)
 
 
 def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:

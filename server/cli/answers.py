@@ -63,14 +63,14 @@ Data = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 
 
-def service_settings(**given: Any) -> Any:
+def service_settings(**overrides: Any) -> Any:
     """The service's settings: options over variables over defaults. A wrong variable is wrong usage."""
     from pydantic import ValidationError
     from pydantic_settings import SettingsError
 
     from server.settings import ServiceSettings, variable_in
 
-    options = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name, value in overrides.items() if value is not None}
     try:
         return ServiceSettings(**options)
     except ValidationError as error:

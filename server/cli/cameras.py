@@ -164,7 +164,7 @@ def _calibrate_scene(
     total = f"{figures['rms_px']:.3f} px over {figures['points']} points; front camera {found.front}"
     for warning in found.warnings:
         warn(warning.text)
-    answer(found.document(), json_out, [str(out), str(page), *cameras, total, f"scale: {found.scale.told}"])
+    answer(found.document(), json_out, [str(out), str(page), *cameras, total, f"scale: {found.scale.provenance}"])
 
 
 @app.command(epilog="Example: eigenhead refine shots/anna shots/ben shots/cleo shots/dora --out cameras.json")

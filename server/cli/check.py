@@ -109,8 +109,8 @@ def _told_by_photographs(folder: Path, report: Progress) -> tuple[list[str], lis
     scale = (
         "scale.json tells the scale" if known else "the scale will be ASSUMED from a head's mean size: add scale.json"
     )
-    given = [kind for kind in ("masks", "background") if (root / kind).is_dir()]
-    masks = f"{given[0]}/ tells the subject" if given else "the subject will be found from the photographs"
+    present = [kind for kind in ("masks", "background") if (root / kind).is_dir()]
+    masks = f"{present[0]}/ tells the subject" if present else "the subject will be found from the photographs"
     aside = [path.name for path in sorted(root.iterdir()) if path.suffix in RIG_SUFFIXES and path.name != SCALE]
     unread = [f"{name} will not be read: it is no rig's file of a known program" for name in aside]
     begun = f"no cameras.json: {len(names)} photographs will be calibrated from the scene"
@@ -147,10 +147,10 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> lis
 
 def lines(found: Checked) -> list[str]:
     """The same for people."""
-    told = [f"fault    {fault}" for fault in found["faults"]]
-    told += [f"warning  {warning['code']}: {warning['message']}" for warning in found["warnings"]]
-    told += [f"will     {step}" for step in found["will"]]
+    findings = [f"fault    {fault}" for fault in found["faults"]]
+    findings += [f"warning  {warning['code']}: {warning['message']}" for warning in found["warnings"]]
+    findings += [f"will     {step}" for step in found["will"]]
     verdict = "cannot be reconstructed" if found["faults"] else "can be reconstructed"
     seen = f"{len(found['cameras'])} cameras, " if found["cameras"] else ""
     seen += f"front {found['front']}; " if found["front"] else ""
-    return [f"{found['capture']}: {seen}{verdict}", *told]
+    return [f"{found['capture']}: {seen}{verdict}", *findings]

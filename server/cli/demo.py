@@ -72,8 +72,8 @@ def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Progres
         What ``demo --json`` prints.
     """
     began = time.monotonic()
-    asked: dict[str, object] = {} if full else {"detail": "photo", "outputs": {"surface": "head"}}
-    prepare_kernels(_part(report, "", 0.0, 0.0), settings_from_document(asked))
+    requested: dict[str, object] = {} if full else {"detail": "photo", "outputs": {"surface": "head"}}
+    prepare_kernels(_part(report, "", 0.0, 0.0), settings_from_document(requested))
     with tempfile.TemporaryDirectory(prefix="eigenhead-demo-") as scratch:
         data = Path(scratch) / "data"
         report("service", 0.0)
@@ -84,7 +84,7 @@ def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Progres
             starts = {"contour": 0.1, "simplex": 0.4, "": 1.0}
             for method, after in pairwise([*folders, ""]):  # one at a time: both draw
                 start, share = starts[method], starts[after] - starts[method]
-                job = client.submit(capture["id"], settings=asked | {"method": method})
+                job = client.submit(capture["id"], settings=requested | {"method": method})
                 client.wait(job["id"], report=_part(report, f"{method}: ", start, share))
                 client.download(job["id"], folders[method])
         truth = data / "captures" / capture["id"] / "truth"
@@ -124,10 +124,10 @@ def side_by_side(found: dict[str, MethodDocument], target: Path) -> None:
         sheet = cv2.imread(str(Path(described["ply"]).with_name("contact_sheet.png")))
         assert sheet is not None  # the job wrote it
         both = [sheet[:, : 2 * PANEL[0]]] if not columns else []  # input, before the fit: the same for every solver
-        told = (
+        caption = (
             f"{method}: {described['error_mm']['median']:.2f} mm median error, {described['evaluations']} evaluations"
         )
-        headings = ["input, and before the fit"] * len(both) + [told]
+        headings = ["input, and before the fit"] * len(both) + [caption]
         for part, heading in zip([*both, sheet[:, 2 * PANEL[0] :]], headings, strict=True):
             columns.append(np.vstack([_strip(part.shape[1], heading), part.astype(np.uint8)]))
     write_image(target, np.hstack(columns)[:, :, ::-1])

@@ -72,8 +72,7 @@ def examine(settings: ServiceSettings) -> dict[str, Finding]:
         try:
             ok, detail = check(settings)
         except Exception as error:  # a check that fails is a finding, not the end of the examination
-            told = str(error) if isinstance(error, EigenheadError) else f"{type(error).__name__}: {error}"
-            ok, detail = False, told
+            ok, detail = False, str(error) if isinstance(error, EigenheadError) else f"{type(error).__name__}: {error}"
         findings[name] = {"ok": ok, "detail": detail}
     return findings
 
@@ -180,8 +179,11 @@ def _results(settings: ServiceSettings) -> tuple[bool, str]:
     missing = [job for job in jobs if not (settings.data / "jobs" / job / "result").is_dir()]
     if not missing:
         return True, f"of {len(jobs)} jobs, all there"
-    told = f"{', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}"
-    return False, f"of {len(jobs)} jobs {len(missing)} are gone ({told}): restore `jobs` from a backup, or restart them"
+    named = f"{', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}"
+    return (
+        False,
+        f"of {len(jobs)} jobs {len(missing)} are gone ({named}): restore `jobs` from a backup, or restart them",
+    )
 
 
 def _kind(settings: ServiceSettings) -> str:
@@ -215,13 +217,13 @@ def _read_only(path: Path) -> sqlite3.Connection:
 def _variables(settings: ServiceSettings) -> tuple[bool, str]:
     """Names the variables of ours that nobody reads."""
     known = {PREFIX + name.upper() for name in ServiceSettings.model_fields} | OTHER_VARIABLES
-    given = sorted(name for name in os.environ if name.startswith(PREFIX))
+    present = sorted(name for name in os.environ if name.startswith(PREFIX))
     faults = []
-    for name in given:
+    for name in present:
         if name not in known:
             near = suggest(name, known)
             faults.append(f"{name} is not known" + (f"; did you mean {near[0]}?" if near else ""))
-    return not faults, "; ".join(faults) or ", ".join(given) or "none set"
+    return not faults, "; ".join(faults) or ", ".join(present) or "none set"
 
 
 def _rig(settings: ServiceSettings) -> tuple[bool, str]:

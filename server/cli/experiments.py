@@ -82,8 +82,8 @@ def _experiment_real(
 
     missing = [str(folder) for folder in folders if not folder.is_dir()]
     if missing or not folders:
-        told = f"{', '.join(missing)}: no such folder" if missing else "name the folders of the photographs"
-        raise typer.BadParameter(told, param_hint="FOLDERS")
+        fault = f"{', '.join(missing)}: no such folder" if missing else "name the folders of the photographs"
+        raise typer.BadParameter(fault, param_hint="FOLDERS")
     with progress_bar() as report:
         found = judge_folders(folders, model=model, front=front, outlines=outlines, kept=out, report=report)
     answer(found, json_out, [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])

@@ -121,11 +121,11 @@ def reconstruct(
 
     switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
     switches |= {"neutral": neutral, "morphs": morphs}
-    outputs: dict[str, object] = {name: True for name, asked in switches.items() if asked}
+    outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
     outputs |= {name: word for name, word in words.items() if word}
-    given = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
-    document = settings_document(settings, method=method, front=front, detail=detail, **given)
+    options = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
+    document = settings_document(settings, method=method, front=front, detail=detail, **options)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
     for warning in written["warnings"]:

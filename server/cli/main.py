@@ -24,8 +24,8 @@ for name, group in groups.items():
     app.add_typer(group, name=name)
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(requested: bool) -> None:
+    if requested:
         from importlib.metadata import version
 
         print(f"eigenhead {version('eigenhead')}")

@@ -80,9 +80,9 @@ def model_build(
         "repaired": {scan: list(words) for scan, words in built.repaired.items()},
         "skipped": dict(built.skipped),
     }
-    told = [f"repaired {scan}: {'; '.join(words)}" for scan, words in built.repaired.items()]
-    told += [f"left out {scan}: {why}" for scan, why in built.skipped.items()]
-    answer(document, json_out, [*told, f"{out}  from {len(built.used)} scans"])
+    scan_lines = [f"repaired {scan}: {'; '.join(words)}" for scan, words in built.repaired.items()]
+    scan_lines += [f"left out {scan}: {why}" for scan, why in built.skipped.items()]
+    answer(document, json_out, [*scan_lines, f"{out}  from {len(built.used)} scans"])
 
 
 @model_app.command("fetch", epilog="Example: eigenhead model fetch ict-facekit")

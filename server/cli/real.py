@@ -43,8 +43,8 @@ def judge_folders(
     prepare_kernels(report, settings)
     with TemporaryDirectory() as scratch, Renderer.create() as renderer:
         place = kept or Path(scratch)
-        given = [read_real_capture(folder, place / folder.name, front, outlines, report) for folder in folders]
-        found = real(load_model(model), given, renderer=renderer, settings=settings, report=report)
+        captures = [read_real_capture(folder, place / folder.name, front, outlines, report) for folder in folders]
+        found = real(load_model(model), captures, renderer=renderer, settings=settings, report=report)
     if kept is not None:
         write_atomically(kept / "real.md", of_figures(found["figures"]).encode())
     return found
@@ -57,8 +57,8 @@ def read_real_capture(
     from pipeline.experiments.real import RealCapture
 
     prepared = read_or_calibrate(folder, kept, front=front, report=report)
-    own = capture_root(folder) / OUTLINES
-    path = outlines or (own if own.is_file() else None)
+    default = capture_root(folder) / OUTLINES
+    path = outlines or (default if default.is_file() else None)
     drawn = {} if path is None else read_outlines(path, prepared.rig)
     # Plates and masks that a folder has are its own; a mask that is there judges, too.
     drawn = {**prepared.capture.masks, **drawn}

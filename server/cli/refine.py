@@ -45,9 +45,9 @@ def refine_locally(
     for number, path in enumerate(captures):
         report("silhouettes", 0.5 * number / len(captures))
         with folder_of(path) as folder:
-            capture, own = read_scaled_capture(folder, pixels_most=None)
-        rig = rig or own
-        faults = _differences(own, rig, same_poses=calibration is None)
+            capture, recorded = read_scaled_capture(folder, pixels_most=None)
+        rig = rig or recorded
+        faults = _differences(recorded, rig, same_poses=calibration is None)
         if faults:
             raise InputError(path.name, [*faults, compose("captures-of-one-rig")])
         found = segment(capture, rig, settings.segmentation, report=discard_progress)
@@ -67,19 +67,21 @@ def refine_locally(
         heads=None if head is None else Heads(head, starts, settings.fitting),
         report=lambda stage, fraction: report(stage, 0.5 + 0.5 * fraction),
     )
-    told = [compose("refinement-camera-moved", camera=name, captures=where) for name, where in sorted(moved.items())]
-    return RefinementRun(refined, rig, tuple(path.name for path in captures), tuple(told))
+    moved_warnings = [
+        compose("refinement-camera-moved", camera=name, captures=where) for name, where in sorted(moved.items())
+    ]
+    return RefinementRun(refined, rig, tuple(path.name for path in captures), tuple(moved_warnings))
 
 
 def _silent(stage: str, fraction: float) -> None:
     """One progress bar is enough."""
 
 
-def _differences(own: Rig, rig: Rig, *, same_poses: bool) -> list[str]:
-    if set(own.names) != set(rig.names):
-        return [f"{name}: only in one of the two calibrations" for name in sorted(set(own.names) ^ set(rig.names))]
+def _differences(recorded: Rig, rig: Rig, *, same_poses: bool) -> list[str]:
+    if set(recorded.names) != set(rig.names):
+        return [f"{name}: only in one of the two calibrations" for name in sorted(set(recorded.names) ^ set(rig.names))]
     faults = []
-    for camera in own:
+    for camera in recorded:
         here, there = camera, rig[camera.name]
         size, wanted = ((c.intrinsics.width, c.intrinsics.height) for c in (here, there))
         if size != wanted:

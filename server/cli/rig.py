@@ -72,9 +72,9 @@ def rig_capture(
 
         shot = capture(read_rig_config(rig), folder, report=report)
     seconds = {"warm_up": round(at["shot"] - at["warm up"], 3), "capture": round(at["done"] - at["shot"], 3)}
-    told = f"{len(shot.images)} pictures in {seconds['capture']:.2f} s, after {seconds['warm_up']:.2f} s of warm-up"
+    summary = f"{len(shot.images)} pictures in {seconds['capture']:.2f} s, after {seconds['warm_up']:.2f} s of warm-up"
     document = {"capture": str(folder), "seconds": seconds, **shot.document()}
-    answer(document, json_out, [str(folder), told, *shot.certificate.lines(), *map(str, shot.faults)])
+    answer(document, json_out, [str(folder), summary, *shot.certificate.lines(), *map(str, shot.faults)])
 
 
 @rig_app.command("board", epilog="Example: eigenhead rig board --rig rig.toml --shots 25 --out board-shots")
@@ -91,9 +91,9 @@ def rig_board(
 
     document = []
     for name, cameras, faults in board_shots(read_rig_config(rig), out, shots, pause_s=pause_s):
-        told = [str(fault) for fault in faults]
-        print(f"{name}  {len(cameras)} pictures  {'; '.join(told)}".rstrip(), file=sys.stderr)
-        document.append({"shot": name, "cameras": list(cameras), "faults": told})
+        texts = [str(fault) for fault in faults]
+        print(f"{name}  {len(cameras)} pictures  {'; '.join(texts)}".rstrip(), file=sys.stderr)
+        document.append({"shot": name, "cameras": list(cameras), "faults": texts})
     answer({"images": str(out), "shots": document}, json_out, [f"{out}  {len(document)} shots"])
 
 

@@ -65,11 +65,11 @@ def prepare(json_out: Json = False) -> None:
     with progress_bar() as report:
         done = prepare_kernels(report)
     seconds = round(monotonic() - began, 3)
-    told = f"all {done.known} loops were compiled before"
+    summary = f"all {done.known} loops were compiled before"
     if done.compiled or done.missing:
-        told = f"{done.compiled} of {done.known} loops compiled in {seconds:.1f} s"
+        summary = f"{done.compiled} of {done.known} loops compiled in {seconds:.1f} s"
     answer(
-        done._asdict() | {"seconds": seconds, "folder": str(cache_folder())}, json_out, [f"{cache_folder()}  {told}"]
+        done._asdict() | {"seconds": seconds, "folder": str(cache_folder())}, json_out, [f"{cache_folder()}  {summary}"]
     )
     if done.missing:
         sys.exit(1)

@@ -85,11 +85,11 @@ def template_list(data: Data = None, json_out: Json = False) -> None:
         try:
             template = read_header(path)
         except BadTemplate as error:
-            found[name], told = {"file": str(path), "fault": str(error)}, "damaged"
+            found[name], status = {"file": str(path), "fault": str(error)}, "damaged"
         else:
             found[name] = {"file": str(path), "model": template.model_name, **template.figures}
-            told = template.model_name
-        lines.append(f"{name}  {told}  {path}")
+            status = template.model_name
+        lines.append(f"{name}  {status}  {path}")
     answer({"templates": found}, json_out, lines)
 
 

@@ -56,11 +56,11 @@ def verify_captures(
         if not is_result(capture):
             folder = out / "results" / name
 
-            def told(stage: str, fraction: float, i: int = i) -> None:
+            def report_one(stage: str, fraction: float, i: int = i) -> None:
                 report(f"{names[i]}: {stage}", (i + fraction) / len(captures))
 
-            told("read", 0.0)
-            reconstruct_locally(capture, folder, model=model, settings=_head_alone(settings), report=told)
+            report_one("read", 0.0)
+            reconstruct_locally(capture, folder, model=model, settings=_head_alone(settings), report=report_one)
         folders.append(folder)
     report("judge", 1.0)
     identities = {name: identity_of(folder) for name, folder in zip(names, folders, strict=True)}

@@ -72,8 +72,8 @@ class Cache:
     def get(self, key: Any, age_s: float, make: MAKE) -> Any:
         """The value of ``key``, made anew where it is older than ``age_s``. Blocks; raises what ``make`` does."""
         with self._lock:
-            own = self._locks.setdefault(key, Lock())
-        with own:
+            key_lock = self._locks.setdefault(key, Lock())
+        with key_lock:
             made, took, value = self._values.get(key, (0.0, 0.0, None))
             began = time.monotonic()
             if began - made > max(age_s, min(KEEP_TIMES * took, KEEP_MOST_S)) or key not in self._values:
@@ -146,13 +146,13 @@ class Page(Element):
     async def refresh(self) -> None:
         try:
             state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
-            told = None
+            detail = None
         except Exception as error:  # the page stays, says so once, and looks again
             problem = problem_from(error)
-            state, told = self.props["state"], problem.detail
-            if told != self._told:
-                self.frame.say("fault", told, problem.errors)
-        self._told = told
+            state, detail = self.props["state"], problem.detail
+            if detail != self._told:
+                self.frame.say("fault", detail, problem.errors)
+        self._told = detail
         waiting = removals.waiting().items()
         self.frame.show(removed=[{"id": i, "title": removal.title.document()} for i, removal in waiting])
         if state != self.props["state"]:

@@ -55,8 +55,8 @@ class Linger:
 
 
 def _closes(scope: Scope) -> bool:
-    told = b",".join(value for name, value in scope["headers"] if name == b"connection").lower()
-    return b"close" in told or (scope["http_version"] == "1.0" and b"keep-alive" not in told)
+    connection = b",".join(value for name, value in scope["headers"] if name == b"connection").lower()
+    return b"close" in connection or (scope["http_version"] == "1.0" and b"keep-alive" not in connection)
 
 
 def _has_body(scope: Scope) -> bool:

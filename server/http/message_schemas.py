@@ -7,7 +7,7 @@ from pydantic import BaseModel, BeforeValidator, Field, model_validator
 from rig.messages.message import Message
 from server.storage.records import JsonObject
 
-TextOf = Annotated[str, BeforeValidator(lambda told: told.text if isinstance(told, Message) else told)]
+TextOf = Annotated[str, BeforeValidator(lambda shown: shown.text if isinstance(shown, Message) else shown)]
 Texts = list[TextOf]
 
 

@@ -100,8 +100,8 @@ def _decodes(secret: str) -> str:
     try:
         base64.b64decode(secret.removeprefix("whsec_"), validate=True)
     except binascii.Error as error:
-        told = "is no base64 after whsec_: it has a number of characters that no bytes have, or lacks its = at the end"
-        raise PydanticCustomError("secret", told) from error
+        fault = "is no base64 after whsec_: it has a number of characters that no bytes have, or lacks its = at the end"
+        raise PydanticCustomError("secret", fault) from error
     return secret
 
 

@@ -88,8 +88,8 @@ class Calibrations:
         found: CalibrationOutcome | None = row.output if row is not None and state == "succeeded" else None
         error = failure(row) if row is not None and state == "failed" else None
         if found is None:
-            told = self._events.latest([identity]).get(identity) if state == "running" else None
-            document: EventDocument = {} if told is None else told.document
+            latest = self._events.latest([identity]).get(identity) if state == "running" else None
+            document: EventDocument = {} if latest is None else latest.document
             return Calibration(
                 **asdict(record),
                 state=state,

@@ -97,7 +97,9 @@ class Captures:
                     content = child.remote(ingest_folder)(
                         folder=str(capture / "files"), image_pixels=self._settings.image_pixels, measured=False
                     )
-                return self._add(capture, "rig", content, About(label="Sample, simulated studio"), shot, asked=False)
+                return self._add(
+                    capture, "rig", content, About(label="Sample, simulated studio"), shot, needs_consent=False
+                )
         finally:
             studio.close()
 
@@ -139,21 +141,21 @@ class Captures:
         return next(iter(self.page(CaptureQuery(), limit=1).items), None)
 
     def edit(
-        self, identity: str, given: Mapping[str, str | None], *, tags: Sequence[str] | None = None
+        self, identity: str, changes: Mapping[str, str | None], *, tags: Sequence[str] | None = None
     ) -> CaptureRecord:
         """Another label, expression or session, or other ``tags``; what is not given stays. Raises NotFound, and
         InputError for texts and tags that cannot be."""
-        check_texts({name: given.get(name) for name in ("label", "expression")})
+        check_texts({name: changes.get(name) for name in ("label", "expression")})
         checked = None if tags is None else checked_tags(tags)
-        if given.get("session") is not None:
-            self._store.session(str(given["session"]))
+        if changes.get("session") is not None:
+            self._store.session(str(changes["session"]))
 
         def change(record: CaptureRecord) -> CaptureRecord:
             return replace(
                 record,
-                session=given.get("session", record.session),
-                label=given.get("label", record.label) or "",
-                expression=given.get("expression", record.expression) or "",
+                session=changes.get("session", record.session),
+                label=changes.get("label", record.label) or "",
+                expression=changes.get("expression", record.expression) or "",
                 tags=record.tags if checked is None else checked,
             )
 
@@ -254,9 +256,9 @@ class Captures:
         about: About,
         shot: Mapping[str, object] | None = None,
         *,
-        asked: bool = True,
+        needs_consent: bool = True,
     ) -> CaptureRecord:
-        if asked and not content.board:
+        if needs_consent and not content.board:
             self._check_consent(about.session)
         faults = tuple(without_consequences([*shot_faults(shot), *content.faults]))
         self._store.put_checks(folder, all_checks(shot, content))

@@ -94,7 +94,7 @@ class Service:
         """Cancels a job and tells the webhooks; a finished one stays as it is."""
         job, did = self.jobs.cancel(job_id)
         if did:
-            self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, own=self.jobs.webhook(job_id))
+            self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, job_webhook=self.jobs.webhook(job_id))
         return job
 
 

@@ -81,8 +81,8 @@ class Sessions:
     def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
         """Another label or consent note; what is None stays. Raises NotFound, InputError."""
         check_texts({"label": label, "consent": consent})
-        given = {name: text for name, text in (("label", label), ("consent", consent)) if text is not None}
-        record = self._store.change_session(identity, lambda old: replace(old, **given))
+        changes = {name: text for name, text in (("label", label), ("consent", consent)) if text is not None}
+        record = self._store.change_session(identity, lambda old: replace(old, **changes))
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def erase(self, identity: str) -> None:

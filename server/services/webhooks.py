@@ -59,9 +59,11 @@ class Webhooks:
             if not connection.execute(sa.delete(webhooks).where(webhooks.c.id == identity)).rowcount:
                 raise NotFound(compose("thing-webhook"), identity)
 
-    def announce(self, job_id: str, state: str, enqueue: Callable[..., Any], own: JobWebhook | None = None) -> None:
+    def announce(
+        self, job_id: str, state: str, enqueue: Callable[..., Any], job_webhook: JobWebhook | None = None
+    ) -> None:
         """Queues one delivery a webhook; doing it again for the same job and state changes nothing."""
-        for hook_id in [*(hook.id for hook in self.all()), *([] if own is None else [OWN])]:
+        for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
             identity = f"hook-{hook_id}-{job_id}-{state}"
             message: WebhookMessage = {
                 "webhook": hook_id,
@@ -69,8 +71,8 @@ class Webhooks:
                 "job_id": job_id,
                 "id": identity,
             }
-            if own is not None and hook_id == OWN:
-                message["own"] = own
+            if job_webhook is not None and hook_id == OWN:
+                message["own"] = job_webhook
             options: EnqueueOptions = {
                 "workflow_name": DELIVERY,
                 "queue_name": WEBHOOKS_QUEUE,

@@ -152,8 +152,8 @@ class JobIndex:
             clauses.append(row.session == query.session)
         for word in words_of(query.sought):
             captures = sa.select(capture_index.c.id).where(captures_with(word))
-            own = sa.or_(contains(row.words, word), is_or_ends(row.job_id, word))
-            clauses.append(sa.or_(own, row.capture_id.in_(captures)))
+            matches = sa.or_(contains(row.words, word), is_or_ends(row.job_id, word))
+            clauses.append(sa.or_(matches, row.capture_id.in_(captures)))
         return clauses
 
 

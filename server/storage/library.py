@@ -237,8 +237,8 @@ class Library:
 def captures_with(word: str) -> sa.ColumnElement[bool]:
     """Of captures that a word of a search stands in, or in whose session it does."""
     sessions = sa.select(session_index.c.id).where(sessions_with(word))
-    own = sa.or_(contains(capture_index.c.words, word), is_or_ends(capture_index.c.id, word))
-    return sa.or_(own, capture_index.c.session.in_(sessions))
+    matches = sa.or_(contains(capture_index.c.words, word), is_or_ends(capture_index.c.id, word))
+    return sa.or_(matches, capture_index.c.session.in_(sessions))
 
 
 def tagged(tag: str) -> sa.Select:

@@ -81,9 +81,9 @@ def _encoded(silhouettes: dict[str, Silhouette]) -> bytes:
     documents = []
     for number, (name, silhouette) in enumerate(silhouettes.items()):
         quality = silhouette.quality
-        told = {"warnings": documents_of(quality.warnings), "doubts": documents_of(quality.doubts)}
+        messages = {"warnings": documents_of(quality.warnings), "doubts": documents_of(quality.doubts)}
         plain = dataclasses.asdict(dataclasses.replace(quality, warnings=(), doubts=()))
-        documents.append({"name": name, **plain, **told})
+        documents.append({"name": name, **plain, **messages})
         arrays[f"shape{number}"] = np.array(silhouette.mask.shape)
         arrays[f"mask{number}"] = _bytes(zlib.compress(np.packbits(silhouette.mask).tobytes(), QUICK))
         arrays[f"distance{number}"] = _bytes(zlib.compress(_steps(silhouette.distance), QUICK))
@@ -102,8 +102,8 @@ def _decoded(data: bytes) -> dict[str, Silhouette]:
             mask = np.unpackbits(packed, count=height * width).reshape(height, width).view(bool)
             distance = _from_steps(zlib.decompress(arrays[f"distance{number}"].tobytes()), height, width)
             name = view.pop("name")
-            told = {field: tuple(map(read_message, view[field])) for field in ("warnings", "doubts")}
-            listed = {"cut_off": tuple(view["cut_off"]), **told}
+            messages = {field: tuple(map(read_message, view[field])) for field in ("warnings", "doubts")}
+            listed = {"cut_off": tuple(view["cut_off"]), **messages}
             found[name] = Silhouette(mask, distance, ViewQuality(**view | listed))
     return found
 

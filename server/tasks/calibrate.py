@@ -153,8 +153,8 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     verdict = judge_scene(found)
     write_scene_report(found, result / "report.html")
     write_rig(found.rig, result / "cameras.json")
-    told = {"missing": texts_of(verdict.missing), "missing_messages": documents_of(verdict.missing)}
-    judged = {"verdict": verdict.word, **told, **found.document()}
+    missing = {"missing": texts_of(verdict.missing), "missing_messages": documents_of(verdict.missing)}
+    judged = {"verdict": verdict.word, **missing, **found.document()}
     write_atomically(result / "calibration.json", json.dumps(judged, indent=1).encode())
     return {
         "verdict": verdict.word,

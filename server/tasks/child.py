@@ -200,8 +200,8 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
         return "failed", "InputError", error.message, error.subject, error.faults, ""
     if isinstance(error, EigenheadError):
         faults = getattr(error, "faults", ())
-        told = tuple(fault if isinstance(fault, Message) else verbatim(str(fault)) for fault in faults)
-        return "failed", type(error).__name__, error.message, "", told, ""
+        messages = tuple(fault if isinstance(fault, Message) else verbatim(str(fault)) for fault in faults)
+        return "failed", type(error).__name__, error.message, "", messages, ""
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return "failed", "disk-full", compose("disk-full"), "", (), ""
     if isinstance(error, MemoryError):

@@ -57,11 +57,11 @@ def ingest_archive(
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
-    told = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
+    warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
     _name_by_camera(root)
     described = check_capture(root, image_pixels, report)
-    if told is not None:
-        described = _with_calibration(described, root, told)
+    if warnings is not None:
+        described = _with_calibration(described, root, warnings)
     for name in described.inputs:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).rename(target / name)
@@ -77,14 +77,14 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
     files = [path for path in picture_folder(root).rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES]
     check_sizes(files, image_pixels)
     try:
-        told = calibrate_photographs(root, root, front=None, report=report)
+        warnings = calibrate_photographs(root, root, front=None, report=report)
     except InputError as error:
         raise InputError("capture", [NO_RIG, *error.faults]) from error
     except CalibrationRefused as refusal:
-        told = compose("photographs-do-not-tell", no_rig=NO_RIG)
-        raise InputError("capture", [told, *refusal.reasons]) from refusal
+        fault = compose("photographs-do-not-tell", no_rig=NO_RIG)
+        raise InputError("capture", [fault, *refusal.reasons]) from refusal
     _leave_out(root, read_rig(root / CAMERAS))
-    return told
+    return warnings
 
 
 def _name_by_camera(root: Path) -> None:
@@ -99,9 +99,9 @@ def _name_by_camera(root: Path) -> None:
     if read is not None:
         files = find_files(root, read.rig, read.left_out)
         for name in () if files.faults else read.rig.names:
-            own = files.of_camera(name)
-            several = sum(kind == "background" for kind, _ in own) > 1
-            for kind, path in own:
+            camera_files = files.of_camera(name)
+            several = sum(kind == "background" for kind, _ in camera_files) > 1
+            for kind, path in camera_files:
                 _move(path, _filed_as(root, kind, name, path, several=several))
     pictures, images = picture_folder(root), root / "images"
     images.mkdir(exist_ok=True)
@@ -128,15 +128,19 @@ def _leave_out(root: Path, rig: Rig) -> None:
     """Removes what belongs to views that did not join, which the warnings name."""
     for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES)):
         for path in [*folder.iterdir()] if folder.is_dir() else ():
-            own = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
-            if own and (path.name if path.is_dir() else path.stem) not in rig and path.name not in BESIDE_PICTURES:
+            is_candidate = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
+            if (
+                is_candidate
+                and (path.name if path.is_dir() else path.stem) not in rig
+                and path.name not in BESIDE_PICTURES
+            ):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def _with_calibration(found: CaptureContent, root: Path, told: tuple[ReportWarning, ...]) -> CaptureContent:
+def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportWarning, ...]) -> CaptureContent:
     """With the figures of the calibration, of which a job reads what was said."""
     inputs = dict(sorted({**found.inputs, FIGURES: _sha256(root / FIGURES)}.items()))
-    return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=told)
+    return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=warnings)
 
 
 def ingest_folder(

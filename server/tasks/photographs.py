@@ -114,23 +114,23 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
 
     scale = root / SCALE
     found = calibrate_scene(root, scale=scale if scale.is_file() else None, front=front, report=report)
-    told = [compose("view-left-out", remark=absence) for absence in found.absences()]
+    warnings = [compose("view-left-out", remark=absence) for absence in found.absences()]
     if found.scale.assumed:
-        told.append(compose("scale-assumed", scale=found.scale.told))
+        warnings.append(compose("scale-assumed", scale=found.scale.provenance))
     rig = found.rig
     if len(rig) > CAMERAS_MOST:
         rig = rig.subset(spread_views(rig, CAMERAS_MOST))
-        told.append(compose("views-many", joined=len(found.rig), most=CAMERAS_MOST))
+        warnings.append(compose("views-many", joined=len(found.rig), most=CAMERAS_MOST))
     write_rig(rig, kept / CAMERAS)
     write_scene_report(found, kept / PAGE)
     document = {
         "made_of": made_of,
         "cameras_sha256": _sha256(kept / CAMERAS),
-        "told": documents_of(told),
+        "told": documents_of(warnings),
         **found.document(),
     }
     write_atomically(kept / FIGURES, json.dumps(document, indent=1).encode())
-    return tuple(told)
+    return tuple(warnings)
 
 
 def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -> tuple[ReportWarning, ...] | None:

@@ -66,7 +66,7 @@ def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Pre
     log.warning("compiling what a job calls (loops: %d), once for this machine and version", len(missing))
     groups = sorted(by_module(missing), key=lambda group: sum(kernel.size() for kernel in group), reverse=True)
     work = _Work(groups, len(missing), report)
-    work.told(0)
+    work.advance(0)
     count = min(len(os.sched_getaffinity(0)), len(groups), PROCESSES_MOST)
     with ThreadPoolExecutor(count, thread_name_prefix="compile") as pool:
         for done in [pool.submit(work.compile_groups) for _ in range(count)]:
@@ -94,12 +94,12 @@ class _Work:
                         if not child.remote(compile_kernel)(line=kernel.line):
                             self._groups.clear()  # a full disk: going on would make what nobody finds again
                             return
-                        self.told(1)
+                        self.advance(1)
         except BaseException:
             self._groups.clear()
             raise
 
-    def told(self, more: int) -> None:
+    def advance(self, more: int) -> None:
         with self._lock:
             self.done += more
             self._report(f"compiling {self.done} of {self._total} loops", self.done / self._total)

@@ -62,9 +62,9 @@ class JobProgress:
     def progress(self) -> float:
         """0 to 1, never falling: each stage counts by its expected time."""
         done = sum(took for stage, took in self._expected.items() if stage in self.seconds and stage != self._visit)
-        own, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
-        now = done + own * spent / max(spent + self._rest_of_stage(), 1e-9)
-        self._progress = max(self._progress, min(0.99, now / max(done + own + self._to_come(), 1e-9)))
+        expected_s, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
+        now = done + expected_s * spent / max(spent + self._rest_of_stage(), 1e-9)
+        self._progress = max(self._progress, min(0.99, now / max(done + expected_s + self._to_come(), 1e-9)))
         return self._progress
 
     def _rest_of_stage(self) -> float:

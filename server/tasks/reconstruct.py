@@ -73,6 +73,6 @@ def reconstruct_capture(
 
     done = reconstruct(ReconstructionContext(shot, rig, head_model, chosen, renderer, tell, once))
     report("write", 0.0)
-    told = calibration_warnings(Path(capture)) or ()
-    done = replace(done, warnings=(*told, *done.warnings))
+    warnings = calibration_warnings(Path(capture)) or ()
+    done = replace(done, warnings=(*warnings, *done.warnings))
     write_result(Path(result), done, shot, template)

@@ -148,8 +148,8 @@ class _Form:
         elif self._name == "file":
             raise Problem(422, "file-repeated", compose("file-repeated"), [compose("field-file-repeated")])
         elif len(self._data) + end - start > FIELD_BYTES:
-            told = compose("form-field-too-long", field=f"{self._name!r:.80}", bytes=FIELD_BYTES)
-            raise Problem(413, "field-too-large", told)
+            fault = compose("form-field-too-long", field=f"{self._name!r:.80}", bytes=FIELD_BYTES)
+            raise Problem(413, "field-too-large", fault)
         else:
             self._data += data[start:end]
 

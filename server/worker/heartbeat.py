@@ -6,12 +6,12 @@ from server.processes import process_identity, process_started
 from server.storage.database import now_sql, workers
 
 
-def dead_workers(engine: sa.Engine, silent_s: float, own: str = "") -> list[str]:
+def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:
     """Ids of workers that stopped, whose process is gone from this machine, or that are silent for ``silent_s``."""
     machine = process_identity()[0]
     with engine.connect() as connection:
         silent = (workers.c.seen < now_sql(connection) - silent_s).label("silent")
-        rows = connection.execute(sa.select(workers, silent).where(workers.c.id != own)).all()
+        rows = connection.execute(sa.select(workers, silent).where(workers.c.id != except_id)).all()
     return [
         row.id
         for row in rows

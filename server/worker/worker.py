@@ -251,7 +251,7 @@ class Worker:
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 
-    def settle(self, job_id: str, state: str, own: JobWebhook | None = None) -> None:
+    def settle(self, job_id: str, state: str, job_webhook: JobWebhook | None = None) -> None:
         """Tells the world how the job ended: the last event of its stream, with what the operator must see to, and the
         webhooks, the job's own too."""
         warnings = warnings_of(self.store.folder("jobs", job_id) / "result" / "report.json")
@@ -260,7 +260,7 @@ class Worker:
         moved = [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
         with suppress(SQLAlchemyError):
             self.events.append(job_id, {"state": state, "camera_moved": moved} if moved else {"state": state})
-        self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options, own=own)
+        self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options, job_webhook=job_webhook)
 
     def _failure(self, error: BaseException) -> BaseException:
         if isinstance(error, Cancelled):
@@ -298,7 +298,7 @@ class Worker:
 
     def _reap(self) -> None:
         """Puts the jobs of dead workers back. Idempotent, and safe for any number of reapers at once."""
-        dead = dead_workers(self.engine, self.settings.silent_s, own=self.id)
+        dead = dead_workers(self.engine, self.settings.silent_s, except_id=self.id)
         running = self._running()
         known = self._known_workers()  # asked second: a worker that begins in between is no stray
         executors = {row.executor_id for row in running if row.executor_id is not None}

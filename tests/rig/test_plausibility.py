@@ -62,17 +62,17 @@ def recorded(rig, name, lens, **intrinsics):
 
 
 @pytest.mark.parametrize(
-    ("lens", "told"),
+    ("lens", "text"),
     [
         (RecordedLens("kannala-brandt", (1e11, 0.0, 0.0, 0.0)), "k1 = 1e+11, k2 = 0, k3 = 0, k4 = 0"),
         (RecordedLens("kannala-brandt", (-30.0, 0.0, 0.0, 0.0)), "k1 = -30"),
         (RecordedLens("rational", (0.0, 0.0, 0.0, 0.0, 0.0, -1000.0, 0.0, 0.0)), "k4 = -1000"),
     ],
 )
-def test_an_absurd_recorded_lens_is_named(lens, told):
+def test_an_absurd_recorded_lens_is_named(lens, text):
     (fault,) = rig_faults(recorded(default_layout(), "cam05", lens))
     assert fault.text.startswith("cam05: the lens is absurd (k1 = ")
-    assert told in fault.text
+    assert text in fault.text
 
 
 def test_fisheyes_and_rational_lenses_of_real_cameras_have_no_faults():

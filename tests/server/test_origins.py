@@ -10,14 +10,14 @@ from server.origins import ANY_PUBLIC, is_public, target
 
 
 def resolve_to(monkeypatch: pytest.MonkeyPatch, *addresses: str) -> list[str]:
-    asked = []
+    hosts = []
 
     def getaddrinfo(host: str, port: int, **_: object) -> list[tuple]:
-        asked.append(host)
+        hosts.append(host)
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, port)) for address in addresses]
 
     monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
-    return asked
+    return hosts
 
 
 @pytest.mark.parametrize(
@@ -40,11 +40,11 @@ def test_public_addresses_are_public() -> None:
 
 
 def test_the_connection_goes_to_the_judged_address_under_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = resolve_to(monkeypatch, "93.184.216.34")
+    hosts = resolve_to(monkeypatch, "93.184.216.34")
     aim = target("https://Store.example/a.zip?v=1#x", [ANY_PUBLIC])
     assert str(aim.url) == "https://93.184.216.34/a.zip?v=1"
     assert (aim.headers, aim.extensions) == ({"Host": "store.example"}, {"sni_hostname": "store.example"})
-    assert asked == ["store.example"]
+    assert hosts == ["store.example"]
 
 
 def test_a_named_origin_may_be_private_and_no_other_port_or_scheme_of_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,9 +26,9 @@ NOT_RAISED_IN_JOBS = ("pipeline.experiments", "server")
 
 
 def test_every_type_that_the_service_gives_is_in_the_table_and_no_other_is() -> None:
-    given = {*_given(), *INPUT_TYPES.values(), *FAILURE_TYPES.values(), *HTTP_TYPES.values()}
-    given |= {type_of_input("someone's file"), type_of_failure("Unheard"), "http-error"}
-    assert given == PROBLEM_TYPES.keys()
+    types = {*_given(), *INPUT_TYPES.values(), *FAILURE_TYPES.values(), *HTTP_TYPES.values()}
+    types |= {type_of_input("someone's file"), type_of_failure("Unheard"), "http-error"}
+    assert types == PROBLEM_TYPES.keys()
 
 
 def test_every_error_that_may_end_a_job_has_its_type() -> None:

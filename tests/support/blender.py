@@ -77,15 +77,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("result", type=Path)
     parser.add_argument("--pictures", type=Path)
-    given = parser.parse_args()
-    paths = [path for path in sorted(given.result.glob("*head.*")) if path.suffix in OPENED]
-    found = [] if paths else [f"{given.result}: no head in it"]
+    arguments = parser.parse_args()
+    paths = [path for path in sorted(arguments.result.glob("*head.*")) if path.suffix in OPENED]
+    found = [] if paths else [f"{arguments.result}: no head in it"]
     for path in paths:
-        told, wrong = opened(path.resolve())
-        sys.stdout.write(told + "\n")
+        line, wrong = opened(path.resolve())
+        sys.stdout.write(line + "\n")
         found += wrong
-        if given.pictures is not None:
-            draw(given.pictures.resolve() / f"{path.stem}-{path.suffix[1:]}.png")
+        if arguments.pictures is not None:
+            draw(arguments.pictures.resolve() / f"{path.stem}-{path.suffix[1:]}.png")
     (sys.stderr if found else sys.stdout).write(("\n".join(found) or "nothing wrong") + "\n")
     return 1 if found else 0
 

@@ -33,13 +33,13 @@ def reasons() -> dict[str, str]:
 def licence(name: str) -> str:
     """As the installed package states it."""
     try:
-        told = metadata(name)
+        package = metadata(name)
     except PackageNotFoundError:
         return ABSENT
-    classified = [c.rpartition(" :: ")[2] for c in told.get_all("Classifier") or [] if c.startswith("License :: ")]
-    stated = {field: text for field in ("License-Expression", "License") for text in told.get_all(field) or []}
-    given = [stated.get("License-Expression"), " or ".join(dict.fromkeys(classified)), stated.get("License")]
-    return next((" ".join(text.split()) for text in given if text and len(text) <= LICENCE_MOST), "see its files")
+    classified = [c.rpartition(" :: ")[2] for c in package.get_all("Classifier") or [] if c.startswith("License :: ")]
+    stated = {field: text for field in ("License-Expression", "License") for text in package.get_all(field) or []}
+    licences = [stated.get("License-Expression"), " or ".join(dict.fromkeys(classified)), stated.get("License")]
+    return next((" ".join(text.split()) for text in licences if text and len(text) <= LICENCE_MOST), "see its files")
 
 
 def page() -> str:
@@ -52,8 +52,8 @@ def page() -> str:
     rows = []
     for name in sorted({package["name"] for package in packages}):
         others = sorted(set(needed_by.get(name, [])))
-        told = why.get(name) or "for " + ", ".join(others[:4]) + (" and others" if len(others) > 4 else "")
-        rows.append(f"| {name} | {licence(name)} | {told} |\n")
+        reason = why.get(name) or "for " + ", ".join(others[:4]) + (" and others" if len(others) > 4 else "")
+        rows.append(f"| {name} | {licence(name)} | {reason} |\n")
     return HEAD + "".join(rows)
 
 

@@ -13,8 +13,8 @@ import pytest
 def small_disk(folder: Path, megabytes: int, *options: str) -> Iterator[Path]:
     """A file system of its own that can be filled; ``options`` of mount: "ro" for one that is only read."""
     folder.mkdir()
-    given = ",".join((f"size={megabytes}m", *options))
-    command = ["mount", "-t", "tmpfs", "-o", given, "tmpfs", str(folder)]
+    mount_options = ",".join((f"size={megabytes}m", *options))
+    command = ["mount", "-t", "tmpfs", "-o", mount_options, "tmpfs", str(folder)]
     if subprocess.run(command, capture_output=True, check=False).returncode:
         pytest.skip("mounting a tmpfs needs root")
     try:

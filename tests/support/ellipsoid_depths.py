@@ -97,7 +97,7 @@ def scene(
     rig = rig or pinhole_fan()
     rng = np.random.default_rng(5)
     maps, silhouettes = [], {}
-    for told, camera in zip(rig, true_rig or rig, strict=True):
-        maps.append(replace(known_depth(camera, bodies, noise_mm, rng), camera=pinhole(told)))
-        silhouettes[told.name] = silhouette_from_mask(np.isfinite(look(camera, bodies)[0]))
+    for recorded, camera in zip(rig, true_rig or rig, strict=True):
+        maps.append(replace(known_depth(camera, bodies, noise_mm, rng), camera=pinhole(recorded)))
+        silhouettes[recorded.name] = silhouette_from_mask(np.isfinite(look(camera, bodies)[0]))
     return Scene(tuple(bodies), rig, tuple(maps), silhouettes)

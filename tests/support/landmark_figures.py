@@ -87,9 +87,9 @@ def chi_square(
     which = np.flatnonzero(~of_model.slides)[::EVERY]
     errors = (found.points_world - true)[which] @ axes - of_model.offset_mm[which]
     views = (found.shared_mm[:, which] @ axes).reshape(len(found.shared_mm), -1)
-    own = np.zeros((len(which), 3, len(which), 3))
-    own[np.arange(len(which)), :, np.arange(len(which)), :] = axes.T @ found.covariances[which] @ axes
-    covariance = of_model.covariance(which) + views.T @ views + own.reshape(errors.size, -1)
+    of_points = np.zeros((len(which), 3, len(which), 3))
+    of_points[np.arange(len(which)), :, np.arange(len(which)), :] = axes.T @ found.covariances[which] @ axes
+    covariance = of_model.covariance(which) + views.T @ views + of_points.reshape(errors.size, -1)
     return float(errors.ravel() @ np.linalg.solve(covariance, errors.ravel()) / errors.size)
 
 

@@ -322,13 +322,13 @@ def main() -> None:
     parser.add_argument("--of", choices=MODELS, default=MODELS[0], help="whose heads are photographed")
     parser.add_argument("--heads", type=int, default=60)
     parser.add_argument("--ict-facekit", type=Path, required=True, help="ict_facekit_light.npz, or its repository")
-    given = parser.parse_args()
-    models = {"makehuman": load_model(), "ict-facekit": assemble(import_model(given.ict_facekit), "")}
-    if given.command == "photograph":
-        _photograph(models[given.of], given.of, given.folder, given.heads)
+    arguments = parser.parse_args()
+    models = {"makehuman": load_model(), "ict-facekit": assemble(import_model(arguments.ict_facekit), "")}
+    if arguments.command == "photograph":
+        _photograph(models[arguments.of], arguments.of, arguments.folder, arguments.heads)
         return
-    measured = load_measured(given.folder, models)
-    if given.command == "check":
+    measured = load_measured(arguments.folder, models)
+    if arguments.command == "check":
         _check(measured, models)
         return
     maps, points = make_tables(measured, models, PACKS / "points.npz")

@@ -216,8 +216,8 @@ def main() -> None:
                 patience_s[mutant.module] = max(LEAST_S, 5 * (time.monotonic() - began))
             is_dead = is_noticed(mutant, folder, tests, patience_s[mutant.module])
             noticed += is_dead
-            told = f"{'noticed ' if is_dead else 'SURVIVED'} {mutant.module}:{mutant.line}\n"
-            sys.stdout.write(told if is_dead else f"{told}-  {mutant.before}\n+  {mutant.after}\n")
+            line = f"{'noticed ' if is_dead else 'SURVIVED'} {mutant.module}:{mutant.line}\n"
+            sys.stdout.write(line if is_dead else f"{line}-  {mutant.before}\n+  {mutant.after}\n")
             sys.stdout.flush()
     figures = {"mutants": len(every), "tried": len(drawn), "noticed": noticed}
     sys.stdout.write(json.dumps({"figures": figures}) + "\n")

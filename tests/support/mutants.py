@@ -34,15 +34,15 @@ def namesake(module: str) -> str:
 def copy_of_checkout(folder: Path, module: str, tests: list[str]) -> None:
     """The files that git knows or would add, and mutmut's settings in their pyproject.toml."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
-    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    for name in filter(None, told.split("\0")):
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(ROOT / name, folder / name)
-    own = module.partition("/")[0]
-    beside = [*(name for name in PACKAGES if name != own), "tests", "docs", "deploy", "README.md", "uv.lock"]
+    package = module.partition("/")[0]
+    beside = [*(name for name in PACKAGES if name != package), "tests", "docs", "deploy", "README.md", "uv.lock"]
     settings = {
-        "source_paths": [own],
+        "source_paths": [package],
         "only_mutate": [module],
         "pytest_add_cli_args_test_selection": tests,
         "pytest_add_cli_args": ["-p", "no:cacheprovider", "--hypothesis-profile", "mutants"],
@@ -72,21 +72,21 @@ def main() -> None:
         folder = Path(scratch)
         copy_of_checkout(folder, arguments.module, tests)
 
-        def asked(*command: str) -> str:
+        def run_mutmut(*command: str) -> str:
             done = subprocess.run([mutmut, *command], cwd=folder, capture_output=True, text=True, check=False)
             return done.stdout
 
         with (folder / "log").open("wb") as log:
             run = [mutmut, "run", "--max-children", str(arguments.children)]
             subprocess.run(run, cwd=folder, stdout=log, stderr=log, timeout=HOURS_MOST * 3600, check=False)
-        asked("export-cicd-stats")
+        run_mutmut("export-cicd-stats")
         stats = folder / "mutants" / "mutmut-cicd-stats.json"
         if not stats.exists():
             sys.exit((folder / "log").read_text(errors="replace")[-4000:])
         counts = json.loads(stats.read_text())
-        survivors = [line.split(":")[0].strip() for line in asked("results").splitlines() if ": survived" in line]
+        survivors = [line.split(":")[0].strip() for line in run_mutmut("results").splitlines() if ": survived" in line]
         for name in survivors:
-            sys.stdout.write(asked("show", name) + "\n")
+            sys.stdout.write(run_mutmut("show", name) + "\n")
         untested = counts.get("no_tests", 0)
         tried = counts["total"] - counts.get("skipped", 0)
         noticed = counts["killed"] + counts.get("timeout", 0) + counts.get("segfault", 0)

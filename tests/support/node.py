@@ -13,7 +13,7 @@ def node() -> str:
     return compute_driver_executable()[0]
 
 
-def evaluate(module: Path, expression: str, given: object = None) -> Any:
+def evaluate(module: Path, expression: str, argument: object = None) -> Any:
     """The value, by way of JSON, of a JavaScript expression over ``m``, the module's exports, and ``given``."""
     script = (
         f"const m = await import({json.dumps(module.as_uri())}); let text = '';"
@@ -21,6 +21,6 @@ def evaluate(module: Path, expression: str, given: object = None) -> Any:
         f"const given = JSON.parse(text); console.log(JSON.stringify({expression}));"
     )
     command = [node(), "--no-warnings", "--input-type=module", "--eval", script]
-    done = subprocess.run(command, input=json.dumps(given), capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, input=json.dumps(argument), capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -204,8 +204,8 @@ def _described(module: ModuleType, tables: dict[str, type]) -> list[str]:
             needed = field.default is dataclasses.MISSING
             value = "needed" if needed else f"`{json.dumps(field.default, default=str)}`"
             parts = [_choices(types[field.name]), _comment(by_name[field.name], comments)]
-            told = "; ".join(filter(None, parts))
-            lines.append(f"- `{field.name}` ({value})" + (f": {told}" if told else ""))
+            meaning = "; ".join(filter(None, parts))
+            lines.append(f"- `{field.name}` ({value})" + (f": {meaning}" if meaning else ""))
     return lines
 
 

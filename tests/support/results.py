@@ -48,9 +48,9 @@ def kept(name: str) -> dict[str, Any]:
 def written(name: str) -> str:
     """The table called ``name`` (of the file of words) with its figures. Raises KeyError where one is not kept."""
     document = kept(name.partition(".")[0])
-    told = document["figures"] | {key: document[key] for key in ("command", "date", "machine")}
+    figures = document["figures"] | {key: document[key] for key in ("command", "date", "machine")}
     words = (KEPT / f"{name}.md").read_text(encoding="utf-8").strip()
-    return PLACE.sub(lambda place: format(told[place[1]], place[2]), words)
+    return PLACE.sub(lambda place: format(figures[place[1]], place[2]), words)
 
 
 def with_tables(text: str) -> str:

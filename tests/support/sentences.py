@@ -42,11 +42,11 @@ def composed(tree: ast.Module) -> Iterator[tuple[int, set[str], set[str] | None]
     for scope in _scopes(tree):
         calls = [node for node in scope if isinstance(node, ast.Call) and _name(node.func) == "compose"]
         for call in calls:
-            code, given = call.args[0], {str(keyword.arg) for keyword in call.keywords}
+            code, parameters = call.args[0], {str(keyword.arg) for keyword in call.keywords}
             if isinstance(code, ast.Constant):
-                yield call.lineno, {str(code.value)}, given
+                yield call.lineno, {str(code.value)}, parameters
             elif isinstance(code, ast.IfExp):
-                yield call.lineno, {ast.literal_eval(code.body), ast.literal_eval(code.orelse)}, given
+                yield call.lineno, {ast.literal_eval(code.body), ast.literal_eval(code.orelse)}, parameters
             else:
                 constants = (node.value for node in scope if isinstance(node, ast.Constant))
                 yield call.lineno, {text for text in constants if isinstance(text, str)}, None
@@ -58,8 +58,8 @@ def raw_sentences(tree: ast.Module) -> list[tuple[int, str]]:
     for scope in _scopes(tree):
         sinks = [sink for node in scope for sink in _sinks(node)]
         names = {node.id for sink in sinks for node in ast.walk(sink) if isinstance(node, ast.Name)}
-        told = [node.value for node in scope if isinstance(node, ast.Assign) and _targets(node) & names]
-        for sink in (*sinks, *told):
+        assigned = [node.value for node in scope if isinstance(node, ast.Assign) and _targets(node) & names]
+        for sink in (*sinks, *assigned):
             found |= {id(node): (node.lineno, text) for node, text in _texts(sink)}
     return sorted(found.values())
 

@@ -252,14 +252,14 @@ class StudioDevices:
 
     def _films_of(self, camera: str) -> dict[_Look, Film]:
         """The films of one camera with the lamps off and on."""
-        looks = [self._look(camera, lamps) for lamps in (0, (1 << LIGHTS) - 1)]
-        if all(look in self._films for look in looks):
-            return {look: self._films[look] for look in looks}
+        lightings = [self._look(camera, lamps) for lamps in (0, (1 << LIGHTS) - 1)]
+        if all(look in self._films for look in lightings):
+            return {look: self._films[look] for look in lightings}
         live = _TAKES_LEAST if self.present else self._takes  # clean plates are taken of the empty studio alone
         now_s = time.monotonic() - self._started_s
         takes = [self._sources[self.present](camera, now_s + i) for i in range(live + _TAKES_LEAST)]
         films: dict[_Look, Film] = {}
-        for look in looks:
+        for look in lightings:
             rng = np.random.default_rng(zlib.crc32(repr(look).encode()))
             jpegs = tuple(_develop(take, look, rng) for take in takes)
             films[look] = Film(jpegs[:live], jpegs[live:])

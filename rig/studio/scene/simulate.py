@@ -167,9 +167,9 @@ def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) 
     click_rng, *rngs = rng.spawn(1 + len(names))
 
     def one(
-        name: str, own: np.random.Generator
+        name: str, camera_rng: np.random.Generator
     ) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[UInt8[np.ndarray, "_ _ 3"], ...]]:
-        return _picture(scene.views[name], scene.preset, [f for f in faults if f.camera in (None, name)], own)
+        return _picture(scene.views[name], scene.preset, [f for f in faults if f.camera in (None, name)], camera_rng)
 
     with ThreadPoolExecutor(THREADS) as pool:  # numpy and cv2 work outside the interpreter lock
         taken = dict(zip(names, pool.map(one, names, rngs), strict=True))
@@ -251,9 +251,11 @@ def _views(
 ) -> dict[str, View]:
     colour = CAMOUFLAGE if any(fault.kind == "camouflage" for fault in faults) else None
 
-    def one(camera: Camera, own: np.random.Generator) -> View:
+    def one(camera: Camera, camera_rng: np.random.Generator) -> View:
         blur = [fault.strength for fault in faults if fault.kind == "blurred" and fault.camera == camera.name]
-        gains = np.exp(own.normal(0, preset.exposure_spread) + own.normal(0, preset.white_balance_spread, 3))
+        gains = np.exp(
+            camera_rng.normal(0, preset.exposure_spread) + camera_rng.normal(0, preset.white_balance_spread, 3)
+        )
         red, green, blue = gains.tolist()
         sensor = Sensor(
             (red, green, blue),
@@ -264,7 +266,7 @@ def _views(
             preset.mosaic,
             preset.jpeg_quality,
         )
-        behind = backdrop(camera.intrinsics, own, preset.backdrop_unevenness, colour)
+        behind = backdrop(camera.intrinsics, camera_rng, preset.backdrop_unevenness, colour)
         return View(light[camera.name], behind, sensor)
 
     with ThreadPoolExecutor(THREADS) as pool:

@@ -114,5 +114,5 @@ def sees(
     z = pose.apply(points)[:, 2]
     slant = (normals * rays).sum(axis=1)
     along = -(normals * towards).sum(axis=1) / np.where(np.abs(slant) > 1e-6, slant, 1.0)
-    own = np.where(np.abs(slant) > 1e-6, along * (rays @ pose.rotation[2]), z)
-    return framed & (facing > LEAST_FACING) & (own < depth[row, column] + HIDDEN_MM)
+    point_depth = np.where(np.abs(slant) > 1e-6, along * (rays @ pose.rotation[2]), z)
+    return framed & (facing > LEAST_FACING) & (point_depth < depth[row, column] + HIDDEN_MM)

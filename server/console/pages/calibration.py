@@ -57,11 +57,11 @@ shots = Shots()
 
 
 class RigLine(TypedDict):
-    """``own``: whether a calibration of the rig's own is in use."""
+    """``is_measured``: whether a calibration of the rig's own is in use."""
 
     kind: str
     calibration: str | None
-    own: bool
+    is_measured: bool
 
 
 class CalibrationState(TypedDict):
@@ -106,7 +106,7 @@ def calibration_state(service: Service) -> CalibrationState:
         "rig": {
             "kind": rig.kind,
             "calibration": rig.calibration,
-            "own": service.calibrations.in_use() is not None,
+            "is_measured": service.calibrations.in_use() is not None,
         },
         "board": shots.board,
         "shots": len(shots.taken),

@@ -121,22 +121,24 @@ class BulkForm(WorkForm):
 class CapturesPage(Page, component="captures.js"):
     def look(self) -> CapturesState:
         """What is looked at stays, whatever comes in meanwhile: nobody erases another capture than the one they see."""
-        asked = {name: self.choice.get(name) or None for name in ASKED}
+        requested = {name: self.choice.get(name) or None for name in ASKED}
         state: CapturesState = shared.get(
-            ("captures", *asked.values()), 0.3, lambda: captures_state(self.service, asked)
+            ("captures", *requested.values()), 0.3, lambda: captures_state(self.service, requested)
         )
-        if state["chosen"] is not None and (self.choice.get("capture") or None) == asked["capture"]:
+        if state["chosen"] is not None and (self.choice.get("capture") or None) == requested["capture"]:
             self.choice["capture"] = state["chosen"]["id"]
         return state
 
 
-def captures_state(service: Service, asked: Mapping[str, str | None]) -> CapturesState:
+def captures_state(service: Service, requested: Mapping[str, str | None]) -> CapturesState:
     """A page of the captures that are sought, with the jobs of each."""
-    order = cast(CaptureOrder, asked["sort"] if asked["sort"] in get_args(CaptureOrder) else "-created")
-    query = CaptureQuery(asked["find"] or "", asked["session"], asked["verdict"], tag=asked["tag"], order=order)
-    found = service.captures.page(query, SHOWN, asked["after"])
+    order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
+    query = CaptureQuery(
+        requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
+    )
+    found = service.captures.page(query, SHOWN, requested["after"])
     records = [record for record in found.items if record.id not in removals]
-    chosen = [record for record in service.captures.of([asked["capture"] or ""]) if record.id not in removals]
+    chosen = [record for record in service.captures.of([requested["capture"] or ""]) if record.id not in removals]
     jobs = jobs_of(service, [record.id for record in (*records, *chosen)])
     lines = [capture_line(record, jobs[record.id]) for record in records]
     return {
@@ -144,7 +146,7 @@ def captures_state(service: Service, asked: Mapping[str, str | None]) -> Capture
         "chosen": capture_line(chosen[0], jobs[chosen[0].id]) if chosen else next(iter(lines), None),
         "next": found.next,
         "total": found.total - (len(found.items) - len(records)),
-        "sessions": sessions_list(service, asked["session"]),
+        "sessions": sessions_list(service, requested["session"]),
         "tags": shared.get("tags", 1.0, service.captures.tags),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
         "presets": preset_lines(),
@@ -255,9 +257,9 @@ def sample(page: Page, event: object) -> Message:
 
 
 def edit(page: Page, event: EditForm) -> None:
-    given: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
+    changes: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     tags = typed_tags(event["tags"]) if "tags" in event else None
-    page.service.captures.edit(event["id"], given, tags=tags)
+    page.service.captures.edit(event["id"], changes, tags=tags)
     forget_captures()
 
 
@@ -268,8 +270,8 @@ def new_session(page: Page, event: SessionForm) -> Message:
 
 
 def edit_consent(page: Page, event: SessionEditForm) -> None:
-    given = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
-    page.service.sessions.edit(event["id"], label=given.get("label"), consent=given.get("consent"))
+    changes = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
+    page.service.sessions.edit(event["id"], label=changes.get("label"), consent=changes.get("consent"))
     forget_captures()
 
 
@@ -324,8 +326,8 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
     forget_captures()
     said = said_of(action, len(done.done))
     if done.refused:
-        told = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
-        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(told)), told)
+        faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
+        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
     return said
 
 
@@ -363,5 +365,5 @@ CapturesPage.actions = {
 async def captures_page(
     capture: str = "", find: str = "", session: str = "", verdict: str = "", tag: str = "", sort: str = ""
 ) -> RedirectResponse | None:
-    asked = {"capture": capture, "find": find, "session": session, "verdict": verdict, "tag": tag, "sort": sort}
-    return await show("captures", CapturesPage, **asked)
+    requested = {"capture": capture, "find": find, "session": session, "verdict": verdict, "tag": tag, "sort": sort}
+    return await show("captures", CapturesPage, **requested)

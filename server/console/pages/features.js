@@ -98,11 +98,11 @@ export default spoken({
         <template v-if="capture"><span class="group" role="group" aria-label="Number of views"><button v-for="n in [3, 4]" :key="n" class="b" :aria-pressed="count === n" @click="count = n">{{ say('{count} view | {count} views', { count: n }) }}</button></span>
         <button class="b" id="save" :disabled="!capture.dirty || !!busy" @click="act('save')">Save <kbd>S</kbd></button>
         <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct')">{{ say(ready ? 'Reconstruct' : 'Skip and reconstruct') }}</button></template></header>
-      <div v-if="capture && capture.asked && wrong.length" class="panel pad stack small" role="alertdialog" aria-label="Points contradict each other" id="contradictions" style="border-color: var(--warn)">
+      <div v-if="capture && capture.is_contradictory && wrong.length" class="panel pad stack small" role="alertdialog" aria-label="Points contradict each other" id="contradictions" style="border-color: var(--warn)">
         <p><strong class="warn">Not saved yet: views contradict each other.</strong> A job would leave these out. Right and left confused, or another point clicked?</p>
         <ul class="faults"><li v-for="[name, text] in wrong" :key="name"><button class="b quiet" @click="at = names.indexOf(name)">{{ title(name) }}</button> {{ say(text) }}</li></ul>
         <div class="line wrap"><button class="b main-action" @click="at = names.indexOf(wrong[0][0])">Look at them</button><button class="b" id="save-anyway" :disabled="!!busy" @click="act('save', { sure: true })">Save all the same</button></div></div>
-      <div v-if="!state.loading && !capture" class="panel grow" style="display: grid"><div class="empty"><h2>{{ say(state.asked ? 'This capture is not there' : 'No captures yet') }}</h2><p>Points are picked in the pictures of a capture.</p><a class="b main-action" :href="state.asked ? '/captures' : '/'">{{ say(state.asked ? 'Go to captures' : 'Go to the rig') }}</a></div></div>
+      <div v-if="!state.loading && !capture" class="panel grow" style="display: grid"><div class="empty"><h2>{{ say(state.requested ? 'This capture is not there' : 'No captures yet') }}</h2><p>Points are picked in the pictures of a capture.</p><a class="b main-action" :href="state.requested ? '/captures' : '/'">{{ say(state.requested ? 'Go to captures' : 'Go to the rig') }}</a></div></div>
       <div v-else-if="capture" class="columns" style="grid-template-columns: 15rem minmax(0, 1fr)">
         <div class="panel scroll" tabindex="0" role="region" aria-label="The points" data-scroll="points">
           <button v-for="{ name, i } in offered" :key="name" class="row-button" :data-point="name" :aria-current="i === at" @click="at = i">

@@ -53,13 +53,13 @@ class Picking(Helps):
     names: list[str]
     points: Points
     dirty: bool
-    asked: bool
+    is_contradictory: bool
 
 
 class FeaturesShown(TypedDict):
     captures: list[CaptureChoice]
     capture: Picking | None
-    asked: NotRequired[str | None]
+    requested: NotRequired[str | None]
 
 
 class Place(TypedDict):
@@ -76,14 +76,16 @@ class Sure(TypedDict):
 
 @dataclass(slots=True)
 class Picked:
-    """The points of a capture as they stand on the page, and as they were saved; ``asked``: as they stood when they
-    were to be saved and contradicted each other."""
+    """Holds the points of a capture as they stand on the page, and as they were saved.
+
+    ``unconfirmed``: as they stood when they were to be saved and contradicted each other.
+    """
 
     capture: str
     points: Points
     saved: Points
     guides: Guides
-    asked: Points | None = None
+    unconfirmed: Points | None = None
 
 
 class Drafts:
@@ -120,7 +122,7 @@ class FeaturesPage(Page, component="features.js"):
             captures = [*captures, *(choice_of(record) for record in older if record.id not in removals)]
             known = bool(older)
         if chosen is None or not known:
-            return {"captures": captures, "capture": None, "asked": self.choice.get("capture")}
+            return {"captures": captures, "capture": None, "requested": self.choice.get("capture")}
         return {"captures": captures, "capture": self._picking(chosen)}
 
     def _picking(self, capture_id: str) -> Picking:
@@ -142,7 +144,7 @@ class FeaturesPage(Page, component="features.js"):
             "names": [*SEVEN_POINTS, *(name for name in NAMES if name not in SEVEN_POINTS)],
             "points": points,
             "dirty": points != picked.saved,
-            "asked": picked.asked == points,
+            "is_contradictory": picked.unconfirmed == points,
             **picked.guides.helps(
                 pixels, landmarks.of(self.service), [shown], chosen.split("\n") if chosen else nearest
             ),
@@ -214,10 +216,10 @@ def save(page: FeaturesPage, event: Sure) -> Message | None:
     picked = page.of_capture()
     points = picked.points
     if not event.get("sure") and contradictions(page):
-        picked.asked = points
+        picked.unconfirmed = points
         return None
     page.service.captures.put_features(picked.capture, points)
-    picked.saved, picked.asked = points, None
+    picked.saved, picked.unconfirmed = points, None
     drafts.keep(page.caller.key, picked)
     return compose("features-saved")
 

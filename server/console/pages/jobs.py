@@ -122,8 +122,8 @@ class ListedJob:
 
 class JobsPage(Page, component="jobs.js"):
     def look(self) -> JobsShown:
-        asked = {name: self.choice.get(name) or None for name in ASKED}
-        state: JobsState = shared.get(("jobs", *asked.values()), 0.3, lambda: jobs_state(self.service, asked))
+        requested = {name: self.choice.get(name) or None for name in ASKED}
+        state: JobsState = shared.get(("jobs", *requested.values()), 0.3, lambda: jobs_state(self.service, requested))
         first = next((job for job in state["jobs"] if job["state"] == "running"), next(iter(state["jobs"]), None))
         chosen = self.choice.get("job")
         known = next((job for job in state["jobs"] if job["id"] == chosen), None)
@@ -135,11 +135,11 @@ class JobsPage(Page, component="jobs.js"):
         return {**state, "job": job, "detail": None if job is None else job_detail(self.service, job["id"])}
 
 
-def jobs_state(service: Service, asked: Mapping[str, str | None]) -> JobsState:
+def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsState:
     """First what runs, then the queue in its order, then what ended, newest first."""
-    sought, after = asked["find"] or "", asked["after"]
-    order = cast(JobOrder, asked["sort"] if asked["sort"] in get_args(JobOrder) else "-created")
-    state = asked["state"] if asked["state"] in STATUSES else None
+    sought, after = requested["find"] or "", requested["after"]
+    order = cast(JobOrder, requested["sort"] if requested["sort"] in get_args(JobOrder) else "-created")
+    state = requested["state"] if requested["state"] in STATUSES else None
     statuses = ENDED if state is None else STATUSES[state]
     before, waiting = ([], 0) if after or state else active_jobs(service, sought)
     if state == "queued":
@@ -278,8 +278,8 @@ def bulk(page: Page, event: BulkForm) -> Message:
     count = len(done.done)
     said = compose("jobs-cancelled", count=count) if action == "cancel" else compose("jobs-queued-again", count=count)
     if done.refused:
-        told = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
-        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(told)), told)
+        faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
+        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
     return said
 
 

@@ -66,7 +66,7 @@ class ResultShown(TypedDict):
     results: list[ResultLine]
     total: int
     job: Head | None
-    asked: str | None
+    requested: str | None
 
 
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
@@ -82,7 +82,7 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
             ]
             known = next(iter(result_lines(self.service, done)), None)
         if known is None:
-            return {"results": results, "total": total, "job": None, "asked": self.choice.get("job")}
+            return {"results": results, "total": total, "job": None, "requested": self.choice.get("job")}
         if self.choice.get("job") is None:  # a head that comes in meanwhile does not take the place of the shown one
             self.choice["job"] = known["id"]
         theirs: list[ResultLine] = shared.get(
@@ -91,7 +91,7 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
         heads = {line["id"]: line for line in (known, *theirs, *results)}
         shown = sorted(heads.values(), key=lambda line: line["id"], reverse=True)
         head = head_of(self.service, known)
-        return {"results": shown, "total": total, "job": head, "asked": self.choice.get("job")}
+        return {"results": shown, "total": total, "job": head, "requested": self.choice.get("job")}
 
     def preloads(self) -> Iterable[tuple[str, str]]:
         job = self.props["state"].get("job")

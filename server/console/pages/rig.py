@@ -118,14 +118,14 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
     if not found:
         return None
     job = found[0]
-    told = shown_detail(job.error.detail) if job.error is not None else job.notice
+    detail = shown_detail(job.error.detail) if job.error is not None else job.notice
     return {
         "id": job.id,
         "state": job.state,
         "stage": job.stage,
         "progress": job.progress,
         "eta_s": job.eta_s,
-        "detail": None if told is None else told.document(),
+        "detail": None if detail is None else detail.document(),
     }
 
 
@@ -207,8 +207,8 @@ def moved_cameras(service: Service) -> set[str]:
     report = read_report(service, done[0].id)
     if report is None:
         return set()
-    told = " ".join(w["message"] for w in report.get("warnings", []) if "moved" in w["code"])
-    return {name for name in report.get("cameras", {}) if name in told}
+    text = " ".join(w["message"] for w in report.get("warnings", []) if "moved" in w["code"])
+    return {name for name in report.get("cameras", {}) if name in text}
 
 
 def read_report(service: Service, job_id: str) -> Report | None:
@@ -268,9 +268,9 @@ def use_plates(page: Page, event: Chosen) -> Message:
 
 
 def begin_session(page: Page, event: SessionForm) -> Message:
-    told = new_session(page, event)
+    notice = new_session(page, event)
     shared.forget("rig")
-    return told
+    return notice
 
 
 def note_consent(page: Page, event: SessionEditForm) -> None:

@@ -57,7 +57,7 @@ export default spoken({
             <div class="line wrap"><button class="b main-action" :disabled="!!busy">Make the key</button><button type="button" class="b quiet" @click="form = null">Cancel</button></div></form>
           <table v-if="keys.length" class="small"><thead><tr><th>Name</th><th>May</th><th>Made</th><th><span class="unseen">Revoke</span></th></tr></thead>
             <tbody><tr v-for="k in keys" :key="k.id" :data-key="k.id"><td><strong>{{ k.name }}</strong> <span class="muted mono">{{ k.id }}</span></td><td>{{ k.scopes.join(', ') }}</td><td class="muted">{{ clock(k.created) }}</td>
-              <td class="num"><span v-if="k.own" class="muted">yours</span><button v-else-if="revoking !== k.id" class="b quiet" :aria-label="say('Revoke {name}', { name: k.name })" @click="revoking = k.id">Revoke ...</button>
+              <td class="num"><span v-if="k.is_yours" class="muted">yours</span><button v-else-if="revoking !== k.id" class="b quiet" :aria-label="say('Revoke {name}', { name: k.name })" @click="revoking = k.id">Revoke ...</button>
                 <span v-else class="line wrap" role="alertdialog" :aria-label="say('Revoke {name}', { name: k.name })"><button class="b danger" :disabled="!!busy" @click="act('revoke', { id: k.id })">Revoke for good</button><button class="b quiet" @click="revoking = ''">Keep</button></span></td></tr></tbody></table>
           <p v-else-if="state.admin && !state.open" class="small muted">No keys.</p>
         </div>

@@ -40,7 +40,7 @@ class KeyLine(TypedDict):
     name: str
     scopes: list[str]
     created: str
-    own: bool
+    is_yours: bool
 
 
 class SettingLine(TypedDict):
@@ -100,14 +100,14 @@ def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
             "name": key.name,
             "scopes": [*key.scopes],
             "created": datetime.fromtimestamp(key.created, UTC).isoformat(timespec="seconds"),
-            "own": key.id == caller.key,
+            "is_yours": key.id == caller.key,
         }
         for key in service.keys.all()
     ]
 
 
 def setting_lines(s: ServiceSettings) -> list[SettingLine]:
-    told = {
+    values = {
         "keep_captures_days": _days(s.keep_captures_days),
         "keep_results_days": _days(s.keep_results_days),
         "keep_jobs": compose("keep-all") if s.keep_jobs is None else compose("keep-newest", count=s.keep_jobs),
@@ -123,7 +123,7 @@ def setting_lines(s: ServiceSettings) -> list[SettingLine]:
             "value": value.document(),
             "means": MEANINGS[name].document(),
         }
-        for name, value in told.items()
+        for name, value in values.items()
     ]
 
 
@@ -178,8 +178,8 @@ def remove_failed(page: ServicePage, event: object) -> Message:
 def sweep_now(page: ServicePage, event: object) -> Message:
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
-    told = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]
-    return compose("swept", gone=told or compose("nothing-due"))
+    removed = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]
+    return compose("swept", gone=removed or compose("nothing-due"))
 
 
 def count_again(page: ServicePage, event: object) -> None:

@@ -28,13 +28,13 @@ class SubjectsState(TypedDict):
 
 class SubjectsPage(Page, component="subjects.js"):
     def look(self) -> SubjectsState:
-        asked = {name: self.choice.get(name) or None for name in ASKED}
-        return shared.get(("subjects", *asked.values()), 1.0, lambda: subjects_state(self.service, asked))
+        requested = {name: self.choice.get(name) or None for name in ASKED}
+        return shared.get(("subjects", *requested.values()), 1.0, lambda: subjects_state(self.service, requested))
 
 
-def subjects_state(service: Service, asked: Mapping[str, str | None]) -> SubjectsState:
-    order = cast(SubjectOrder, asked["sort"] if asked["sort"] in get_args(SubjectOrder) else "-created")
-    found = service.sessions.subjects(asked["find"] or "", order, SHOWN, asked["after"], tag=asked["tag"])
+def subjects_state(service: Service, requested: Mapping[str, str | None]) -> SubjectsState:
+    order = cast(SubjectOrder, requested["sort"] if requested["sort"] in get_args(SubjectOrder) else "-created")
+    found = service.sessions.subjects(requested["find"] or "", order, SHOWN, requested["after"], tag=requested["tag"])
     return {
         "subjects": [asdict(subject) for subject in found.items],
         "tags": shared.get("tags", 1.0, service.captures.tags),
@@ -44,9 +44,9 @@ def subjects_state(service: Service, asked: Mapping[str, str | None]) -> Subject
 
 
 def begin(page: Page, event: SessionForm) -> Message:
-    told = new_session(page, event)
+    notice = new_session(page, event)
     shared.forget("subjects")
-    return told
+    return notice
 
 
 SubjectsPage.actions = {"new_session": Action("capture", begin)}

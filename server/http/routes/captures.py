@@ -129,8 +129,8 @@ def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureCh
 @router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: CaptureEdit) -> CaptureOut:
     """Another label, expression or session, or other tags."""
-    given = wanted.model_dump(exclude_unset=True)
-    changed = service.captures.edit(capture_id, given, tags=given.pop("tags", None))
+    changes = wanted.model_dump(exclude_unset=True)
+    changed = service.captures.edit(capture_id, changes, tags=changes.pop("tags", None))
     return CaptureOut.model_validate(changed)
 
 

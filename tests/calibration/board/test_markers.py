@@ -32,8 +32,8 @@ def picture(board: Board, turn: int = 0, *, flipped: bool = False) -> np.ndarray
     return np.ascontiguousarray(seen[:, ::-1]) if flipped else seen
 
 
-def markers(board: Board, told: Board = TOLD) -> list[dict[int, np.ndarray]]:
-    return [find_markers(picture(board, turn), told.dictionary) for turn in range(3)]
+def markers(board: Board, configured: Board = TOLD) -> list[dict[int, np.ndarray]]:
+    return [find_markers(picture(board, turn), configured.dictionary) for turn in range(3)]
 
 
 @pytest.mark.parametrize("printed", [

@@ -13,7 +13,7 @@ HELD_OUT = Check("held-out shots", True, verbatim(""))
 
 
 @pytest.mark.parametrize(
-    ("weak", "word", "told"),
+    ("weak", "word", "reason"),
     [
         ({}, "good", None),
         ({"views": 5}, "usable", "cam02: fewer than 6 views of the board"),
@@ -25,11 +25,11 @@ HELD_OUT = Check("held-out shots", True, verbatim(""))
         ({"covered": 0.2}, "usable", "cam02: the board was never near the rim"),
     ],
 )
-def test_the_weakest_camera_decides(weak: dict[str, float], word: str, told: str | None) -> None:
+def test_the_weakest_camera_decides(weak: dict[str, float], word: str, reason: str | None) -> None:
     cameras = {f"cam{i:02}": SOUND for i in range(4)} | {"cam02": replace(SOUND, **weak)}
     verdict = judge(cameras, [HELD_OUT])
     assert verdict.word == word
-    assert [missing.text.startswith(told or "") for missing in verdict.missing] == [True] * (told is not None)
+    assert [missing.text.startswith(reason or "") for missing in verdict.missing] == [True] * (reason is not None)
 
 
 def test_shots_that_none_could_be_held_out_of_are_usable_at_most() -> None:

@@ -38,28 +38,28 @@ def stepped(camera: Camera, lens: np.ndarray, pose: np.ndarray) -> Camera:
 
 @pytest.mark.parametrize("one_lens", [True, False])
 def test_it_is_the_schur_complement_of_dense_normal_equations(one_lens: bool) -> None:
-    given = structure(one_lens, points=8)
-    places = camera_places(given)
-    size, count = int(places.max()) + 1, len(given.points)
+    observed = structure(one_lens, points=8)
+    places = camera_places(observed)
+    size, count = int(places.max()) + 1, len(observed.points)
 
     def residuals(step: np.ndarray) -> np.ndarray:
-        cameras = tuple(stepped(c, step[p[:LENS]], step[p[LENS:]]) for c, p in zip(given.rig, places, strict=True))
-        world = given.points + step[size:].reshape(-1, 3)
-        return replace(given, rig=Rig(cameras), points=world).residuals().ravel()
+        cameras = tuple(stepped(c, step[p[:LENS]], step[p[LENS:]]) for c, p in zip(observed.rig, places, strict=True))
+        world = observed.points + step[size:].reshape(-1, 3)
+        return replace(observed, rig=Rig(cameras), points=world).residuals().ravel()
 
     h = 1e-6
     columns = [(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(size + 3 * count)]
     jacobian = np.stack(columns, axis=1)
     normal = jacobian.T @ jacobian / 10.0**2
     dense = normal[:size, :size] - normal[:size, size:] @ np.linalg.solve(normal[size:, size:], normal[size:, :size])
-    ours = reduced_camera_system(given, 10.0)
+    ours = reduced_camera_system(observed, 10.0)
     scale = np.sqrt(np.diag(normal)[:size])
     np.testing.assert_allclose(ours / np.outer(scale, scale), dense / np.outer(scale, scale), atol=1e-6)
 
 
 def test_a_motion_of_the_world_costs_nothing() -> None:
-    given = structure(one_lens=True)
-    system = reduced_camera_system(given, NOISE_PX)
+    observed = structure(one_lens=True)
+    system = reduced_camera_system(observed, NOISE_PX)
     scaled = system / np.sqrt(np.outer(np.diag(system), np.diag(system)))
     assert (np.linalg.eigvalsh(scaled)[:7] < 1e-9).all()
     assert np.linalg.eigvalsh(scaled)[7] > 1e-9
@@ -77,16 +77,16 @@ def test_the_blocks_are_covariances_in_the_subjects_gauge() -> None:
 def test_lenses_that_differ_are_noticed_and_widen_what_is_claimed(bend: float, least: float, most: float) -> None:
     """Fifteen values more: chi-squared by its number is 1 with a deviation of sqrt(2 / 15) = 0.37; three of them.
     Every second camera saw through a lens that bends more; the structure has one."""
-    given = structure(one_lens=True, points=600)
-    pixels = given.pixels.copy()
-    for index, camera in enumerate(given.rig):
-        own = given.camera_of == index
+    observed = structure(one_lens=True, points=600)
+    pixels = observed.pixels.copy()
+    for index, camera in enumerate(observed.rig):
+        of_camera = observed.camera_of == index
         k = camera.intrinsics
         wide = replace(camera, intrinsics=replace(k, distortion=Distortion(k1=bend)))
         shift = wide if index % 2 else camera
-        pixels[own] += shift.project(given.points[given.point_of[own]])
-        pixels[own] -= camera.project(given.points[given.point_of[own]])
-    given = replace(given, pixels=pixels)
-    assert least < lens_misfit(given, NOISE_PX) < most
-    alone = uncertainty(replace(given, pixels=structure(one_lens=True, points=600).pixels))
-    assert (uncertainty(given).pose_sigma_px >= 0.99 * alone.pose_sigma_px).all()
+        pixels[of_camera] += shift.project(observed.points[observed.point_of[of_camera]])
+        pixels[of_camera] -= camera.project(observed.points[observed.point_of[of_camera]])
+    observed = replace(observed, pixels=pixels)
+    assert least < lens_misfit(observed, NOISE_PX) < most
+    alone = uncertainty(replace(observed, pixels=structure(one_lens=True, points=600).pixels))
+    assert (uncertainty(observed).pose_sigma_px >= 0.99 * alone.pose_sigma_px).all()

@@ -35,7 +35,7 @@ def test_a_folder_a_camera(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("files", "told"),
+    ("files", "text"),
     [
         (("a.jpg", "b.jpg"), "2 photographs; at least 3"),
         (("a.jpg", "b/1.jpg", "c/1.jpg"), "photographs beside folders"),
@@ -45,8 +45,8 @@ def test_a_folder_a_camera(tmp_path: Path) -> None:
         ((), "0 photographs"),
     ],
 )
-def test_faults_are_named(tmp_path: Path, files: tuple[str, ...], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_faults_are_named(tmp_path: Path, files: tuple[str, ...], text: str) -> None:
+    with pytest.raises(InputError, match=text):
         find_photographs(fill(tmp_path / "photos", "readme.txt", *files))
 
 

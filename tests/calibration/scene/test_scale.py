@@ -58,7 +58,7 @@ def test_a_printed_tag(photographs: Path) -> None:
     known = TagSize("DICT_4X4_50", TAG_MM)
     found = find_scale(structure(ENDS), known, find_photographs(photographs), HEAD)
     assert found.factor == pytest.approx(1 / UNIT, rel=0.01)  # 12 corners to 0.3 px, of sides of 35 px
-    assert f"({TAG_NUMBER})" in found.told.text
+    assert f"({TAG_NUMBER})" in found.provenance.text
 
 
 def test_tags_that_are_not_there_are_told(photographs: Path) -> None:
@@ -88,4 +88,4 @@ def test_a_heads_size_is_an_assumption() -> None:
     assert found.factor == pytest.approx(2 / UNIT, rel=0.05)
     assert found.source == ASSUMED
     assert found.assumed
-    assert "ASSUMPTION" in found.told.text
+    assert "ASSUMPTION" in found.provenance.text

@@ -37,7 +37,7 @@ def test_principal_point_and_pixels_are_shifted_alike() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "reason"),
     [
         ("dark", "only 12 distinct points in it"),
         ("alone", "none of its 900 points is found in another view"),
@@ -45,10 +45,10 @@ def test_principal_point_and_pixels_are_shifted_alike() -> None:
         ("farther", "at most 30 points in common with another view (far, which did not join either)"),
     ],
 )
-def test_a_view_that_does_not_join_is_told_why(name: str, told: str) -> None:
+def test_a_view_that_does_not_join_is_told_why(name: str, reason: str) -> None:
     features = {"near": 2000, "dark": 12, "alone": 900, "far": 800, "farther": 700}
     matched = {("near", "far"): 20, ("far", "farther"): 30, ("near", "alone"): 0}
     if name == "far":
         matched["far", "farther"] = 10
     matches = Matches((), False, dict.fromkeys(features, (640, 480)), features, matched, 0)
-    assert why_not(name, matches, ("near",)).text.startswith(told)
+    assert why_not(name, matches, ("near",)).text.startswith(reason)

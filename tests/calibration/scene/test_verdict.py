@@ -15,7 +15,9 @@ def test_a_calibration_from_a_scene_is_judged_by_what_it_does_not_know() -> None
     sharp = np.full(len(found.rig), 0.3)
     sound = replace(found, uncertainty=replace(found.uncertainty, pose_sigma_px=sharp))
     assert judge_scene(sound).word == "good"
-    guessed = judge_scene(replace(sound, scale=replace(found.scale, source=ASSUMED, told=verbatim("an ASSUMPTION"))))
+    guessed = judge_scene(
+        replace(sound, scale=replace(found.scale, source=ASSUMED, provenance=verbatim("an ASSUMPTION")))
+    )
     assert (guessed.word, texts_of(guessed.missing)) == ("usable", ["the scale is an ASSUMPTION"])
     apart = judge_scene(replace(sound, left_out={"dark": verbatim("only 3 distinct points in it")}))
     assert (apart.word, texts_of(apart.missing)) == ("usable", ["dark: only 3 distinct points in it"])

@@ -105,9 +105,9 @@ def test_own_and_foreign_backgrounds_of_rendered_captures(capture: str) -> None:
     shot, rig = read_capture(shared(f"data/captures/{capture}"))
     names = rig.names
     for i, name in enumerate(names):
-        own = register(shot.images[name], shot.backgrounds[name][0])
-        assert own.found > FOUND_SURELY
-        assert own.moved_px < 0.5
+        registration = register(shot.images[name], shot.backgrounds[name][0])
+        assert registration.found > FOUND_SURELY
+        assert registration.moved_px < 0.5
         foreign = register(shot.images[name], shot.backgrounds[names[i - 1]][0])
         assert foreign.found < FOUND_LEAST
         blur = blur_px(shot.images[name])

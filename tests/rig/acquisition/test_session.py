@@ -196,13 +196,13 @@ def test_somebody_who_holds_still_does_not_replace_good_plates(
 ) -> None:
     """They are kept as a version, for whoever knows that the studio itself changed."""
     shutil.copytree(config.plates_folder, tmp_path / "plates")
-    own = dataclasses.replace(config, plates=str(tmp_path / "plates"))
-    before = {path: path.read_bytes() for path in own.plates_folder.rglob("*.*")}
+    changed = dataclasses.replace(config, plates=str(tmp_path / "plates"))
+    before = {path: path.read_bytes() for path in changed.plates_folder.rglob("*.*")}
     studio.seat(True)
     with pytest.raises(PlatesRefused, match="occupied") as refused:
-        take_plates(own)
-    assert {path: path.read_bytes() for path in own.plates_folder.rglob("*.*")} == before
-    newest = plates_versions(own.plates_folder)[0]
+        take_plates(changed)
+    assert {path: path.read_bytes() for path in changed.plates_folder.rglob("*.*")} == before
+    newest = plates_versions(changed.plates_folder)[0]
     assert (newest.id, newest.in_use) == (refused.value.version, False)
     assert newest.refused
 

@@ -314,7 +314,9 @@ def test_pictures_and_points_of_a_fisheye_come_undistorted(tmp_path: Path) -> No
     assert back["a"].recorded == lens
     assert back["a"].intrinsics.distortion.is_zero
     pixels = np.stack([columns, rows], axis=2)[4:-4, 4:-4].reshape(-1, 2).astype(float)
-    told = capture.images["a"][4:-4, 4:-4, :2].reshape(-1, 2) / (3.0, 4.0)
-    np.testing.assert_allclose(told, lens.distorted(pixels, matrix), atol=0.25)  # half a level, and the way of reading
+    encoded = capture.images["a"][4:-4, 4:-4, :2].reshape(-1, 2) / (3.0, 4.0)
+    np.testing.assert_allclose(
+        encoded, lens.distorted(pixels, matrix), atol=0.25
+    )  # half a level, and the way of reading
     np.testing.assert_allclose(capture.features["pronasale"]["a"], wanted[0], atol=1e-6)
     assert capture.masks["c"].dtype == bool

@@ -125,9 +125,9 @@ def test_blender_frames_tell_an_angle_and_no_size(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError) as refused:
         read_rig_file(tmp_path / "transforms.json")
-    told = " ".join(texts_of(refused.value.faults))
+    text = " ".join(texts_of(refused.value.faults))
     for fault in ("r_0.fl_x is '9'", "r_0.k4", "r_1 has neither fl_x nor camera_angle_x"):
-        assert fault in told
+        assert fault in text
 
 
 def test_blender_sees_what_the_camera_sees(tmp_path: Path) -> None:

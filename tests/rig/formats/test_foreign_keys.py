@@ -306,9 +306,9 @@ def test_each_key_is_treated_as_its_row_says(kind: str, key: str, tmp_path: Path
         return
     read = read_cameras(path)
     assert signature(read) == before
-    told = [remark for remark in read.remarks if word in remark.text]
-    assert bool(told) == (rule.treatment == "told")
-    assert len(read.remarks) == len(told)
+    remarks = [remark for remark in read.remarks if word in remark.text]
+    assert bool(remarks) == (rule.treatment == "told")
+    assert len(read.remarks) == len(remarks)
 
 
 @pytest.mark.parametrize(("kind", "key"), [(kind, "frobnicated") for kind in FOREIGN_KEYS if kind != "colmap"])

@@ -30,7 +30,7 @@ def test_a_square_with_a_hole_has_its_area(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("outlines", "kind", "told"),
+    ("outlines", "kind", "text"),
     [
         ({}, "eigenhead-cameras/1", "format"),
         ([1, 2], OUTLINES_FORMAT, "cannot be read"),
@@ -38,6 +38,6 @@ def test_a_square_with_a_hole_has_its_area(tmp_path: Path) -> None:
         ({"cam00": [[[1, 2], [3, 1e9], [3, 4]]]}, OUTLINES_FORMAT, "cam00"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, outlines: object, kind: str, told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_what_is_wrong_is_named(tmp_path: Path, outlines: object, kind: str, text: str) -> None:
+    with pytest.raises(InputError, match=text):
         read_outlines(written(tmp_path, outlines, kind), wedge_rig())

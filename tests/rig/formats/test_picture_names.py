@@ -109,7 +109,7 @@ def test_what_file_managers_add_is_junk() -> None:
 @given(st.lists(st.text(max_size=12), max_size=8), st.lists(st.text(min_size=1, max_size=6), max_size=6, unique=True))
 def test_no_file_is_given_twice_and_none_to_a_camera_that_has_one(names: list[str], cameras: list[str]) -> None:
     found = match_names(names, cameras)
-    given_away = [name for own in found.values() for name in own]
+    given_away = [name for files in found.values() for name in files]
     assert len(given_away) == len(set(given_away)) == len(found)
     assert set(given_away) <= set(names)
     assert not set(found) & {picture_stem(name) for name in names}

@@ -63,7 +63,7 @@ def test_every_fault_of_a_file_is_named(tmp_path: Path) -> None:
     broken = "v 0 0 nan\nv 1 0\nv a b c\nv 0 1 0\nvt inf 0\nf 1 2\nf 1 2 0\nf 1 2 99\nf 1/5 2/1 3/1\nf x y z\n"
     with pytest.raises(InputError) as refused:
         read(tmp_path, broken)
-    told = str(refused.value)
+    message = str(refused.value)
     for word in (
         "line 1:",
         "line 2:",
@@ -75,7 +75,7 @@ def test_every_fault_of_a_file_is_named(tmp_path: Path) -> None:
         "vertex 99",
         "texture 5",
     ):
-        assert word in told, word
+        assert word in message, word
     for text, word in (("", "no vertices"), ("v 0 0 0\n", "no faces"), ("f 1/1 2/1 3/1\nv 0 0 0\n", "are none")):
         with pytest.raises(InputError, match=word):
             read(tmp_path, text)

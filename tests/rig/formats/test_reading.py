@@ -27,11 +27,13 @@ def test_faults_that_differ_in_more_than_names_are_all_said() -> None:
 
 def test_many_files_with_one_fault_are_one_sentence() -> None:
     names = [f"cam{i:02}" for i in range(11)]
-    (told,) = texts_of(say_once([f"images/{name}.png is missing" for name in names], names))
-    assert told == ("images/cam00.png is missing; the same is true of 10 more (cam01, cam02, cam03, cam04 and 6 more)")
+    (sentence,) = texts_of(say_once([f"images/{name}.png is missing" for name in names], names))
+    assert sentence == (
+        "images/cam00.png is missing; the same is true of 10 more (cam01, cam02, cam03, cam04 and 6 more)"
+    )
     plates = [f"background/{name}/{i:03}.png is 3 x 4 pixels" for name in names for i in range(2)]
-    (told,) = texts_of(say_once(plates, names))
-    assert "the same is true of 21 more (" in told
+    (sentence,) = texts_of(say_once(plates, names))
+    assert "the same is true of 21 more (" in sentence
     assert say_once(["cam1 is a", "cam11 is a", "cam111 is a"], ["cam1", "cam11"])[0].text.startswith("cam1 is a")
 
 

@@ -236,8 +236,8 @@ def test_colmap_models_that_are_not_read_are_told(folder: Path) -> None:
     write_rig_file(rig_of(), folder / "sparse/0", "colmap")
     write_rig_file(rig_of(), folder / "sparse/0", "colmap-text")
     write_rig_file(rig_of(3), folder / "sparse/1", "colmap-text")
-    told = [remark.text for remark in read_capture(folder)[0].remarks]
-    assert told == [
+    remarks = [remark.text for remark in read_capture(folder)[0].remarks]
+    assert remarks == [
         "sparse/0/cameras.txt is not read: the cameras come from sparse/0/cameras.bin",
         "sparse/1/cameras.txt is not read: the cameras come from sparse/0/cameras.bin",
     ]

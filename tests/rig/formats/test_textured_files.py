@@ -46,12 +46,12 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     visual: Any = loaded.visual
     np.testing.assert_allclose(loaded.vertices * 1000, MESH.vertices, atol=1e-4)
     np.testing.assert_allclose(visual.uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
-    told = document(data)
-    assert told["asset"]["extras"] == extras
-    assert told["images"][0]["mimeType"] == mime
-    assert ("EXT_texture_webp" in told.get("extensionsRequired", [])) == (suffix == ".webp")
-    assert "COLOR_0" not in told["meshes"][0]["primitives"][0]["attributes"]
-    assert 0 < told["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] < 1
+    header = document(data)
+    assert header["asset"]["extras"] == extras
+    assert header["images"][0]["mimeType"] == mime
+    assert ("EXT_texture_webp" in header.get("extensionsRequired", [])) == (suffix == ".webp")
+    assert "COLOR_0" not in header["meshes"][0]["primitives"][0]["attributes"]
+    assert 0 < header["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] < 1
 
 
 def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
@@ -70,8 +70,12 @@ def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
 
 def test_trimesh_reads_texture_coordinates_of_a_ply_and_we_its_mesh(tmp_path: Path) -> None:
     count = len(MESH.vertices)
-    given = {"colours": np.zeros((count, 3), np.uint8), "quality": np.ones(count), "views": np.ones(count, np.uint8)}
-    data = ply_bytes(MESH, normals=NORMALS, corner_uv=UV[MESH.faces], comments=["TextureFile head.png"], **given)
+    attributes = {
+        "colours": np.zeros((count, 3), np.uint8),
+        "quality": np.ones(count),
+        "views": np.ones(count, np.uint8),
+    }
+    data = ply_bytes(MESH, normals=NORMALS, corner_uv=UV[MESH.faces], comments=["TextureFile head.png"], **attributes)
     (tmp_path / "head.ply").write_bytes(data)
     (tmp_path / "head.png").write_bytes(image(".png"))
     loaded = trimesh.load(tmp_path / "head.ply", force="mesh", process=False)
@@ -106,9 +110,9 @@ def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
     UsdGeom: Any = pytest.importorskip("pxr.UsdGeom")
     UsdShade: Any = pytest.importorskip("pxr.UsdShade")
 
-    given = {"normals": NORMALS, "uv": UV, "faces_uv": MESH.faces, "image": image(".jpg"), "suffix": ".jpg"}
-    data = usdz_bytes(MESH, **given)
-    assert data == usdz_bytes(MESH, **given)
+    parts = {"normals": NORMALS, "uv": UV, "faces_uv": MESH.faces, "image": image(".jpg"), "suffix": ".jpg"}
+    data = usdz_bytes(MESH, **parts)
+    assert data == usdz_bytes(MESH, **parts)
     path = tmp_path / "head.usdz"
     path.write_bytes(data)
     with zipfile.ZipFile(path) as archive:

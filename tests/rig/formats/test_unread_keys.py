@@ -27,23 +27,23 @@ def test_a_key_that_is_not_read_is_named_with_its_place(place: tuple[str, ...], 
     for part in place:
         entry = entry[part][3] if part == "cameras" else entry[part]
     entry[key] = 1.0
-    (told,) = unread_keys_of(document)
-    assert f"the key {'.'.join((*place, key))!r} is not read" in told.text
+    (remark,) = unread_keys_of(document)
+    assert f"the key {'.'.join((*place, key))!r} is not read" in remark.text
 
 
 def test_what_all_cameras_have_alike_is_said_once() -> None:
     document = json.loads(json.dumps(document_from_rig(default_layout())))
     for camera in document["cameras"]:
         camera["owner"] = "x"
-    (told,) = unread_keys_of(document)
-    assert f"'cameras.owner' of {len(document['cameras'])} cameras" in told.text
+    (remark,) = unread_keys_of(document)
+    assert f"'cameras.owner' of {len(document['cameras'])} cameras" in remark.text
 
 
 @pytest.mark.parametrize("key", ["\ud800", "\x1b[31m", "\a", "a" * 1000])
 def test_a_key_of_any_signs_can_be_printed(key: str) -> None:
-    (told,) = unread_keys_of({"format": FORMAT, key: 1})
-    assert told.text.isprintable()
-    assert len(told.text.encode()) < 200
+    (remark,) = unread_keys_of({"format": FORMAT, key: 1})
+    assert remark.text.isprintable()
+    assert len(remark.text.encode()) < 200
 
 
 def test_a_thousand_keys_are_a_few_lines() -> None:

@@ -59,14 +59,14 @@ RAW = {
 def test_every_code_is_composed_with_its_parameters() -> None:
     wrong = []
     for path, tree in modules().items():
-        for line, codes, given in composed(tree):
+        for line, codes, parameters in composed(tree):
             known = codes & CATALOGUE.keys()
-            if not known or (given is not None and codes != known):
+            if not known or (parameters is not None and codes != known):
                 wrong.append(f"{path.relative_to(ROOT)}:{line}: {sorted(codes)} are not in the catalogue")
             wrong += [
                 f"{path.relative_to(ROOT)}:{line}: {code} has {sorted(fields_of(CATALOGUE[code]))}"
                 for code in known
-                if given is not None and given != fields_of(CATALOGUE[code]).keys()
+                if parameters is not None and parameters != fields_of(CATALOGUE[code]).keys()
             ]
     assert wrong == []
 

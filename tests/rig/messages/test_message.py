@@ -60,8 +60,8 @@ def test_an_unknown_code_is_no_message() -> None:
 
 
 def test_numbers_of_numpy_become_plain_and_infinite_ones_words() -> None:
-    told = compose("camera-gain", camera="cam00", factor=np.float32(0.5))
-    assert type(told.parameters["factor"]) is float
+    message = compose("camera-gain", camera="cam00", factor=np.float32(0.5))
+    assert type(message.parameters["factor"]) is float
     endless = compose("camera-gain", camera="cam00", factor=np.inf)
     assert endless.document()["parameters"] == {"camera": "cam00", "factor": "inf"}  # pyright: ignore
     assert through_json(endless).text == "cam00 is inf times as bright as the others: check its exposure"
@@ -73,16 +73,16 @@ def test_what_is_no_text_is_escaped() -> None:
     assert (document["message"], document["parameters"]) == ("key \\ud800", {"text": "key \\ud800"})  # pyright: ignore
 
 
-@pytest.mark.parametrize("told", ["the view is left out", {"code": "view", "message": "the view is left out"}])
-def test_messages_of_earlier_versions_have_their_text(told: object) -> None:
-    assert read_message(told).text == "the view is left out"
-    assert read_message(told).code in ("view", "verbatim")
+@pytest.mark.parametrize("stored", ["the view is left out", {"code": "view", "message": "the view is left out"}])
+def test_messages_of_earlier_versions_have_their_text(stored: object) -> None:
+    assert read_message(stored).text == "the view is left out"
+    assert read_message(stored).code in ("view", "verbatim")
 
 
-@pytest.mark.parametrize("told", [None, 3, {"code": "view"}, {"message": "text"}, ["text"]])
-def test_what_is_no_message_is_refused(told: object) -> None:
+@pytest.mark.parametrize("stored", [None, 3, {"code": "view"}, {"message": "text"}, ["text"]])
+def test_what_is_no_message_is_refused(stored: object) -> None:
     with pytest.raises(ValueError, match="no message"):
-        read_message(told)
+        read_message(stored)
 
 
 def test_an_error_carries_its_message() -> None:

@@ -19,10 +19,10 @@ def test_photographs_become_cameras_and_a_page(tmp_path: Path) -> None:
     out = tmp_path / "new" / "cameras.json"
     done = run("calibrate", str(photos), "--from", "scene", "--out", str(out), "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert set(told["figures"]["cameras"]) == {"cam00", "cam01", "cam02"}
-    assert {"rms_px", "used_share"} <= set(told["figures"])
-    assert told["scale"]["assumed"]
+    printed = json.loads(done.stdout)
+    assert set(printed["figures"]["cameras"]) == {"cam00", "cam01", "cam02"}
+    assert {"rms_px", "used_share"} <= set(printed["figures"])
+    assert printed["scale"]["assumed"]
     assert "ASSUMPTION" in done.stderr
     assert all(camera.covariance is not None for camera in read_rig(out))
     assert "3 of 3 views joined" in out.with_suffix(".html").read_text()
@@ -41,7 +41,7 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "text"),
     [
         ((), "--board"),
         (("--from", "sky"), "'sky' is none of board, scene"),
@@ -50,16 +50,16 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
         (("--scale", "{file}"), "is for --from scene"),
     ],
 )
-def test_options_that_do_not_go_together_are_wrong_usage(tmp_path: Path, options: tuple[str, ...], told: str) -> None:
+def test_options_that_do_not_go_together_are_wrong_usage(tmp_path: Path, options: tuple[str, ...], text: str) -> None:
     (tmp_path / "file").write_text("")
-    given = [option.format(file=tmp_path / "file") for option in options]
-    done = run("calibrate", str(tmp_path), "--out", str(tmp_path / "cameras.json"), *given)
+    arguments = [option.format(file=tmp_path / "file") for option in options]
+    done = run("calibrate", str(tmp_path), "--out", str(tmp_path / "cameras.json"), *arguments)
     assert done.returncode == 2
-    assert told in done.stderr
+    assert text in done.stderr
 
 
 @pytest.mark.parametrize(
-    ("kind", "out", "told"),
+    ("kind", "out", "text"),
     [
         ("eigenhead", "file/cameras.json", "cannot be written"),
         ("eigenhead", "folder", "it is a folder"),
@@ -67,7 +67,7 @@ def test_options_that_do_not_go_together_are_wrong_usage(tmp_path: Path, options
         ("colmap", "file/sparse", "cannot be written"),
     ],
 )
-def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: str, out: str, told: str) -> None:
+def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: str, out: str, text: str) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     write_rig(wedge_rig(), tmp_path / "cameras.json")
@@ -76,7 +76,7 @@ def test_a_place_where_no_cameras_can_be_written_is_named(tmp_path: Path, kind: 
     )
     assert isinstance(done.exception, CannotWrite)
     assert str(done.exception).startswith(f"{tmp_path / out} ")
-    assert told in str(done.exception)
+    assert text in str(done.exception)
 
 
 def test_cameras_that_take_no_part_are_told_where_a_file_is_converted(tmp_path: Path) -> None:

@@ -47,10 +47,10 @@ def test_every_fault_is_told_at_once_and_is_status_2(tmp_path: Path) -> None:
     for capture in (folder, tmp_path / "capture.tar"):
         done = run("check", str(capture), "--json")
         assert (done.returncode, done.stderr) == (2, "")
-        told = json.loads(done.stdout)
+        printed = json.loads(done.stdout)
         for word in ("at one place", "'third_eye'", "images/cam01.png is missing", "images/foo.png has no camera"):
-            assert len([fault for fault in told["faults"] if word in fault]) == 1
-        assert told["warnings"] == []  # of the picture that may be the missing one nothing is said twice
+            assert len([fault for fault in printed["faults"] if word in fault]) == 1
+        assert printed["warnings"] == []  # of the picture that may be the missing one nothing is said twice
     done = run("check", str(folder))
     assert done.returncode == 2
     assert "cannot be reconstructed" in done.stdout.splitlines()[0]
@@ -61,9 +61,9 @@ def test_a_good_capture_is_nothing_to_speak_of(masked: tuple[Capture, Rig], tmp_
     write_capture(tmp_path / "good", *masked)
     done = run("check", str(tmp_path / "good"), "--json")
     assert done.returncode == 0
-    told = json.loads(done.stdout)
-    assert (told["faults"], told["warnings"]) == ([], [])
-    assert told["cameras"] == list(masked[1].names)
+    printed = json.loads(done.stdout)
+    assert (printed["faults"], printed["warnings"]) == ([], [])
+    assert printed["cameras"] == list(masked[1].names)
 
 
 @pytest.mark.gl
@@ -102,10 +102,10 @@ def test_unread_cameras_are_warnings_and_a_scale_is_read(masked: tuple[Capture, 
     (folder / "images" / "cam00.xmp").write_text(
         '<x:xmpmeta xmlns:x="adobe:ns:meta/"></x:xmpmeta>'
     )  # a raw developer's
-    told = [(w["code"], w["message"].split(":")[0]) for w in found_in(folder)["warnings"]]
+    warnings = [(w["code"], w["message"].split(":")[0]) for w in found_in(folder)["warnings"]]
     names = ("sparse/0/cameras.bin", "transforms.json")
     unread = [("file-unread", f"{name} is not read") for name in names]
-    assert sorted(told) == sorted([*unread, ("cameras-scaled", "the cameras were scaled by 0.94")])
+    assert sorted(warnings) == sorted([*unread, ("cameras-scaled", "the cameras were scaled by 0.94")])
     (folder / "calibration.json").write_text("{}")  # which says that the scale was read, and found these cameras
     assert len(found_in(folder)["warnings"]) == 2
 

@@ -27,16 +27,16 @@ class Broken(httpx.SyncByteStream):
 
 
 def test_events_go_on_across_broken_connections_and_busy_answers() -> None:
-    asked: list[str] = []
+    requested: list[str] = []
 
     def answer(request: httpx.Request) -> httpx.Response:
-        asked.append(request.headers["last-event-id"])
+        requested.append(request.headers["last-event-id"])
         replies = [httpx.Response(200, stream=Broken()), httpx.Response(503), httpx.Response(200, content=END)]
-        return replies[len(asked) - 1]
+        return replies[len(requested) - 1]
 
     with client_of(answer) as client:
         assert [kind for kind, _ in client.events("job")] == ["progress", "end"]
-    assert asked == ["0", "1", "1"]
+    assert requested == ["0", "1", "1"]
 
 
 @pytest.mark.parametrize("reply", [httpx.Response(503), httpx.ConnectError("nobody there")])

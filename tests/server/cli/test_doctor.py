@@ -19,7 +19,7 @@ def examine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict]:
     """Without the two checks that load what is heavy."""
     for name in ("_egl", "_model"):
         monkeypatch.setattr(doctor, name, lambda settings: (True, "not looked at"))
-    return lambda **given: doctor.examine(ServiceSettings(**given))
+    return lambda **overrides: doctor.examine(ServiceSettings(**overrides))
 
 
 def test_it_makes_nothing(examine: Callable[..., dict], tmp_path: Path) -> None:

@@ -43,8 +43,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
             main()
         except SystemExit as end:
             status = int(end.code or 0)
-        told = capsys.readouterr()
-        return Done(status, told.out, told.err)
+        captured = capsys.readouterr()
+        return Done(status, captured.out, captured.err)
 
     return call
 
@@ -99,8 +99,8 @@ def test_no_summary_of_a_command_is_cut_off(run: Run, group: list[str]) -> None:
 
 
 def test_help_names_every_fault(run: Run) -> None:
-    told = " ".join(run("simulate", "--help").out.split())
-    assert all(kind in told.replace("- ", "-") for kind in KINDS)
+    text = " ".join(run("simulate", "--help").out.split())
+    assert all(kind in text.replace("- ", "-") for kind in KINDS)
 
 
 def test_it_names_its_version(run: Run) -> None:
@@ -126,9 +126,9 @@ def test_a_shell_completes_commands_options_and_what_they_may_be(line: str, offe
 
 
 def test_what_a_model_is_made_of_is_told_in_words(run: Run) -> None:
-    told = run("model", "info").out
-    assert not any(sign in told for sign in "{}[]'\"")
-    assert "female: 41; male: 97; total: 138" in told
+    text = run("model", "info").out
+    assert not any(sign in text for sign in "{}[]'\"")
+    assert "female: 41; male: 97; total: 138" in text
 
 
 def test_serve_says_in_one_line_that_its_rig_file_is_missing(run: Run, tmp_path: Path) -> None:

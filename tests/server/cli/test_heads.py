@@ -22,7 +22,7 @@ def test_warnings_of_a_result_reach_the_terminal_and_the_status_stays_0(
         {"code": "scale-implausible", "message": "too large"},
     ]
 
-    def reconstructed(*given: Any, **named: Any) -> dict[str, Any]:
+    def reconstructed(*positional: Any, **named: Any) -> dict[str, Any]:
         return {"warnings": warnings}
 
     monkeypatch.setattr(reconstruct_local, "reconstruct_locally", reconstructed)
@@ -38,20 +38,20 @@ def test_warnings_of_a_result_reach_the_terminal_and_the_status_stays_0(
 def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_settings(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    asked: list[Any] = []
+    requested: list[Any] = []
 
-    def reconstructed(*given: Any, settings: dict[str, Any], **named: Any) -> dict[str, Any]:
-        asked.append(settings["outputs"])
+    def reconstructed(*positional: Any, settings: dict[str, Any], **named: Any) -> dict[str, Any]:
+        requested.append(settings["outputs"])
         return {"warnings": []}
 
     monkeypatch.setattr(reconstruct_local, "reconstruct_locally", reconstructed)
     arguments = ["reconstruct", str(small_capture(tmp_path / "capture")), "--out", str(tmp_path / "out")]
     wrong = CliRunner().invoke(app, [*arguments, "--formats", "glb,fbx"])
-    assert (wrong.exit_code, asked) == (2, [])
+    assert (wrong.exit_code, requested) == (2, [])
     assert "'fbx' is none of glb, ply, obj, usdz, stl, 3mf" in " ".join(wrong.stderr.replace("│", " ").split())
     assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
     assert CliRunner().invoke(app, [*arguments, "--delight"]).exit_code == 0
-    assert asked == [{"formats": ["glb", "usdz"]}, {"delight": True}]
+    assert requested == [{"formats": ["glb", "usdz"]}, {"delight": True}]
 
 
 @pytest.mark.parametrize("option", ["--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps"])
@@ -65,8 +65,8 @@ def test_what_is_no_finite_number_is_wrong_usage(option: str, value: str, tmp_pa
 def test_a_realism_that_nobody_knows_is_wrong_usage_and_the_known_ones_are_named(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["simulate", str(tmp_path / "shot"), "--realism", "oily,shiny"])
     assert done.exit_code == 2
-    told = " ".join(done.stderr.replace("│", " ").split())
-    assert "shiny is none of smooth, oily, scattering, mosaic, jpeg" in told
+    text = " ".join(done.stderr.replace("│", " ").split())
+    assert "shiny is none of smooth, oily, scattering, mosaic, jpeg" in text
 
 
 @pytest.mark.parametrize("enclosed", [False, True])

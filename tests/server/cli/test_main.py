@@ -96,7 +96,7 @@ def test_a_data_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("name", "value", "text"),
     [
         ("CORS_ORIGINS", "abc", "is no JSON"),
         ("PORT", "abc", "valid integer"),
@@ -106,13 +106,13 @@ def test_a_data_folder_that_cannot_be_made_is_one_clear_line(tmp_path: Path) -> 
     ],
 )
 def test_a_wrong_variable_is_wrong_usage_and_is_named(
-    name: str, value: str, told: str, monkeypatch: pytest.MonkeyPatch
+    name: str, value: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(f"EIGENHEAD_{name}", value)
     with pytest.raises(typer.BadParameter) as refused:
         service_settings()
     assert refused.value.message.startswith(f"EIGENHEAD_{name}")
-    assert told in refused.value.message
+    assert text in refused.value.message
 
 
 def test_keys_on_the_command_line(tmp_path: Path) -> None:

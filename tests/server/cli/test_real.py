@@ -30,11 +30,15 @@ def test_outlines_and_masks_of_a_folder_judge_it(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "anna")
     write_image(folder / "masks" / "cam00.png", np.pad(np.full((12, 12), 255, np.uint8), 6))
     outlines(folder / "outlines.json", "cam01", "cam07")
-    given = read_real_capture(folder, tmp_path / "kept", "cam02", None, quiet)
-    assert (given.name, given.front, given.rig.names) == ("anna", "cam02", read_rig(folder / "cameras.json").names)
-    assert set(given.drawn) == {"cam00", "cam01"}
-    assert given.drawn["cam00"].sum() == 144
-    assert given.drawn["cam01"].sum() == pytest.approx(81, abs=2)
+    capture = read_real_capture(folder, tmp_path / "kept", "cam02", None, quiet)
+    assert (capture.name, capture.front, capture.rig.names) == (
+        "anna",
+        "cam02",
+        read_rig(folder / "cameras.json").names,
+    )
+    assert set(capture.drawn) == {"cam00", "cam01"}
+    assert capture.drawn["cam00"].sum() == 144
+    assert capture.drawn["cam01"].sum() == pytest.approx(81, abs=2)
     other = read_real_capture(folder, tmp_path / "kept", None, outlines(tmp_path / "other.json", "cam02"), quiet)
     assert set(other.drawn) == {"cam00", "cam02"}
     assert not (tmp_path / "kept").exists(), "the cameras were given"

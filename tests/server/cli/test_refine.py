@@ -41,9 +41,9 @@ def test_cameras_come_back_and_the_page_says_so(renderer, tmp_path: Path) -> Non
     out = tmp_path / "refined.json"
     done = run("refine", *map(str, folders), "--out", str(out), "--json")
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["kept"]
-    assert told["held_out"]["after_px"] < 0.7 * told["held_out"]["before_px"]
+    printed = json.loads(done.stdout)
+    assert printed["kept"]
+    assert printed["held_out"]["after_px"] < 0.7 * printed["held_out"]["before_px"]
     refined = read_rig(out)
     assert rms(image_distance(refined, TRUE)) < 0.5 * rms(image_distance(off, TRUE))
     assert all(camera.covariance is not None for camera in refined)

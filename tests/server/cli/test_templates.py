@@ -21,23 +21,23 @@ from tests.support.template_headers import header_file
 
 
 def command(*words: str, data: Path) -> subprocess.CompletedProcess[str]:
-    given = [sys.executable, "-m", "server.cli", *words]
+    arguments = [sys.executable, "-m", "server.cli", *words]
     environment = {**os.environ, "EIGENHEAD_DATA": str(data)}
-    return subprocess.run(given, capture_output=True, text=True, timeout=600, env=environment)
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=600, env=environment)
 
 
 def test_wrong_files_and_names_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     bad = tmp_path / "bad.obj"
     bad.write_text("v 0 0 nan\n")
     here = ["--data", str(tmp_path / "data")]
-    for words, kind, told in (
+    for words, kind, text in (
         (["template", "add", str(bad)], InputError, "holds no faces"),
         (["template", "add", str(bad), "--name", "../x"], EigenheadError, "cannot be a template's name"),
         (["template", "remove", "nobody"], EigenheadError, "known are none"),
     ):
         done = CliRunner().invoke(app, [*words, *here])
         assert isinstance(done.exception, kind)
-        assert told in str(done.exception)
+        assert text in str(done.exception)
     assert not list((tmp_path / "data").rglob("*.npz"))
     assert json.loads(CliRunner().invoke(app, ["template", "list", "--json", *here]).stdout) == {"templates": {}}
 
@@ -47,11 +47,11 @@ def test_a_template_that_the_job_cannot_have_is_told_before_the_work(tmp_path: P
     data, capture = tmp_path / "data", tmp_path / "capture"
     capture.mkdir()
     header_file(data, "foreign", model_name="other", model_sha256="ee" * 32)
-    given = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), "--data", str(data), "--template"]
-    for name, told in (("nobody", "known are foreign"), ("foreign", "registered to the model 'other'")):
-        done = CliRunner().invoke(app, [*given, name])
+    arguments = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), "--data", str(data), "--template"]
+    for name, text in (("nobody", "known are foreign"), ("foreign", "registered to the model 'other'")):
+        done = CliRunner().invoke(app, [*arguments, name])
         assert isinstance(done.exception, EigenheadError)
-        assert told in str(done.exception)
+        assert text in str(done.exception)
     assert not list((tmp_path / "out").glob("*"))
     listed = json.loads(CliRunner().invoke(app, ["template", "list", "--json", "--data", str(data)]).stdout)
     assert listed["templates"]["foreign"]["skin_share"] == 0.78
@@ -68,18 +68,18 @@ def test_a_head_is_written_in_a_templates_order(tmp_path: Path) -> None:
     (tmp_path / "low.obj").write_text("\n".join(lines))
     added = command("template", "add", str(tmp_path / "low.obj"), "--json", data=data)
     assert added.returncode == 0, added.stderr
-    told = json.loads(added.stdout)
-    assert told["figures"]["skin_share"] > 0.9
+    printed = json.loads(added.stdout)
+    assert printed["figures"]["skin_share"] > 0.9
     assert {path.name for path in (data / "templates").iterdir()} == {"low.npz", "low.png"}
     again = command("template", "add", str(tmp_path / "low.obj"), data=data)
     assert (again.returncode, "--overwrite" in again.stderr) == (1, True)
-    given = ["reconstruct", str(shared("data/captures/scan-a")), "--detail", "span", "--surface", "head"]
-    done = command(*given, "--template", "low", "--formats", "ply", "--out", str(tmp_path / "out"), data=data)
+    arguments = ["reconstruct", str(shared("data/captures/scan-a")), "--detail", "span", "--surface", "head"]
+    done = command(*arguments, "--template", "low", "--formats", "ply", "--out", str(tmp_path / "out"), data=data)
     assert done.returncode == 0, done.stderr
     head = read_head_ply(tmp_path / "out" / "head.ply")[0].vertices[level.rows[order]]
     named = json.loads((tmp_path / "out" / "report.json").read_text())["template"]
     assert (named["name"], named["source"]) == ("low", "low.obj")
     assert named["sha256"] == hashlib.sha256((tmp_path / "low.obj").read_bytes()).hexdigest()
-    assert named["registration"] == pytest.approx(told["figures"])
+    assert named["registration"] == pytest.approx(printed["figures"])
     written = read_polygons(tmp_path / "out" / "head-low.obj")
     assert np.median(np.linalg.norm(written.vertices - head, axis=1)) < 0.15  # chords of 9 mm sag by 0.1 mm

@@ -56,7 +56,7 @@ def test_what_another_page_sent_is_foreign(host: str, origin: str | None, foreig
 
 
 @pytest.mark.parametrize(
-    ("asked", "listens", "rebound"),
+    ("host", "listens", "rebound"),
     [
         ("127.0.0.1:8600", "127.0.0.1", False),
         ("localhost:8600", "127.0.0.1", False),
@@ -67,15 +67,15 @@ def test_what_another_page_sent_is_foreign(host: str, origin: str | None, foreig
         ("studio.example", "0.0.0.0", False),  # it has keys
     ],
 )
-def test_a_service_of_this_machine_answers_to_its_own_names(asked: str, listens: str, rebound: bool) -> None:
-    assert is_rebound(scope(asked), ServiceSettings(host=listens)) is rebound
+def test_a_service_of_this_machine_answers_to_its_own_names(host: str, listens: str, rebound: bool) -> None:
+    assert is_rebound(scope(host), ServiceSettings(host=listens)) is rebound
 
 
 def test_behind_a_proxy_the_public_address_is_our_own() -> None:
     settings = ServiceSettings(public_url="https://heads.example:8443")
-    asked = scope("heads.example:8443", "https://heads.example:8443")
-    assert not is_rebound(asked, settings)
-    assert not is_foreign(asked, settings)
+    request = scope("heads.example:8443", "https://heads.example:8443")
+    assert not is_rebound(request, settings)
+    assert not is_foreign(request, settings)
     assert not is_foreign(scope("127.0.0.1:8600", "https://heads.example:8443"), settings)  # the proxy names itself
     assert is_rebound(scope("evil.example"), settings)
     assert is_foreign(scope("heads.example:8443", "https://evil.example"), settings)
@@ -221,15 +221,15 @@ def test_three_picked_points_place_the_models_landmarks() -> None:
     place = RigidTransform(rotation_from_vector(np.array([0.1, -0.2, 0.05])), np.array([8.0, -5.0, 12.0]))
     world = {name: place.apply(point[None])[0] for name, point in head.items()}
     picked = {n: {c.name: c.project(world[n][None])[0] for c in RIG if c.name != "right"} for n in "abd"}
-    told = guides.helps(RIG, picked, head)
+    result = guides.helps(RIG, picked, head)
     for name in "abcdefg":
         for c in RIG:
-            np.testing.assert_allclose(told["predicted"][name][c.name], c.project(world[name][None])[0], atol=0.02)
+            np.testing.assert_allclose(result["predicted"][name][c.name], c.project(world[name][None])[0], atol=0.02)
     for name in picked:
         np.testing.assert_allclose(
-            told["reprojected"][name]["right"], RIG["right"].project(world[name][None])[0], atol=0.02
+            result["reprojected"][name]["right"], RIG["right"].project(world[name][None])[0], atol=0.02
         )
-        assert max(told["off_px"][name].values()) < 0.01
+        assert max(result["off_px"][name].values()) < 0.01
     assert guides.helps(RIG, {"a": picked["a"]}, head)["predicted"] == {}
     assert guides.nearest_views(RIG, "front", 2) == ["front", "right"]
 
@@ -283,8 +283,8 @@ def test_a_look_on_the_wire_holds_every_picture() -> None:
     ]
     message = look_bytes(frames, None)
     header, body = struct.unpack(">II", message[:8])
-    told = json.loads(message[8 : 8 + header])
-    assert [(c["name"], c["bytes"]) for c in told["cameras"]] == [("a", 3), ("b", 0)]
+    document = json.loads(message[8 : 8 + header])
+    assert [(c["name"], c["bytes"]) for c in document["cameras"]] == [("a", 3), ("b", 0)]
     assert message[8 + header :] == b"abc"
     assert body == 3
 

@@ -30,9 +30,9 @@ def picked(rig: Rig) -> dict[str, dict[str, np.ndarray]]:
 
 
 def test_a_click_costs_one_point_however_many_there_are(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    points, own = picked(rig), guides.Guides(rig)
+    points, fresh = picked(rig), guides.Guides(rig)
     assert (len(points), len(rig.names)) == (26, 11)
-    own.helps(points, {}, ["pronasale"])
+    fresh.helps(points, {}, ["pronasale"])
     located: list[str] = []
     locate = guides.locate
     monkeypatch.setattr(guides, "locate", lambda rig, name, views: (located.append(name), locate(rig, name, views))[1])
@@ -41,29 +41,29 @@ def test_a_click_costs_one_point_however_many_there_are(rig: Rig, monkeypatch: p
     for shift in (0.5, 0.7, 0.9):
         changed["pronasale"] = points["pronasale"] | {"cam03": points["pronasale"]["cam03"] + shift}
         began = time.process_time()
-        told = own.helps(changed, {}, ["pronasale"])
+        result = fresh.helps(changed, {}, ["pronasale"])
         took.append(time.process_time() - began)
     assert located == ["pronasale"] * 3
     assert min(took) < CLICK_MOST_S
-    assert told["guides"].keys() == {"pronasale"}
+    assert result["guides"].keys() == {"pronasale"}
     whole = guides.helps(rig, changed, {})
-    assert told["off_px"] == whole["off_px"]
-    assert told["reprojected"] == whole["reprojected"]
-    assert told["guides"]["pronasale"] == whole["guides"]["pronasale"]
+    assert result["off_px"] == whole["off_px"]
+    assert result["reprojected"] == whole["reprojected"]
+    assert result["guides"]["pronasale"] == whole["guides"]["pronasale"]
 
 
 def test_a_pick_that_contradicts_the_others_is_named_as_a_job_would(rig: Rig) -> None:
     points = {name: views for name, views in picked(rig).items() if name in ("nasion", "pronasale", "stomion")}
-    own = guides.Guides(rig)
-    assert own.helps(points, {}, [])["contradictions"] == {}
+    kept_guides = guides.Guides(rig)
+    assert kept_guides.helps(points, {}, [])["contradictions"] == {}
     wrong = points | {
         "nasion": points["nasion"] | {"cam04": points["nasion"]["cam04"] + [60.0, -40.0]},
         "stomion": {"cam00": points["stomion"]["cam00"], "cam05": points["stomion"]["cam05"] + [0.0, 90.0]},
     }
-    told = own.helps(wrong, {}, [])["contradictions"]
-    assert told["nasion"] == compose("feature-view-contradicts", name="nasion", camera="cam04").document()
-    assert told["stomion"] == compose("feature-contradictory", name="stomion").document()
-    assert sorted(one["message"] for one in told.values()) == sorted(
+    contradictions = kept_guides.helps(wrong, {}, [])["contradictions"]
+    assert contradictions["nasion"] == compose("feature-view-contradicts", name="nasion", camera="cam04").document()
+    assert contradictions["stomion"] == compose("feature-contradictory", name="stomion").document()
+    assert sorted(one["message"] for one in contradictions.values()) == sorted(
         texts_of(locate_features(wrong, rig, noise_px=CLICK_NOISE_PX).remarks)
     )
-    assert own.helps(points, {}, [])["contradictions"] == {}  # put right again
+    assert kept_guides.helps(points, {}, [])["contradictions"] == {}  # put right again

@@ -21,15 +21,15 @@ MARKS = {"en": [".", ","], "de": [",", "."]}
 
 def shown(messages: list[object], templates: Mapping[str, str], language: str = "de") -> list[str]:
     """As the console shows them."""
-    given = {"told": messages, "templates": dict(templates), "words": german(), "marks": MARKS[language]}
-    given["words"] = german() if language == "de" else {}
+    argument = {"told": messages, "templates": dict(templates), "words": german(), "marks": MARKS[language]}
+    argument["words"] = german() if language == "de" else {}
     return evaluate(
-        SCRIPT, "given.told.map((told) => m.sentence(told, given.templates, given.words, given.marks))", given
+        SCRIPT, "given.told.map((told) => m.sentence(told, given.templates, given.words, given.marks))", argument
     )
 
 
 def in_german(*messages: Message) -> list[str]:
-    return shown([told.document() for told in messages], GERMAN)
+    return shown([message.document() for message in messages], GERMAN)
 
 
 def sample(code: str) -> Message:
@@ -58,12 +58,12 @@ def test_german_has_the_same_parameters(code: str) -> None:
 def test_the_console_fills_templates_in_as_the_service_does() -> None:
     """Its English, of the same templates, is the service's own text."""
     samples = [sample(code) for code in CATALOGUE]
-    told = shown([one.document() for one in samples], CATALOGUE, "en")
-    assert dict(zip(CATALOGUE, told, strict=True)) == {one.code: one.text for one in samples}
+    sentences = shown([one.document() for one in samples], CATALOGUE, "en")
+    assert dict(zip(CATALOGUE, sentences, strict=True)) == {one.code: one.text for one in samples}
 
 
 @pytest.mark.parametrize(
-    ("told", "text"),
+    ("message", "text"),
     [
         (compose("disk-free", free_gb=12.34, spare_gb=2), "12,3 GB frei; Hochladen und Aufträge lassen 2,0 GB übrig"),
         (compose("upload-too-large", bytes=1234567), "Hochgeladen werden dürfen 1.234.567 Bytes."),
@@ -81,8 +81,8 @@ def test_the_console_fills_templates_in_as_the_service_does() -> None:
         (verbatim("nobody translates what a camera's maker says"), "nobody translates what a camera's maker says"),
     ],
 )  # fmt: skip
-def test_german_by_code_and_parameters(told: Message, text: str) -> None:
-    assert in_german(told) == [text]
+def test_german_by_code_and_parameters(message: Message, text: str) -> None:
+    assert in_german(message) == [text]
 
 
 def test_new_english_of_every_code_changes_no_german(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,7 +90,7 @@ def test_new_english_of_every_code_changes_no_german(monkeypatch: pytest.MonkeyP
     reworded = {code: FORMS.join(f"Anew: {form}" for form in CATALOGUE[code].split(FORMS)) for code in CATALOGUE}
     monkeypatch.setattr(message, "CATALOGUE", reworded)
     after = [sample(code) for code in CATALOGUE]
-    assert all(told.text.startswith("Anew: ") for told in after)
+    assert all(changed.text.startswith("Anew: ") for changed in after)
     assert in_german(*after) == before
 
 
@@ -105,7 +105,7 @@ def test_a_change_of_the_english_changes_no_german(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    "told",
+    "message",
     [
         "a text of an earlier version",
         {"code": "view", "message": "cam03: a warning of an earlier version"},
@@ -113,5 +113,5 @@ def test_a_change_of_the_english_changes_no_german(monkeypatch: pytest.MonkeyPat
         {"code": "camera-gain", "message": "of another version", "parameters": {"camera": "cam00"}},
     ],
 )
-def test_what_is_not_known_is_shown_as_it_came(told: Any) -> None:
-    assert shown([told], GERMAN) == [told if isinstance(told, str) else told["message"]]
+def test_what_is_not_known_is_shown_as_it_came(message: Any) -> None:
+    assert shown([message], GERMAN) == [message if isinstance(message, str) else message["message"]]

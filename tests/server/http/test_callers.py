@@ -46,8 +46,13 @@ class Door:
     def refusal(self, *args: str, **kwargs: str) -> tuple[int, str, str, str]:
         with pytest.raises(Problem) as caught:
             self.ask(*args, **kwargs)
-        told = caught.value
-        return told.status, told.kind, told.detail.text, dict(told.headers or {}).get("WWW-Authenticate", "")
+        problem = caught.value
+        return (
+            problem.status,
+            problem.kind,
+            problem.detail.text,
+            dict(problem.headers or {}).get("WWW-Authenticate", ""),
+        )
 
 
 @pytest.fixture
@@ -91,8 +96,8 @@ def test_what_a_foreign_page_made_a_browser_send_is_refused(door: Door, sent: di
 
 def test_once_there_is_a_key_it_is_needed(door: Door) -> None:
     token = door.keys.add("lab", ("read",))
-    status, kind, detail, asked = door.refusal()
-    assert (status, kind, asked) == (401, "key-missing", "Bearer")
+    status, kind, detail, challenge = door.refusal()
+    assert (status, kind, challenge) == (401, "key-missing", "Bearer")
     assert detail == "An API key is needed: send 'Authorization: Bearer eh_...'."
     assert door.ask(token=token) == Caller(token.split("_")[1], frozenset({"read"}))
     assert door.ask(token=token, host="heads.example", origin="http://evil.example").may("read")  # no cookie to steal
@@ -100,8 +105,8 @@ def test_once_there_is_a_key_it_is_needed(door: Door) -> None:
 
 def test_a_wrong_key_is_told_from_none(door: Door) -> None:
     for _ in range(2):  # with no key made, and with one
-        status, kind, detail, asked = door.refusal(token="eh_0123456789ab_wrong")
-        assert (status, kind, asked) == (401, "key-invalid", 'Bearer error="invalid_token"')
+        status, kind, detail, challenge = door.refusal(token="eh_0123456789ab_wrong")
+        assert (status, kind, challenge) == (401, "key-invalid", 'Bearer error="invalid_token"')
         assert detail.startswith("Nobody here has this API key: it is misspelt")
         door.keys.add("lab", ("read",))
 

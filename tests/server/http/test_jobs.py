@@ -58,8 +58,8 @@ def test_an_upload_becomes_a_capture_and_a_job_a_result(http: httpx.Client, arch
         assert {name: len(zipped.read(name)) for name in zipped.namelist()} == {
             n: f["bytes"] for n, f in listed.items()
         }
-    asked = {"If-None-Match": packed.headers["etag"]}
-    assert http.get(f"/v1/jobs/{job['id']}/result/all.zip", headers=asked).status_code == 304
+    condition = {"If-None-Match": packed.headers["etag"]}
+    assert http.get(f"/v1/jobs/{job['id']}/result/all.zip", headers=condition).status_code == 304
     assert http.get(f"/v1/captures/{capture['id']}/images/cam01").headers["content-type"] == "image/png"
     assert http.get(f"/v1/captures/{capture['id']}/images/cam99").status_code == 404
 
@@ -100,9 +100,11 @@ def test_an_upload_that_is_sent_again_with_its_key_makes_one_job_and_one_capture
 
 def test_the_events_of_a_job_name_a_camera_that_has_moved(http: httpx.Client, client: Client, archive: bytes) -> None:
     capture = upload(http, archive).json()["id"]
-    for front, told in (("moved", [["cam02 has moved by 5.0 px"]]), ("cam00", [])):
+    for front, expected in (("moved", [["cam02 has moved by 5.0 px"]]), ("cam00", [])):
         job = client.submit(capture, settings={"front": front})["id"]
-        assert [document["camera_moved"] for _, document in client.events(job) if "camera_moved" in document] == told
+        assert [
+            document["camera_moved"] for _, document in client.events(job) if "camera_moved" in document
+        ] == expected
 
 
 def test_events_tell_progress_and_resume(http: httpx.Client, client: Client, archive: bytes) -> None:
@@ -120,11 +122,11 @@ def test_events_tell_progress_and_resume(http: httpx.Client, client: Client, arc
 
 def test_a_stage_that_reports_nothing_still_moves(http: httpx.Client, client: Client, archive: bytes) -> None:
     job = client.submit(upload(http, archive).json()["id"], settings={"front": "quiet"})["id"]
-    told = [document for _, document in client.events(job) if document.get("stage") == "depth"]
-    assert len(told) >= 3
-    shares = [document["progress"] for document in told]
+    events = [document for _, document in client.events(job) if document.get("stage") == "depth"]
+    assert len(events) >= 3
+    shares = [document["progress"] for document in events]
     assert all(0 <= earlier < later < earlier + 0.5 for earlier, later in pairwise(shares))
-    assert all(document["eta_s"] > 0 for document in told)
+    assert all(document["eta_s"] > 0 for document in events)
 
 
 @pytest.mark.parametrize("mode", ["long", "deaf"])

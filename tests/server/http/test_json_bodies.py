@@ -133,9 +133,9 @@ def test_a_body_up_to_the_limit_arrives_whole(door: Door, length: int, announces
     assert answer == (200, str(length - 12).encode(), length)
 
 
-@pytest.mark.parametrize(("path", "told"), [("/streams", b"5000"), ("/pages/notes", b"4988")])
-def test_what_streams_and_pages_have_their_own_rules(door: Door, path: str, told: bytes) -> None:
-    assert door.ask(path, note_of(5 * MOST)) == (200, told, 5 * MOST)
+@pytest.mark.parametrize(("path", "body"), [("/streams", b"5000"), ("/pages/notes", b"4988")])
+def test_what_streams_and_pages_have_their_own_rules(door: Door, path: str, body: bytes) -> None:
+    assert door.ask(path, note_of(5 * MOST)) == (200, body, 5 * MOST)
 
 
 def test_who_goes_away_on_the_way_is_no_fault(door: Door) -> None:

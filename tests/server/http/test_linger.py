@@ -21,8 +21,8 @@ def test_who_is_still_writing_gets_the_answer(service: RunningService, path: str
     with socket.create_connection(("127.0.0.1", service.port), timeout=30) as client:
         client.sendall(head.encode() + bytes(BYTES))  # raises where the service reset the connection
         answer = b"".join(iter(lambda: client.recv(1 << 16), b""))
-    told, body = answer.split(b"\r\n\r\n", 1)
-    assert int(told.split()[1]) == (404 if "nowhere" in path else 415)
+    headers, body = answer.split(b"\r\n\r\n", 1)
+    assert int(headers.split()[1]) == (404 if "nowhere" in path else 415)
     assert json.loads(body)["detail"]
 
 

@@ -183,11 +183,11 @@ def test_the_live_view_takes_all_pictures_in_one_look(studio: StudioDevices, tmp
     rig = open_rig(ServiceSettings(data=tmp_path / "data", rig=studio.folder / "rig.toml"))
     try:
         source = RigSource(rig)
-        looks = [source.frames() for _ in range(2)]
-        for frames in looks:
+        rounds = [source.frames() for _ in range(2)]
+        for frames in rounds:
             assert [frame["name"] for frame in frames] == list(NAMES)
             assert {_decoded(frame["jpeg"] or b"").shape for frame in frames} == {(240, 320, 3)}
-        judged = [[frame["name"] for frame in frames if "blur_px" in frame] for frames in looks]
+        judged = [[frame["name"] for frame in frames if "blur_px" in frame] for frames in rounds]
         assert judged == [["cam01"], ["cam02"]], "each look judges another camera"
         studio.inject(DeviceFault("hung", "cam04"))
         deadline = time.monotonic() + 20

@@ -36,9 +36,9 @@ def test_ctrl_c_stops_service_and_worker_once_and_the_job_goes_on_later(tmp_path
             time.sleep(0.5)  # the worker's child has the work
             os.write(keyboard, b"\x03")
             assert service.process.wait(20) == 130
-        told = service.log.read_text()
-        assert told.count("worker ready") == told.count("worker stopped") == 1
-        assert not [line for line in told.splitlines() if "died" in line or "Traceback" in line or "failed" in line]
+        log = service.log.read_text()
+        assert log.count("worker ready") == log.count("worker stopped") == 1
+        assert not [line for line in log.splitlines() if "died" in line or "Traceback" in line or "failed" in line]
         assert worker_pids(service) == []
         service.start()
         with httpx.Client(base_url=service.url, timeout=30) as client:

@@ -85,8 +85,8 @@ def test_a_bad_model_does_not_hide_bad_settings(http: httpx.Client, archive: byt
     wanted = {"capture_id": capture, "model": "nobody", "settings": {"metod": "contour", "fitting": {"modes": "many"}}}
     refused = http.post("/v1/jobs", json=wanted)
     assert refused.status_code == 422
-    told = " | ".join(refused.json()["errors"])
-    assert all(word in told for word in ("'nobody' is not at hand", "metod", "fitting.modes")), told
+    text = " | ".join(refused.json()["errors"])
+    assert all(word in text for word in ("'nobody' is not at hand", "metod", "fitting.modes")), text
 
 
 def test_an_upload_of_what_is_announced_too_large_is_refused_unread(service: RunningService) -> None:
@@ -125,9 +125,9 @@ def test_templates_are_listed_and_a_job_may_name_those_of_its_model(
         wanted["settings"] = {"outputs": {"template": "other", "formats": ["xyz"]}}
         refused = http.post("/v1/jobs", json=wanted)
         assert (refused.status_code, refused.headers["content-type"]) == (422, "application/problem+json")
-        told = " | ".join(refused.json()["errors"])
-        assert "'xyz' is none of" in told
-        assert "'other' was registered to the model 'other'" in told
+        text = " | ".join(refused.json()["errors"])
+        assert "'xyz' is none of" in text
+        assert "'other' was registered to the model 'other'" in text
     finally:
         mine.unlink()
         other.unlink()
@@ -147,15 +147,15 @@ def test_a_worker_that_loads_is_no_fault(tmp_path: Path) -> None:
 
 
 def test_info_tells_limits_waiting_jobs_and_default_settings(http: httpx.Client, archive: bytes) -> None:
-    told = http.get("/v1/info").json()
-    assert told["version"] == http.get("/healthz").json()["version"]
-    assert (told["cameras_least"], told["cameras_most"], told["jobs_per_key_most"]) == (3, 64, 200)
+    info = http.get("/v1/info").json()
+    assert info["version"] == http.get("/healthz").json()["version"]
+    assert (info["cameras_least"], info["cameras_most"], info["jobs_per_key_most"]) == (3, 64, 200)
     capture = upload(http, archive).json()["id"]
-    job = http.post("/v1/jobs", json={"capture_id": capture, "settings": told["settings"]}).json()["id"]
+    job = http.post("/v1/jobs", json={"capture_id": capture, "settings": info["settings"]}).json()["id"]
     busy = http.get("/v1/info").json()
     assert busy["queued"] + busy["running"] >= 1
     assert await_state(http, job, ("succeeded", "failed"))["state"] == "succeeded"
-    assert await_state(http, job, ("succeeded",))["settings"] == told["settings"]
+    assert await_state(http, job, ("succeeded",))["settings"] == info["settings"]
 
 
 def test_the_page_of_the_api_is_there(http: httpx.Client) -> None:

@@ -16,15 +16,19 @@ def test_storage_and_retention_are_told(tmp_path: Path) -> None:
         capture = upload(http, packed(small_capture(tmp_path / "capture"))).json()
         jobs = [http.post("/v1/jobs", json={"capture_id": capture["id"]}).json()["id"] for _ in range(2)]
         http.post("/v1/jobs/bulk", json={"action": "cancel", "ids": jobs})
-        told = http.get("/v1/retention").json()
-        assert (told["keep_captures_days"], told["keep_results_days"], told["keep_jobs"]) == (30.0, None, 1)
-        assert [(one["kind"], one["why"]) for one in told["upcoming"]] == [
+        retention = http.get("/v1/retention").json()
+        assert (retention["keep_captures_days"], retention["keep_results_days"], retention["keep_jobs"]) == (
+            30.0,
+            None,
+            1,
+        )
+        assert [(one["kind"], one["why"]) for one in retention["upcoming"]] == [
             ("job", "keep_jobs"),
             ("job", "keep_jobs"),
             ("capture", "keep_captures_days"),
         ]
-        assert told["upcoming"][2]["id"] == capture["id"]
-        assert (told["upcoming"][0]["goes"] is None, told["upcoming"][1]["goes"] is None) == (False, True)
+        assert retention["upcoming"][2]["id"] == capture["id"]
+        assert (retention["upcoming"][0]["goes"] is None, retention["upcoming"][1]["goes"] is None) == (False, True)
         deadline = time.monotonic() + 30.0
         while (use := http.get("/v1/storage").json())["kinds"] is None and time.monotonic() < deadline:
             time.sleep(0.05)  # the first look through the folder

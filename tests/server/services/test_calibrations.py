@@ -184,8 +184,8 @@ def test_a_poor_one_is_not_put_to_use_unasked_and_a_running_one_tells_its_progre
     made = calibrations.add_shots(BOARD, [board_shot(store, "a")], "few")
     engine.rows[made.id].status = "PENDING"
     assert (calibrations.get(made.id).progress, calibrations.get(made.id).eta_s) == (0.0, None)
-    told: EventDocument = {"state": "running", "stage": "bundle", "progress": 0.6, "eta_s": 12.5}
-    calibrations._events.append(made.id, told)
+    event: EventDocument = {"state": "running", "stage": "bundle", "progress": 0.6, "eta_s": 12.5}
+    calibrations._events.append(made.id, event)
     running = calibrations.get(made.id)
     assert (running.stage, running.progress, running.eta_s) == ("bundle", 0.6, 12.5)
     finish(store, engine, made.id)

@@ -122,23 +122,27 @@ def test_settings_reach_the_driver_and_are_kept(
 ) -> None:
     """The studio's streams say what network cameras say, that HTTP cannot set them; what any driver is told, is seen
     where drivers are made."""
-    told: dict[str, CameraConfig] = {}
+    configured: dict[str, CameraConfig] = {}
 
     def noting(camera: CameraConfig, folder: Path) -> Driver:
-        told[camera.name] = camera
+        configured[camera.name] = camera
         return driver_for(camera, folder)
 
     monkeypatch.setattr("server.services.rigs.RigSession", lambda config: RigSession(config, noting))
     rig.look()
-    assert told["cam03"].exposure_ms is None
+    assert configured["cam03"].exposure_ms is None
     changed = rig.set_camera("cam03", {"exposure_ms": 8.0, "gain_db": 3.0})
-    assert (told["cam03"].exposure_ms, told["cam03"].gain_db, told["cam04"].exposure_ms) == (8.0, 3.0, None)
+    assert (configured["cam03"].exposure_ms, configured["cam03"].gain_db, configured["cam04"].exposure_ms) == (
+        8.0,
+        3.0,
+        None,
+    )
     assert (changed.exposure_ms, changed.gain_db, changed.white_balance_k) == (8.0, 3.0, None)
     assert [line.text.split()[0] for line in changed.unmet] == ["exposure_ms", "gain_db"]
     again = RealRig(studio.folder / "rig.toml", tmp_path / "rig" / "cameras.json")
     assert again.camera_settings("cam03").exposure_ms == 8.0
     assert rig.set_camera("cam03", {"exposure_ms": None}).exposure_ms is None
-    assert (told["cam03"].exposure_ms, told["cam03"].gain_db) == (None, 3.0)
+    assert (configured["cam03"].exposure_ms, configured["cam03"].gain_db) == (None, 3.0)
     with pytest.raises(InputError, match="exposure_ms: -1"):
         rig.set_camera("cam03", {"exposure_ms": -1.0})
     with pytest.raises(NotFound, match="cam99"):

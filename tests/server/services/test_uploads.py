@@ -22,8 +22,8 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
 
 
 def uploads(store: Store, **settings: float) -> ResumableUploads:
-    given = {"body_bytes": 400, "free_bytes": 100, "upload_hours": 2.0} | settings
-    return ResumableUploads(store, ServiceSettings.model_validate({"data": store.data, **given}))
+    values = {"body_bytes": 400, "free_bytes": 100, "upload_hours": 2.0} | settings
+    return ResumableUploads(store, ServiceSettings.model_validate({"data": store.data, **values}))
 
 
 def test_an_announced_upload_is_empty_and_belongs_to_its_key(store: Store) -> None:

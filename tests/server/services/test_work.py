@@ -22,7 +22,7 @@ def _data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "models" / "other.npz").write_bytes(model_path("default").read_bytes() + b"\n")
 
 
-def asked(model: str | None = None, **settings: object) -> tuple[str, tuple[Message, ...]]:
+def refusal_of(model: str | None = None, **settings: object) -> tuple[str, tuple[Message, ...]]:
     with pytest.raises(InputError) as refused:
         Work(model, settings).check()
     return refused.value.subject, refused.value.faults
@@ -35,23 +35,26 @@ def test_what_can_be_done_is_not_refused() -> None:
 
 
 def test_a_template_that_there_is_not_or_that_another_model_carries_is_refused() -> None:
-    subject, (told,) = asked(outputs={"template": "ict"})
-    assert (subject, "outputs.template: no template 'ict': known are damaged, flame" in told.text) == ("settings", True)
-    subject, (told,) = asked("other", outputs={"template": "flame"})
+    subject, (fault,) = refusal_of(outputs={"template": "ict"})
+    assert (subject, "outputs.template: no template 'ict': known are damaged, flame" in fault.text) == (
+        "settings",
+        True,
+    )
+    subject, (fault,) = refusal_of("other", outputs={"template": "flame"})
     assert subject == "settings"
-    assert "registered to the model 'makehuman-138', and the job's is 'other'" in told.text
-    _, (told,) = asked(outputs={"template": "damaged"})
-    assert "Register it again" in told.text
+    assert "registered to the model 'makehuman-138', and the job's is 'other'" in fault.text
+    _, (fault,) = refusal_of(outputs={"template": "damaged"})
+    assert "Register it again" in fault.text
 
 
 def test_every_fault_is_named_at_once() -> None:
-    subject, told = asked("nobody", metod="contour", outputs={"template": "ict", "formats": ["xyz"]})
+    subject, faults = refusal_of("nobody", metod="contour", outputs={"template": "ict", "formats": ["xyz"]})
     assert subject == "request"
     for part in ("model: 'nobody' is not at hand", "metod", "'xyz' is none of", "no template 'ict'"):
-        assert any(part in fault.text for fault in told), (part, told)
-    assert len(told) == 4
-    _, told = asked(outputs={"template": "../x"})
-    assert len(told) == 1
-    assert "is no name" in told[0].text
-    _, told = asked(outputs={"template": 3})
-    assert len(told) == 1
+        assert any(part in fault.text for fault in faults), (part, faults)
+    assert len(faults) == 4
+    _, faults = refusal_of(outputs={"template": "../x"})
+    assert len(faults) == 1
+    assert "is no name" in faults[0].text
+    _, faults = refusal_of(outputs={"template": 3})
+    assert len(faults) == 1

@@ -150,13 +150,15 @@ def test_what_a_kill_left_of_a_record_goes_with_it_and_with_time(tmp_path: Path)
     store, record = Store(tmp_path), SessionRecord(new_id(), "2026-01-01T00:00:00.000Z", "anna", "signed")
     store.add_session(record)
     folders = [tmp_path / "sessions", tmp_path / "rig", stored(store, capture_record()).parent]
-    own, *others = [folder / f".{name}.abcd.part" for folder in folders for name in (f"{record.id}.json", "other")]
-    for part in (own, *others):
+    of_record, *others = [
+        folder / f".{name}.abcd.part" for folder in folders for name in (f"{record.id}.json", "other")
+    ]
+    for part in (of_record, *others):
         part.write_text("anna")
         os.utime(part, (0, 0))
     others[0].touch()  # is being written
     store.remove_session(record.id)
-    assert [part.exists() for part in (own, *others)] == [False] + 5 * [True]
+    assert [part.exists() for part in (of_record, *others)] == [False] + 5 * [True]
     assert store.sweep(older_s=900) == 4
     assert [part.exists() for part in others] == [True] + 4 * [False]
 

@@ -33,9 +33,9 @@ def shot(tmp_path: Path) -> tuple[Capture, Rig]:
 
 def looked(folder: Path, capture: Capture, rig: Rig, settings: SegmentationSettings) -> tuple[dict, bool]:
     """What was found, and whether it had to be made: only then is there progress to report."""
-    told: list[float] = []
-    found = segment_once(folder, capture, rig, settings, report=lambda stage, share: told.append(share))
-    return found, len(told) > 1
+    shares: list[float] = []
+    found = segment_once(folder, capture, rig, settings, report=lambda stage, share: shares.append(share))
+    return found, len(shares) > 1
 
 
 def assert_same(first: dict[str, Silhouette], second: dict[str, Silhouette]) -> None:

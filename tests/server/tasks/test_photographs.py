@@ -20,24 +20,24 @@ def quiet(stage: str, share: float) -> None:
 @pytest.mark.slow
 def test_photographs_alone_become_a_capture_and_are_kept(tmp_path: Path) -> None:
     photos, kept = write_photographs(tmp_path / "photos", wedge_rig()), tmp_path / "out"
-    told: list[str] = []
-    found = read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: told.append(stage))
+    stages: list[str] = []
+    found = read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: stages.append(stage))
     assert set(found.rig.names) == set(found.capture.images) == set(wedge_rig().names)
     assert image_distance(found.rig, wedge_rig(), scale=True).max() < 0.1
     assert [warning.code for warning in found.warnings] == ["scale-assumed"]
     assert {"cameras.json", "calibration.json", "calibration.html"} <= {path.name for path in kept.iterdir()}
-    assert "structure" in told
+    assert "structure" in stages
 
-    told.clear()
-    again = read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: told.append(stage))
-    assert told == []  # nothing was worked out again
+    stages.clear()
+    again = read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: stages.append(stage))
+    assert stages == []  # nothing was worked out again
     assert again.capture.digests == found.capture.digests
     assert again.warnings == found.warnings
 
     picture = np.array(read_image(photos / "cam00.png"))
     write_image(photos / "cam00.png", np.ascontiguousarray(255 - picture))
-    read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: told.append(stage))
-    assert "structure" in told
+    read_or_calibrate(photos, kept, front="cam02", report=lambda stage, share: stages.append(stage))
+    assert "structure" in stages
 
 
 def test_a_folder_with_cameras_is_read_as_it_is(tmp_path: Path) -> None:

@@ -43,13 +43,13 @@ def kept(folder: Path) -> set[str]:
 
 @pytest.mark.slow
 def test_what_is_missing_is_compiled_once_and_counted_aloud(folder: Path) -> None:
-    told: list[tuple[str, float]] = []
-    assert prepare_kernels(lambda stage, share: told.append((stage, share))) == (2, 0, 2)
-    assert told == [(f"compiling {done} of 2 loops", done / 2) for done in range(3)]
+    reported: list[tuple[str, float]] = []
+    assert prepare_kernels(lambda stage, share: reported.append((stage, share))) == (2, 0, 2)
+    assert reported == [(f"compiling {done} of 2 loops", done / 2) for done in range(3)]
     assert {"grid_kernels.grown", "vertex_colours_kernels.blend_views"} <= kept(folder)
-    told.clear()
-    assert prepare_kernels(lambda stage, share: told.append((stage, share))) == (0, 0, 2)
-    assert told == []
+    reported.clear()
+    assert prepare_kernels(lambda stage, share: reported.append((stage, share))) == (0, 0, 2)
+    assert reported == []
     next(folder.glob("grid_kernels.grown-*")).unlink()
     assert prepare_kernels(lambda stage, share: None) == (1, 0, 2)
 
@@ -114,9 +114,9 @@ def preparing(cache: Path, script: Path) -> "subprocess.Popen[str]":
 
 def ended(process: "subprocess.Popen[str]") -> tuple[list[str], list[str]]:
     """Lines of standard output and error."""
-    out, told = process.communicate(timeout=120)
-    assert process.returncode == 0, told
-    return out.splitlines(), told.splitlines()
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    return out.splitlines(), errors.splitlines()
 
 
 @pytest.mark.slow
@@ -133,9 +133,9 @@ def test_one_that_is_killed_leaves_nothing_that_others_stumble_over(tmp_path: Pa
     compiled_now, missing, known = map(int, numbers.split())
     assert (compiled_now > 0, missing, known) == (True, 0, 2)
     assert int(count) > 1
-    (numbers, _), told = ended(preparing(cache, tmp_path / "use.py"))
+    (numbers, _), errors = ended(preparing(cache, tmp_path / "use.py"))
     assert numbers == "0 0 2"
-    assert told == []
+    assert errors == []
 
 
 @pytest.mark.slow
@@ -159,10 +159,10 @@ def test_where_nothing_can_be_kept_the_work_is_done_and_one_line_says_so(tmp_pat
             home = stack.enter_context(small_disk(tmp_path / "home", 1, *(["ro"] if kind == "read-only" else [])))
         if kind == "full":
             (home / "ballast").write_bytes(bytes((1 << 20) - (16 << 10)))
-        out, told = ended(preparing(home / "cache", tmp_path / "use.py"))
+        out, errors = ended(preparing(home / "cache", tmp_path / "use.py"))
         assert out[0] == "0 2 2"
         assert int(out[1]) > 1
-        (line,) = told
+        (line,) = errors
         assert line.startswith(f"compiled loops and arrays of head models are not kept in {home / 'cache'} (")
         assert {"full": "No space left", "read-only": "Read-only", "no folder": "Not a directory"}[kind] in line
         assert not [path for path in home.rglob("*") if path.is_file() and path.name != "ballast"]

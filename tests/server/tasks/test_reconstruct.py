@@ -35,9 +35,9 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
 ) -> None:
     write_capture(tmp_path / "capture", shot.capture, shot.rig)
-    told = {"code": "scale-assumed", "message": "as if these cameras had been found from the photographs"}
+    stored = {"code": "scale-assumed", "message": "as if these cameras had been found from the photographs"}
     digest = hashlib.sha256((tmp_path / "capture" / "cameras.json").read_bytes()).hexdigest()
-    (tmp_path / "capture" / "calibration.json").write_text(json.dumps({"cameras_sha256": digest, "told": [told]}))
+    (tmp_path / "capture" / "calibration.json").write_text(json.dumps({"cameras_sha256": digest, "told": [stored]}))
     bench, heard = Bench(), []
     bench.keep("renderer", lambda: renderer)
     reconstruct_capture(
@@ -60,7 +60,7 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     assert order[-1] == "write"  # nothing is called done before its files are there
     report = json.loads((tmp_path / "result" / "report.json").read_text())
     assert all(camera["used"] for camera in report["cameras"].values())
-    assert report["warnings"][0] == {**told, "parameters": {}}
+    assert report["warnings"][0] == {**stored, "parameters": {}}
     assert {warning["code"] for warning in report["warnings"][1:]} <= {"view"}
     face = shot.scene.head.vertices[shot.scene.photographed]
     away, _ = KDTree(read_mesh(tmp_path / "result" / "head.ply").vertices).query(face)

@@ -18,7 +18,7 @@ class Store:
     """A server elsewhere: /a.tar is a capture, other paths misbehave. Keeps what it was sent."""
 
     def __init__(self, archive: bytes) -> None:
-        store, self.told = self, list[tuple[dict[str, str], bytes]]()
+        store, self.received = self, list[tuple[dict[str, str], bytes]]()
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
@@ -45,7 +45,7 @@ class Store:
 
             def do_POST(self) -> None:
                 length = int(self.headers["content-length"])
-                store.told.append(({k.lower(): v for k, v in self.headers.items()}, self.rfile.read(length)))
+                store.received.append(({k.lower(): v for k, v in self.headers.items()}, self.rfile.read(length)))
                 self.send_response(204)
                 self.end_headers()
 
@@ -142,24 +142,24 @@ def test_a_jobs_own_webhook_name_and_log(service: RunningService, store: Store) 
         assert job["name"] == "Anna, fine"
         assert await_state(client, job["id"], ("succeeded",))["name"] == "Anna, fine"
         deadline = time.monotonic() + 30
-        while not store.told:
+        while not store.received:
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        headers, body = store.told[0]
+        headers, body = store.received[0]
         assert headers["webhook-signature"].startswith("v1,")
         assert job["id"] in body.decode()
         assert "job.succeeded" in body.decode()
         assert client.get("/v1/webhooks").json() == {"webhooks": []}
-        told = client.get(f"/v1/jobs/{job['id']}/log")
-        assert told.headers["content-type"].startswith("text/plain")
+        log = client.get(f"/v1/jobs/{job['id']}/log")
+        assert log.headers["content-type"].startswith("text/plain")
         for words in ("job started", "stage stage=fit", "cam02 has moved by 5.0 px", "job finished"):
-            assert words in told.text, told.text
+            assert words in log.text, log.text
         assert client.get(f"/v1/jobs/{'0' * 28}/log").status_code == 404
         broken = client.post("/v1/jobs", json={"capture_id": capture, "settings": {"front": "bug"}}).json()["id"]
         await_state(client, broken, ("failed",))
-        told = client.get(f"/v1/jobs/{broken}/log").text
-        assert "job failed" in told
-        assert "Traceback" not in told
+        log = client.get(f"/v1/jobs/{broken}/log").text
+        assert "job failed" in log
+        assert "Traceback" not in log
 
 
 def test_imports_and_webhooks_of_jobs_are_off_by_default(store: Store, tmp_path: Path) -> None:

@@ -53,8 +53,8 @@ def received(
 
     async def receive() -> tuple[Path, dict[str, str]]:
         request = cast(Request, SimpleNamespace(headers={"content-type": content_type}, stream=stream))
-        given = ServiceSettings.model_validate({"data": folder, "free_bytes": 0, **settings})
-        return await receive_multipart(request, folder, Store(folder), given, Threads())
+        service_settings = ServiceSettings.model_validate({"data": folder, "free_bytes": 0, **settings})
+        return await receive_multipart(request, folder, Store(folder), service_settings, Threads())
 
     path, fields = asyncio.run(receive())
     return path.read_bytes(), fields
@@ -244,8 +244,8 @@ def pictures_of(folder: Path, *fields: bytes) -> tuple[str, bytes, str]:
         accept_photographs=taken_as("scene"),
     )
     request = SimpleNamespace(headers={"content-type": TYPE, "content-length": str(len(data))}, stream=stream)
-    told = asyncio.run(receive_calibration_pictures(cast(Service, service), cast(Request, request)))
-    return cast(tuple[str, bytes, str], told)
+    received_pictures = asyncio.run(receive_calibration_pictures(cast(Service, service), cast(Request, request)))
+    return cast(tuple[str, bytes, str], received_pictures)
 
 
 @pytest.mark.parametrize(

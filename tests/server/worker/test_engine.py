@@ -19,12 +19,12 @@ def test_workers_that_died_are_named_to_the_engine(monkeypatch: pytest.MonkeyPat
         def get_workflow_id(self) -> str:
             return "job"
 
-    asked: list[str] = []
+    recovered: list[str] = []
 
     def recover(executors: list[str]) -> list[Handle]:
-        asked.extend(executors)
+        recovered.extend(executors)
         return [Handle()]
 
     monkeypatch.setattr(DBOS, "_recover_pending_workflows", recover)
     assert engine.take_over(("one", "two")) == ["job"]
-    assert asked == ["one", "two"]
+    assert recovered == ["one", "two"]

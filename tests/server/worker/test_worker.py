@@ -70,7 +70,7 @@ def request(capture: str, mode: str | None = None) -> JobRequest:
     return {"capture_id": capture, "model": None, "settings": {} if mode is None else {"front": mode}}
 
 
-def told(worker: Worker) -> list[dict[str, Any]]:
+def events_of(worker: Worker) -> list[dict[str, Any]]:
     return [dict(event.document) for event in worker.events.since(JOB, 0)]
 
 
@@ -79,7 +79,7 @@ def test_a_job_begins_where_its_capture_is_and_the_disk_has_room(
 ) -> None:
     worker.ingest(JOB, request(capture))
     assert worker.store.folder("jobs", JOB).is_dir()
-    assert told(worker) == [{"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None}]
+    assert events_of(worker) == [{"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None}]
     with pytest.raises(JobFailed) as gone:
         worker.ingest(JOB, request(new_id()))
     assert gone.value.kind == "not-found"
@@ -97,9 +97,9 @@ def test_a_fit_is_published_once_whoever_publishes_it(worker: Worker, capture: s
     worker.ingest(JOB, request(capture))
     attempts = []
     for _ in range(2):
-        before = len(told(worker))
+        before = len(events_of(worker))
         attempts.append(worker.fit(JOB, request(capture)))
-        shares = [event["progress"] for event in told(worker)[before:]]
+        shares = [event["progress"] for event in events_of(worker)[before:]]
         assert shares == sorted(shares), "progress never goes back within an attempt"
     first, second = attempts
     folder = worker.store.folder("jobs", JOB)
@@ -142,12 +142,12 @@ def test_the_last_event_names_cameras_that_moved(worker: Worker, capture: str) -
     worker.ingest(JOB, request(capture))
     worker.publish(JOB, worker.fit(JOB, request(capture, "moved")))
     worker.settle(JOB, "succeeded")
-    assert told(worker)[-1] == {"state": "succeeded", "camera_moved": ["cam02 has moved by 5.0 px"]}
+    assert events_of(worker)[-1] == {"state": "succeeded", "camera_moved": ["cam02 has moved by 5.0 px"]}
 
 
 def test_a_job_without_a_report_ends_without_a_word(worker: Worker) -> None:
     worker.settle(JOB, "failed")
-    assert told(worker) == [{"state": "failed"}]
+    assert events_of(worker) == [{"state": "failed"}]
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"warnings": 3'])
