@@ -12,7 +12,7 @@ from calibration.board.board import board_from_document
 from calibration.board.corners import detect
 from rig.messages.message import Message, compose
 from rig.progress import Progress
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 CELLS = (4, 3)  # of an image, across and down, that corners should fall into
 CORNERS_SHOWN = 60
@@ -33,7 +33,7 @@ class Coverage(TypedDict):
     last: list[list[float]]
 
 
-def detect_shot(bench: Bench, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
+def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
     """Runs in a child: corners of the board in each image of a capture, as shares of width and height; none where the
     board is not seen. Raises InputError for a board that cannot be."""
     described = board_from_document(board)

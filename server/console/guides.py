@@ -19,7 +19,7 @@ from rig.camera import Camera
 from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress
 from rig.rig import Rig
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 Pixels = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]  # point, camera
 Landmarks = Mapping[str, Float[np.ndarray, " 3"]]  # head frame, mm
@@ -164,7 +164,7 @@ def nearest_views(rig: Rig, front: str, count: int) -> list[str]:
     return sorted(axes, key=lambda name: (name != front, -float(axes[name] @ axes[front])))[:count]
 
 
-def mean_landmarks(bench: Bench, report: Progress, *, model: str, names: list[str]) -> dict[str, list[float]]:
+def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, names: list[str]) -> dict[str, list[float]]:
     """Landmarks of a model's mean head (head frame, mm); runs in a child, because a model is large."""
     from pipeline.eigenheads.model import load_model
 

@@ -8,14 +8,14 @@ from jaxtyping import Bool, UInt8
 
 from rig.atomic_write import write_atomically
 from rig.progress import Progress
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 WIDTH = 640
 COLOUR = (108, 178, 255)  # the accent of the pages
 LINE_PX = 3
 
 
-def draw(bench: Bench, report: Progress, *, capture: str, cache: str, target: str) -> None:
+def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, target: str) -> None:
     """Writes ``target``/<camera>.png, the outline with a tint of the subject on nothing. Raises InputError."""
     from pipeline.settings import SegmentationSettings
     from server.storage.silhouette_cache import segment_once

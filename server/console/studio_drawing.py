@@ -17,7 +17,7 @@ from rig.studio.scene.simulate import Scene, build_scene, view_light
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.sensor import Sensor, expose
 from server.console.live_frame import LiveFrame
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 from server.tasks.subjects import drawn_subject
 
 WIDTH = 320
@@ -27,10 +27,10 @@ QUICK = replace(PRESET, samples=1)  # the pictures are shown at a third of their
 SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 
-def frames(bench: Bench, look: int) -> list[LiveFrame]:
+def frames(context: WorkerContext, look: int) -> list[LiveFrame]:
     """One frame a camera; now and then one of them has blur_px."""
-    views = bench.keep("live", _draw)
-    rng = bench.keep("noise", np.random.default_rng)
+    views = context.keep("live", _draw)
+    rng = context.keep("noise", np.random.default_rng)
     names = list(views)
     sharp = names[look // SHARP_EVERY % len(names)] if look % SHARP_EVERY == 0 else None
     return [_frame(name, view, rng, sharp=name == sharp) for name, view in views.items()]

@@ -2,11 +2,11 @@
 
 from rig.progress import Progress
 from server.console.live_frame import LiveFrame
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 
-def frames(bench: Bench, report: Progress, *, look: int) -> list[LiveFrame]:
+def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
     """One frame a camera; now and then one of them has blur_px."""
     from server.console import studio_drawing
 
-    return studio_drawing.frames(bench, look)
+    return studio_drawing.frames(context, look)

@@ -6,7 +6,7 @@ from rig.messages.message import MessageDocument
 from server.console.page import Chosen
 from server.services.presets import PRESETS, settings_of
 from server.services.templates import templates_at_hand
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 
 
 class PresetLine(TypedDict):
@@ -38,9 +38,9 @@ def template_lines() -> list[TemplateLine]:
     return [{"name": found.name, "models": list(found.models)} for found in templates_at_hand() if found.models]
 
 
-def chosen_work(event: WorkForm) -> Work:
+def chosen_work(event: WorkForm) -> ReconstructionRequest:
     """Model, preset and template of the form; what is not chosen is the service's default."""
     settings, template = dict(settings_of(event.get("method"))), event.get("template")
     if template:
         settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}
-    return Work(event.get("model") or None, settings)
+    return ReconstructionRequest(event.get("model") or None, settings)

@@ -29,7 +29,7 @@ from server.settings import ServiceSettings
 from server.storage.library import CaptureQuery, Library
 from server.storage.records import CaptureContent, CaptureRecord
 from server.storage.store import Store, StoredFile, new_id
-from server.tasks.child import Children, WorkFailed
+from server.tasks.child import ChildProcessPool, WorkFailed
 from server.tasks.ingest import Points, check_features, ingest_archive, ingest_board, ingest_folder
 
 SAMPLE_SEED = 11
@@ -37,8 +37,8 @@ POINTS = TypeAdapter(Points)
 
 
 @dataclass(frozen=True, slots=True)
-class About:
-    """What people say of a capture. Raises InputError for texts that cannot be."""
+class CaptureMetadata:
+    """Holds what people say of a capture. Raises InputError for texts that cannot be stored."""
 
     session: str | None = None
     label: str = ""
@@ -49,7 +49,7 @@ class About:
         check_texts({"session": self.session, "label": self.label, "expression": self.expression})
 
     @classmethod
-    def of(cls, fields: Mapping[str, str | None]) -> "About":
+    def of(cls, fields: Mapping[str, str | None]) -> "CaptureMetadata":
         """From a form, in which commas stand between tags. Raises InputError."""
         tags = typed_tags(fields.get("tags") or "")
         return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "", tags)
@@ -63,14 +63,14 @@ class Captures:
         store: Store,
         jobs: Jobs,
         rig: RigBackend,
-        children: Children,
+        children: ChildProcessPool,
         settings: ServiceSettings,
         library: Library,
     ) -> None:
         self._store, self._jobs, self._rig, self._children = store, jobs, rig, children
         self._settings, self._library = settings, library
 
-    def take(self, about: About, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
+    def take(self, about: CaptureMetadata, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
         """Triggers the rig now. ``board``: pictures of the calibration board. Raises Unavailable, and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         if not board:
@@ -98,12 +98,17 @@ class Captures:
                         folder=str(capture / "files"), image_pixels=self._settings.image_pixels, measured=False
                     )
                 return self._add(
-                    capture, "rig", content, About(label="Sample, simulated studio"), shot, needs_consent=False
+                    capture,
+                    "rig",
+                    content,
+                    CaptureMetadata(label="Sample, simulated studio"),
+                    shot,
+                    needs_consent=False,
                 )
         finally:
             studio.close()
 
-    def accept(self, archive: Path, folder: Path, about: About) -> CaptureRecord:
+    def accept(self, archive: Path, folder: Path, about: CaptureMetadata) -> CaptureRecord:
         """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
         fault, Conflict where the service asks for consent."""
         self._check_consent(about.session)
@@ -253,7 +258,7 @@ class Captures:
         folder: Path,
         source: str,
         content: CaptureContent,
-        about: About,
+        about: CaptureMetadata,
         shot: Mapping[str, object] | None = None,
         *,
         needs_consent: bool = True,

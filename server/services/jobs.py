@@ -25,7 +25,7 @@ from server.origins import target
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
 from server.services.records import Found, Job
-from server.services.work import Work, refuse_board
+from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.database import alive_workers, workers
 from server.storage.events import EventLog, JobEvent
@@ -77,7 +77,7 @@ class Jobs:
     def submit(
         self,
         capture_id: str,
-        wanted: Work,
+        wanted: ReconstructionRequest,
         *,
         key: str = "local",
         idempotency_key: str | None = None,
@@ -107,7 +107,7 @@ class Jobs:
             request["webhook"] = wanted.webhook
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
-    def submit_session(self, session: str, wanted: Work, *, key: str, priority: int) -> list[Job]:
+    def submit_session(self, session: str, wanted: ReconstructionRequest, *, key: str, priority: int) -> list[Job]:
         """Queues a reconstruction of every capture of a session. Raises as ``submit`` does."""
         wanted.check()  # a session without captures asks no job to
         self._store.session(session)
@@ -256,7 +256,7 @@ class Jobs:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
         return StoredFile(self._result(job_id) / name, file["sha256"])
 
-    def restart(self, job_id: str, wanted: Work, *, key: str = "local") -> Job:
+    def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
         """A new job for the same capture, which names the old one. What is None is as in that. Raises InputError,
         NotFound, TooMany."""
         wanted.check()

@@ -23,7 +23,7 @@ from server.storage.database import open_database
 from server.storage.library import Library
 from server.storage.store import Store
 from server.tasks.calibrate import ingest_board_pictures, ingest_photographs
-from server.tasks.child import Children
+from server.tasks.child import ChildProcessPool
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Service:
     webhooks: Webhooks
     uploads: ResumableUploads
     threads: Threads
-    children: Children
+    children: ChildProcessPool
     rig: RigBackend
     captures: Captures
     sessions: Sessions
@@ -106,7 +106,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     library.reconcile(store)
     migrate(settings)
     jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)
-    children = Children(settings.checks_at_once, niceness=3)
+    children = ChildProcessPool(settings.checks_at_once, niceness=3)
     return Service(
         settings=settings,
         store=store,

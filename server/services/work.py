@@ -1,4 +1,4 @@
-"""What a job is asked for, and of what."""
+"""What a job shall do, and of which capture."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from server.storage.records import CaptureRecord, JobWebhook
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
-    """What a job is asked for: a model's name and settings of the pipeline, the default ones where they are None; what
-    people call it, and who is told of its end beside the service's webhooks."""
+class ReconstructionRequest:
+    """Holds what a job shall do: a model's name and settings of the pipeline, None for the default ones; its name; and
+    the webhook that hears of its end beside the service's own."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None

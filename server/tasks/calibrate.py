@@ -13,7 +13,7 @@ from rig.formats.capture_folder import capture_root
 from rig.messages.message import compose, documents_of, texts_of
 from rig.progress import Progress
 from server.storage.records import CalibrationOutcome
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 from server.tasks.photographs import SCALE, check_sizes
 
 BOARD = "board.toml"
@@ -38,7 +38,7 @@ def is_of_board(folder: Path) -> bool:
 
 
 def ingest_photographs(
-    bench: Bench, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
+    context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> None:
     """Unpacks photographs of a scene, and scale.json where there is one, into ``folder`` and looks at both. Raises
     InputError."""
@@ -75,7 +75,9 @@ def check_scale(folder: Path) -> None:
         read_scale(folder / SCALE, [path.name for path in (folder / "images").iterdir()])
 
 
-def ingest_board_pictures(bench: Bench, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits) -> None:
+def ingest_board_pictures(
+    context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits
+) -> None:
     """Unpacks board.toml and IMAGES/ into ``folder`` and looks at both. Raises InputError."""
     from calibration.board.board import read_board
     from calibration.board.detection import list_pictures
@@ -97,7 +99,14 @@ def ingest_board_pictures(bench: Bench, report: Progress, *, archive: str, folde
 
 
 def calibrate_folder(
-    bench: Bench, report: Progress, *, folder: str, result: str, previous: str | None, cache: str, front: str | None
+    context: WorkerContext,
+    report: Progress,
+    *,
+    folder: str,
+    result: str,
+    previous: str | None,
+    cache: str,
+    front: str | None,
 ) -> CalibrationOutcome:
     """``calibrate()``, or ``calibrate_scene()``, and its files; returns what the record shows."""
     if not is_of_board(Path(folder)):

@@ -52,8 +52,8 @@ class WorkFailed(EigenheadError):
         self.faults = tuple(message_of(fault) for fault in faults)
 
 
-class Bench:
-    """What outlives one piece of work in the child: expensive things by name, made once, closed at the end."""
+class WorkerContext:
+    """Keeps what outlives one piece of work in the child: resources by name, made once, closed at the end."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
@@ -84,13 +84,13 @@ class Child:
 
     def remote(
         self,
-        work: Callable[Concatenate[Bench, Progress, P], T],
+        work: Callable[Concatenate[WorkerContext, Progress, P], T],
         *,
         report: Progress = lambda stage, fraction: None,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Callable[P, T]:
         """``work``, a function of a module, as it runs in the child: ``child.remote(work)(name=value)`` calls
-        ``work(bench, report, name=value)`` there. What travels is the function's module and name.
+        ``work(context, report, name=value)`` there. What travels is the function's module and name.
 
         The call raises Cancelled within ``PATIENCE_S`` and one poll after ``cancelled()`` becomes true, InputError and
         WorkFailed as the function did, and WorkFailed("crash") when the child died.
@@ -167,8 +167,8 @@ class Child:
         return process.wait()
 
 
-class Children:
-    """A few children for many threads: each takes one for its work and gives it back."""
+class ChildProcessPool:
+    """Lends a few child processes to many threads: each takes one for its work and gives it back."""
 
     def __init__(self, count: int, niceness: int = 0) -> None:
         self._all = [Child(niceness) for _ in range(count)]
@@ -226,13 +226,13 @@ def serve(connection: Connection) -> None:
         os._exit(0)  # the parent is gone: nobody waits for the result
 
     threading.Thread(target=listen, daemon=True).start()
-    bench = Bench()
+    context = WorkerContext()
     while True:
         request = requests.get()
         stop.clear()
         try:
             work, arguments, named = pickle.loads(request)
-            answer = ("done", work(bench, _reporter(connection, stop), *arguments, **named))
+            answer = ("done", work(context, _reporter(connection, stop), *arguments, **named))
         except BaseException as error:
             answer = _described(error)
         connection.send(answer)

@@ -1,15 +1,15 @@
 """Whether this machine draws; runs in a child process."""
 
 from rig.progress import Progress
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 
-def try_egl(bench: Bench, report: Progress) -> str:
+def try_egl(context: WorkerContext, report: Progress) -> str:
     """The name of the GL device. Raises the renderer's own error."""
     from rig.render.context import GlContext  # without the renderer's NumPy: half the time
 
-    context = GlContext()
+    gl = GlContext()
     try:
-        return context.description
+        return gl.description
     finally:
-        context.close()
+        gl.close()

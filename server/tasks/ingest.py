@@ -40,14 +40,14 @@ from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, check_sizes, photographs_alone
 
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
 
 def ingest_archive(
-    bench: Bench, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
+    context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> CaptureContent:
     """Unpacks ``archive``, checks the capture in it, and leaves ``folder`` with exactly its files.
 
@@ -144,13 +144,13 @@ def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportW
 
 
 def ingest_folder(
-    bench: Bench, report: Progress, *, folder: str, image_pixels: int, measured: bool = False
+    context: WorkerContext, report: Progress, *, folder: str, image_pixels: int, measured: bool = False
 ) -> CaptureContent:
     """The same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was taken."""
     return check_capture(Path(folder), image_pixels, report, measured=measured)
 
 
-def ingest_board(bench: Bench, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
+def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
     """A shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
     root = Path(folder)
     for entry in root.iterdir():
@@ -239,7 +239,7 @@ def _shows_its_plate(shot: Capture, name: str) -> bool:
     return image is not None and any(np.array_equal(image, plate) for plate in plates)
 
 
-def check_features(bench: Bench, report: Progress, *, folder: str, points: Points) -> bytes:
+def check_features(context: WorkerContext, report: Progress, *, folder: str, points: Points) -> bytes:
     """Judges feature points for the capture in ``folder``; returns the file of them. Raises InputError."""
     rig_file = find_rig_file(Path(folder))
     if rig_file is None:

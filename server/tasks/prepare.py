@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rig.cache_folder import cache_folder
 from rig.progress import Progress
-from server.tasks.child import Bench, Child
+from server.tasks.child import Child, WorkerContext
 
 if TYPE_CHECKING:
     from pipeline.kernel_list import Kernel
@@ -33,7 +33,7 @@ class Prepared(NamedTuple):
     known: int
 
 
-def compile_kernel(bench: Bench, report: Progress, *, line: str) -> bool:
+def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bool:
     """In a child: compiles a line of the list. False where it could not be kept, which the log has said."""
     from pipeline.kernel_list import Kernel
 

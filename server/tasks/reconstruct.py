@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from server.processes import share_one_heap
-from server.tasks.child import Bench, Report
+from server.tasks.child import Report, WorkerContext
 
 DONE = "done"  # the pipeline's last word, when nothing is written yet
 
@@ -17,7 +17,7 @@ class CaptureWork(Protocol):
 
     def __call__(
         self,
-        bench: Bench,
+        context: WorkerContext,
         report: Report,
         /,
         *,
@@ -30,7 +30,7 @@ class CaptureWork(Protocol):
 
 
 def reconstruct_capture(
-    bench: Bench,
+    context: WorkerContext,
     report: Report,
     *,
     capture: str,
@@ -60,11 +60,11 @@ def reconstruct_capture(
 
     chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
     kind = f"{chosen.detail} {chosen.outputs.surface}"
-    bench.keep(f"loops {kind}", lambda: prepare_kernels(lambda _, share: report("compiling", share), chosen))
+    context.keep(f"loops {kind}", lambda: prepare_kernels(lambda _, share: report("compiling", share), chosen))
     name = model or "default"
-    head_model = bench.keep(f"model {name}", lambda: load_model(name))
+    head_model = context.keep(f"model {name}", lambda: load_model(name))
     template = load_template(chosen.outputs.template, head_model)
-    renderer = bench.keep("renderer", Renderer.create)
+    renderer = context.keep("renderer", Renderer.create)
     shot, rig = read_scaled_capture(Path(capture))
 
     def tell(stage: str, fraction: float) -> None:

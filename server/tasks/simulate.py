@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from rig.progress import Progress
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
     from rig.studio.scene.simulate import SimulatedCapture
@@ -27,7 +27,7 @@ class SimulatedCertificate(TypedDict):
     faults: list[str]
 
 
-def simulated(bench: Bench, report: Progress, *, folder: str, seed: int | None) -> SimulatedCertificate:
+def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: int | None) -> SimulatedCertificate:
     """A capture in ``folder/files``, its truth in ``folder/truth``; returns the shot's certificate.
 
     Without a seed the subject is another one each time. The operator's clicks are left out: they are made later.
@@ -41,8 +41,8 @@ def simulated(bench: Bench, report: Progress, *, folder: str, seed: int | None) 
     from rig.studio.sensor.preset import PRESET
     from server.tasks.subjects import drawn_subject
 
-    model = bench.keep("model", load_model)
-    renderer = bench.keep("renderer", Renderer.create)
+    model = context.keep("model", load_model)
+    renderer = context.keep("renderer", Renderer.create)
     rng = np.random.default_rng(seed)
     taken = simulate(drawn_subject(model, rng), default_layout(), PRESET, rng, renderer=renderer)
     write_capture(Path(folder) / "files", replace(taken.capture, features={}), taken.rig)
@@ -57,7 +57,7 @@ def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
 
 
-def look(bench: Bench, report: Progress, *, cameras: list[str]) -> dict[str, np.ndarray]:
+def look(context: WorkerContext, report: Progress, *, cameras: list[str]) -> dict[str, np.ndarray]:
     """What cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
     from pipeline.eigenheads.model import load_model
     from rig.render.renderer import Renderer
@@ -69,9 +69,9 @@ def look(bench: Bench, report: Progress, *, cameras: list[str]) -> dict[str, np.
 
     def scene() -> Any:
         rng = np.random.default_rng(1)
-        model = bench.keep("model", load_model)
-        renderer = bench.keep("renderer", Renderer.create)
+        model = context.keep("model", load_model)
+        renderer = context.keep("renderer", Renderer.create)
         return build_scene(drawn_subject(model, rng), default_layout(), PRESET, rng, renderer=renderer)
 
-    views, noise = bench.keep("scene", scene).views, np.random.default_rng()
+    views, noise = context.keep("scene", scene).views, np.random.default_rng()
     return {name: expose(view_light(views[name]), views[name].sensor, noise) for name in cameras}

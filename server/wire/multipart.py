@@ -15,7 +15,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from rig.errors import InputError
 from rig.messages.message import compose
 from rig.text import suggest
-from server.services.captures import About
+from server.services.captures import CaptureMetadata
 from server.services.records import Calibration
 from server.services.service import Service
 from server.services.threads import Threads
@@ -187,7 +187,7 @@ async def receive_capture(
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
         check_fields(fields, known)
-        record = await service.threads.check(service.captures.accept, archive, folder, About.of(fields))
+        record = await service.threads.check(service.captures.accept, archive, folder, CaptureMetadata.of(fields))
     return record, fields
 
 

@@ -47,7 +47,7 @@ from server.storage.events import EventLog
 from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
-from server.tasks.child import DISK_FULL, Children, WorkFailed, function_at
+from server.tasks.child import DISK_FULL, ChildProcessPool, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
@@ -68,7 +68,7 @@ class Worker:
         self.engine = open_database(settings)
         self.events = EventLog(self.engine)
         self.id = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"[:64]
-        self._children = Children(settings.concurrency, niceness=5)  # a busy machine still answers requests
+        self._children = ChildProcessPool(settings.concurrency, niceness=5)  # a busy machine still answers requests
         self._work: CaptureWork = function_at(settings.work)
         self._stop = threading.Event()
         self._webhooks = Webhooks(self.engine, settings.webhook_origins)

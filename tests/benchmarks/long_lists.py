@@ -25,7 +25,7 @@ import httpx
 import sqlalchemy as sa
 
 from server.services.jobs import Jobs, migrate
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.database import job_index, open_database
 from server.storage.job_index import words_of_job
@@ -72,7 +72,7 @@ def fill_records(store: Store, captures: int) -> Iterator[str]:
 
 def fill_jobs(engine: sa.Engine, jobs: Jobs, captures: list[str], count: int) -> None:
     """Copies the engine's rows of one real job ``count`` times: most succeeded, some failed, some wait, two run."""
-    template = jobs.submit(captures[0], Work(settings={"detail": "fine"}))
+    template = jobs.submit(captures[0], ReconstructionRequest(settings={"detail": "fine"}))
     schema = None if engine.dialect.name == "sqlite" else "dbos"
     tables = sa.MetaData()
     tables.reflect(engine, schema=schema, only=["workflow_status", "workflow_input", "workflow_output"])

@@ -14,14 +14,14 @@ from rig.formats.glb import write_glb
 from rig.formats.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import Progress
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 RADIUS_MM = 90.0
 QUALITY_MOST_MM = 2.0  # at the top of the ball; 1.0 at the bottom
 
 
 def work(
-    bench: Bench,
+    context: WorkerContext,
     report: Progress,
     *,
     capture: str,

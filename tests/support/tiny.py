@@ -11,11 +11,11 @@ from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.capture_folder import read_capture
 from rig.progress import Progress
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 
 def work(
-    bench: Bench,
+    context: WorkerContext,
     report: Progress,
     *,
     capture: str,
@@ -56,7 +56,7 @@ def work(
 
 
 def busy(
-    bench: Bench,
+    context: WorkerContext,
     report: Progress,
     *,
     capture: str,

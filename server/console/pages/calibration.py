@@ -15,7 +15,7 @@ from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.removal import removals
 from server.console.shown_messages import shown_failure
 from server.errors import Conflict, Unusable
-from server.services.captures import About
+from server.services.captures import CaptureMetadata
 from server.services.records import Calibration
 from server.services.service import Service
 
@@ -142,7 +142,7 @@ def shoot(page: Page, event: BoardForm) -> Message:
     board, service = board_of(event), page.service
     board_from_document(board)
     shots.check(board)
-    identity = service.captures.take(About(label=LABEL), board=True).id
+    identity = service.captures.take(CaptureMetadata(label=LABEL), board=True).id
     files = service.store.folder("captures", identity) / "files"
     with service.children.one() as child:
         found = child.remote(detect_shot)(files=str(files), board=board)

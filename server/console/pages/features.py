@@ -21,7 +21,7 @@ from server.console.page import Action, Page, shared, show
 from server.console.removal import removals
 from server.errors import Conflict
 from server.services.service import Service
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureQuery
 from server.storage.records import CaptureRecord
 from server.tasks.ingest import Points
@@ -234,7 +234,7 @@ def reconstruct(page: FeaturesPage, event: Sure) -> Message | None:
     picked = page.of_capture()
     if picked.points != picked.saved and save(page, event) is None:
         return None
-    job = page.service.jobs.submit(picked.capture, Work(), key=page.caller.key)
+    job = page.service.jobs.submit(picked.capture, ReconstructionRequest(), key=page.caller.key)
     page.started(job.id, opens=True)
     return compose("job-queued-watch", job=job.id[-6:])
 

@@ -23,7 +23,7 @@ from server.services.jobs import FINISHED, STATUSES
 from server.services.records import Job
 from server.services.retention import ENDED
 from server.services.service import Service
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 from server.storage.events import JobEvent
 from server.storage.job_index import JobOrder, JobQuery
 
@@ -230,7 +230,7 @@ def log_lines(events: list[JobEvent]) -> list[LogLine]:
 
 
 def restart(page: Page, event: RestartForm) -> Message:
-    wanted = Work(event.get("model") or None, chosen_settings(event))
+    wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
     page.started(job.id, opens=True)
@@ -267,7 +267,7 @@ def bulk(page: Page, event: BulkForm) -> Message:
             raise Conflict("job-active", compose("jobs-active"))
         remove_all_later(ended, service.jobs.delete, compose("jobs-with-heads", count=len(ended)), "submit")
         return compose("jobs-removed-count", count=len(ended))
-    restarted, begun = Work(), list[str]()
+    restarted, begun = ReconstructionRequest(), list[str]()
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
         "restart": lambda job: begun.append(service.jobs.restart(job, restarted, key=page.caller.key).id),

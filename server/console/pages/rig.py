@@ -30,7 +30,7 @@ from server.console.removal import removals
 from server.console.shown_messages import shown_detail
 from server.console.work_form import WorkForm, chosen_work
 from server.errors import Conflict, NotFound
-from server.services.captures import About
+from server.services.captures import CaptureMetadata
 from server.services.records import Calibration
 from server.services.service import Service
 from server.tasks.simulate import SimulatedSync
@@ -222,7 +222,7 @@ def read_report(service: Service, job_id: str) -> Report | None:
 
 
 def capture(page: Page, event: Mapping[str, str | None]) -> Message:
-    record = page.service.captures.take(About.of(event))
+    record = page.service.captures.take(CaptureMetadata.of(event))
     page.choice["shot"] = record.id
     shared.forget("rig")
     pictures = len(record.cameras)

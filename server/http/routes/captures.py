@@ -16,11 +16,11 @@ from server.http.list_schemas import BulkOut, CaptureBulk, CaptureList, Cursor, 
 from server.http.rig_schemas import CaptureChecks, HoldingsOut
 from server.http.schemas import CaptureEdit, CaptureOut, Idempotency, JobOut, NewCapture, NewFeatures, NewImport
 from server.services.bulk import each
-from server.services.captures import About
+from server.services.captures import CaptureMetadata
 from server.services.keys import Caller
 from server.services.tags import checked_tags
 from server.services.texts import PLAIN, TEXT_MOST
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
 from server.storage.records import CaptureRecord
 from server.wire.fetch import fetch_archive
@@ -42,7 +42,7 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
     """Triggers the rig now; answers once every camera delivered (201) or the fault is known (503).
 
     ``board``: pictures of the calibration board, from the cameras that deliver, for ``POST /v1/calibrations``."""
-    about = About(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
+    about = CaptureMetadata(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     return _created(service.captures.take(about, seed=wanted.seed, board=wanted.board), response)
 
 
@@ -65,7 +65,7 @@ async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, r
     if not service.settings.import_origins:
         detail = compose("imports-not-allowed")
         raise Forbidden("imports-off", detail)
-    about = About(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
+    about = CaptureMetadata(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     with service.store.incoming() as folder:
         archive = await fetch_archive(service, wanted.url, folder)
         record = await service.threads.check(service.captures.accept, archive, folder, about)
@@ -101,7 +101,7 @@ def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> B
     scope ``submit``."""
     if wanted.action == "reconstruct" and not caller.may("submit"):
         raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope="'submit'"))
-    work = Work(wanted.model, wanted.settings)
+    work = ReconstructionRequest(wanted.model, wanted.settings)
     work.check()
     actions: dict[str, Callable[[str], object]] = {
         "remove": service.captures.remove,
@@ -210,7 +210,7 @@ async def reconstruct_upload(
     record, fields = await receive_capture(service, request, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
-        wanted = Work(fields.get("model") or None, _settings_of(fields.get("settings")), name)
+        wanted = ReconstructionRequest(fields.get("model") or None, _settings_of(fields.get("settings")), name)
         submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=idempotency_key)
         job = await service.threads.disk(submit)
     except BaseException:

@@ -16,7 +16,7 @@ from server.services.bulk import each
 from server.services.jobs import FINISHED, STATUSES
 from server.services.keys import Caller
 from server.services.records import Job
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JobWebhook
 from server.wire.problems import Responses, documented
@@ -34,7 +34,7 @@ def submit_job(
     """Queues a reconstruction. The same Idempotency-Key with the same request returns the first job."""
     job = service.jobs.submit(
         wanted.capture_id,
-        Work(wanted.model, wanted.settings, wanted.name, _webhook(wanted)),
+        ReconstructionRequest(wanted.model, wanted.settings, wanted.name, _webhook(wanted)),
         key=caller.key,
         idempotency_key=idempotency_key,
         queue=wanted.queue,
@@ -46,7 +46,7 @@ def submit_job(
 @router.post("/sessions/{session_id}/jobs", status_code=202, responses=documented(400, 404, 413, 415, 507))
 def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wanted: NewSessionJobs) -> JobBatch:
     """Queues a reconstruction of every capture of a session."""
-    work = Work(wanted.model, wanted.settings)
+    work = ReconstructionRequest(wanted.model, wanted.settings)
     jobs = service.jobs.submit_session(session_id, work, key=caller.key, priority=wanted.priority)
     return JobBatch(jobs=[JobOut.model_validate(job) for job in jobs])
 
@@ -80,7 +80,7 @@ def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkO
     """One action on many jobs; what cannot be done to one is said and holds no other up."""
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
-        "restart": lambda job: service.jobs.restart(job, Work(), key=caller.key),
+        "restart": lambda job: service.jobs.restart(job, ReconstructionRequest(), key=caller.key),
         "remove": service.jobs.delete,
     }
     return BulkOut.model_validate(each(wanted.ids, actions[wanted.action]))
@@ -132,7 +132,7 @@ def restart_job(
     service: ServiceOf, caller: Submitter, job_id: str, response: Response, wanted: Restart | None = None
 ) -> JobOut:
     """A new job for the same capture, perhaps with another model or settings; ``restart_of`` names the old one."""
-    work = Work(wanted.model, wanted.settings) if wanted else Work()
+    work = ReconstructionRequest(wanted.model, wanted.settings) if wanted else ReconstructionRequest()
     return _accepted(service.jobs.restart(job_id, work, key=caller.key), response)
 
 

@@ -17,7 +17,7 @@ from rig.messages.message import compose
 from server.errors import DiskFull, NotFound, Refused, Unavailable
 from server.http.auth import ServiceOf, require
 from server.http.tus import append
-from server.services.captures import About
+from server.services.captures import CaptureMetadata
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import UploadRecord
@@ -57,7 +57,7 @@ def tus_create(
     if not upload_length or not (upload_length.isascii() and upload_length.isdigit()) or len(upload_length) > 18:
         raise Problem(400, "upload-length", compose("upload-length-missing"))
     fields = _metadata(upload_metadata)
-    about = About.of(fields)
+    about = CaptureMetadata.of(fields)
     if about.session is not None:
         service.store.session(about.session)
     record = service.uploads.create(int(upload_length), fields, caller.key)
@@ -132,7 +132,7 @@ def _finish(service: Service, record: UploadRecord) -> UploadRecord:
     try:
         with service.store.incoming() as folder:
             data = service.uploads.data(record)
-            capture = service.captures.accept(data, folder, About.of(record.fields))
+            capture = service.captures.accept(data, folder, CaptureMetadata.of(record.fields))
     except (Unavailable, DiskFull):  # these may go well another time
         raise
     except (InputError, Refused):

@@ -15,7 +15,7 @@ from rig.formats.capture_folder import read_capture
 from rig.formats.serials import BODY_SERIAL, DNG_SERIAL, EXIF_IFD, camera_serial, with_serials
 from rig.messages.message import texts_of
 from server.cli.check import checked
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 from server.tasks.ingest import ingest_archive
 from tests.support.services import small_capture
 
@@ -78,7 +78,7 @@ def test_pictures_are_filed_by_their_bodies(tmp_path: Path) -> None:
     pack_folder(tmp_path / "shot", tmp_path / "shot.tar")
     (tmp_path / "in" / "files").mkdir(parents=True)
     content = ingest_archive(
-        Bench(), lambda *_: None, archive=str(tmp_path / "shot.tar"), folder=str(tmp_path / "in" / "files"),
+        WorkerContext(), lambda *_: None, archive=str(tmp_path / "shot.tar"), folder=str(tmp_path / "in" / "files"),
         limits=ArchiveLimits(members=100, total_bytes=10**7, ratio=100.0), image_pixels=10**8,
     )  # fmt: skip
     assert {f"{kind}/cam0{i}.jpg" for kind in ("images", "background") for i in range(3)} <= content.inputs.keys()

@@ -30,7 +30,7 @@ from server.console.work_form import chosen_work
 from server.errors import Conflict, Forbidden, NotFound, Unknown
 from server.services.keys import Keys
 from server.services.presets import settings_of
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.events import JobEvent
 
@@ -270,9 +270,11 @@ def test_the_restart_form_becomes_settings() -> None:
 
 
 def test_the_captures_form_becomes_work() -> None:
-    assert chosen_work({"id": "", "model": "", "method": "", "template": ""}) == Work(None, {})
+    assert chosen_work({"id": "", "model": "", "method": "", "template": ""}) == ReconstructionRequest(None, {})
     work = chosen_work({"id": "", "model": "ict", "method": "texture", "template": "flame"})
-    assert work == Work("ict", {"outputs": {"formats": ["glb", "ply", "obj", "usdz"], "template": "flame"}})
+    assert work == ReconstructionRequest(
+        "ict", {"outputs": {"formats": ["glb", "ply", "obj", "usdz"], "template": "flame"}}
+    )
     assert settings_of("texture") == {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}}  # as it was
 
 

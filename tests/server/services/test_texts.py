@@ -3,16 +3,20 @@
 import pytest
 
 from rig.errors import InputError
-from server.services.captures import About
+from server.services.captures import CaptureMetadata
 from server.services.texts import TEXT_MOST, check_texts
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 
 
 @pytest.mark.parametrize("text", ["a\0b", "\x1b[31m", "\x7f", "half \ud800", "a" * (TEXT_MOST + 1)])
 def test_what_no_database_keeps_is_refused_and_named(text: str) -> None:
     with pytest.raises(InputError, match="form: label: "):
         check_texts({"label": text, "consent": "signed"})
-    for made in (lambda: About(label=text), lambda: About.of({"label": text}), Work(name=text).check):
+    for made in (
+        lambda: CaptureMetadata(label=text),
+        lambda: CaptureMetadata.of({"label": text}),
+        ReconstructionRequest(name=text).check,
+    ):
         with pytest.raises(InputError, match=r"(label|name): "):
             made()
 

@@ -8,7 +8,7 @@ from pipeline.eigenheads.data_folder import DATA
 from pipeline.eigenheads.model_names import model_path
 from rig.errors import InputError
 from rig.messages.message import Message
-from server.services.work import Work
+from server.services.work import ReconstructionRequest
 from tests.support.template_headers import header_file
 
 
@@ -24,14 +24,14 @@ def _data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def refusal_of(model: str | None = None, **settings: object) -> tuple[str, tuple[Message, ...]]:
     with pytest.raises(InputError) as refused:
-        Work(model, settings).check()
+        ReconstructionRequest(model, settings).check()
     return refused.value.subject, refused.value.faults
 
 
 def test_what_can_be_done_is_not_refused() -> None:
-    Work().check()
-    Work("makehuman-138", {"outputs": {"template": "flame"}}).check()
-    Work("other", {"outputs": {"template": None}}).check()
+    ReconstructionRequest().check()
+    ReconstructionRequest("makehuman-138", {"outputs": {"template": "flame"}}).check()
+    ReconstructionRequest("other", {"outputs": {"template": None}}).check()
 
 
 def test_a_template_that_there_is_not_or_that_another_model_carries_is_refused() -> None:

@@ -15,7 +15,7 @@ from rig.formats.capture_folder import read_capture, write_capture
 from rig.formats.images import read_image, write_image
 from rig.messages.message import texts_of
 from server.storage.records import CaptureContent
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 from server.tasks.ingest import check_capture, ingest_archive
 from tests.rig.acquisition.test_session import flat_rig
 from tests.server.http.test_hostile import SPOILT
@@ -85,7 +85,7 @@ def test_an_upload_keeps_every_file_of_another_programs_cameras(tmp_path: Path, 
     pack_folder(folder, tmp_path / "capture.tar")
     kept.mkdir()
     archive = {"archive": str(tmp_path / "capture.tar"), "folder": str(kept), "limits": ArchiveLimits()}
-    ingest_archive(Bench(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST)
+    ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST)
     _, read = read_capture(kept)  # as a job reads it
     assert sorted(read.names) == sorted(rig.names)
 
@@ -96,7 +96,7 @@ def kept_of(folder: Path, tmp_path: Path) -> tuple[CaptureContent, Path]:
     kept = tmp_path / "kept"
     kept.mkdir()
     archive = {"archive": str(tmp_path / "capture.tar"), "folder": str(kept), "limits": ArchiveLimits()}
-    return ingest_archive(Bench(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST), kept
+    return ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=PIXELS_MOST), kept
 
 
 def test_an_upload_is_kept_under_its_cameras_names(tmp_path: Path) -> None:

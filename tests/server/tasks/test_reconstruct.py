@@ -17,7 +17,7 @@ from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.sensor.preset import PRESET
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.subjects import drawn_subject
 
@@ -38,10 +38,10 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     stored = {"code": "scale-assumed", "message": "as if these cameras had been found from the photographs"}
     digest = hashlib.sha256((tmp_path / "capture" / "cameras.json").read_bytes()).hexdigest()
     (tmp_path / "capture" / "calibration.json").write_text(json.dumps({"cameras_sha256": digest, "told": [stored]}))
-    bench, heard = Bench(), []
-    bench.keep("renderer", lambda: renderer)
+    context, heard = WorkerContext(), []
+    context.keep("renderer", lambda: renderer)
     reconstruct_capture(
-        bench,
+        context,
         lambda stage, fraction: heard.append((stage, fraction)),
         capture=str(tmp_path / "capture"),
         result=str(tmp_path / "result"),
@@ -76,11 +76,11 @@ def test_an_empty_studio_is_refused_and_leaves_no_result(
 ) -> None:
     nobody = {name: plates[0] for name, plates in shot.capture.backgrounds.items()}
     write_capture(tmp_path / "capture", replace(shot.capture, images=nobody, features={}), shot.rig)
-    bench = Bench()
-    bench.keep("renderer", lambda: renderer)
+    context = WorkerContext()
+    context.keep("renderer", lambda: renderer)
     with pytest.raises(TooFewViews, match="cam06"):
         reconstruct_capture(
-            bench,
+            context,
             lambda stage, fraction: None,
             capture=str(tmp_path / "capture"),
             result=str(tmp_path / "result"),
