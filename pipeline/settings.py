@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 from pipeline.diagnostics import WARNING_CODES
 from rig.errors import InputError
 from rig.messages.message import Message, compose
-from rig.text import encodes, suggest
+from rig.text import is_encodable, suggest
 
 T = TypeVar("T")
 
@@ -363,7 +363,7 @@ def _number(value: Any) -> float | None:
 
 
 def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and encodes(value)
+    return isinstance(value, str) and is_encodable(value)
 
 
 def _are_texts(value: Any) -> bool:

@@ -39,8 +39,8 @@ class Distortion:
     def opencv(self) -> Float[np.ndarray, " 5"]:
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
-    def turning_radius(self) -> float:
-        """Radius (of ``X / Z``) where the radial model stops growing: farther points would fold back into the image."""
+    def max_valid_radius(self) -> float:
+        """Returns the radius (of ``X / Z``) where the radial model stops growing: farther points fold back."""
         return _turning_radius(self.k1, self.k2, self.k3)
 
     def apply(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
@@ -55,7 +55,7 @@ class Distortion:
         """Inverse of ``apply`` by Newton's method; NaN where no point inside the turning radius maps there."""
         if self.is_zero:
             return distorted.copy()
-        limit = self.turning_radius()
+        limit = self.max_valid_radius()
         guess = distorted.copy()
         for _ in range(20):
             miss = self.apply(guess) - distorted
@@ -151,7 +151,7 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = lens_image(points, self.intrinsics.values())
             radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
-            bad = (points[:, 2] <= 0) | (radius > self.intrinsics.distortion.turning_radius())
+            bad = (points[:, 2] <= 0) | (radius > self.intrinsics.distortion.max_valid_radius())
         pixels[bad] = np.nan
         return pixels
 
@@ -172,7 +172,7 @@ class CameraStack:
             np.array([camera.camera_from_world.rotation for camera in cameras]),
             np.array([camera.camera_from_world.translation for camera in cameras]),
             np.array([camera.intrinsics.values() for camera in cameras]),
-            np.array([camera.intrinsics.distortion.turning_radius() for camera in cameras]),
+            np.array([camera.intrinsics.distortion.max_valid_radius() for camera in cameras]),
         )
 
     def project_with_jacobian(

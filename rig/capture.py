@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from rig.image import ImageRgb
 from rig.messages.message import Message
 
-Filed = TypeVar("Filed")
+Content = TypeVar("Content")
 
 
 Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
@@ -33,14 +33,14 @@ class Capture:
     soft_masks: Mapping[str, UInt8[np.ndarray, "h w"]] = field(default_factory=dict)
 
 
-def refiled(
+def reassign_images(
     capture: Capture,
     *,
     pictures: Mapping[str, str] = MappingProxyType({}),
     plates: Mapping[str, str] = MappingProxyType({}),
     points: Mapping[str, str] = MappingProxyType({}),
 ) -> Capture:
-    """The capture as it would be had some of its files other names.
+    """Returns the capture with some of its images, clean plates and points assigned to other cameras.
 
     Args:
         pictures: for a camera, the name under which its image and mask are filed now.
@@ -48,18 +48,18 @@ def refiled(
         points: the same of the feature points that were picked in its image.
     """
 
-    def reassigned(filed: Mapping[str, Filed], source: Mapping[str, str]) -> dict[str, Filed]:
+    def reassign(filed: Mapping[str, Content], source: Mapping[str, str]) -> dict[str, Content]:
         wanted = {name: source.get(name, name) for name in filed.keys() | source.keys()}
         return {name: filed[wanted[name]] for name in sorted(wanted) if wanted[name] in filed}
 
     return Capture(
-        reassigned(capture.images, pictures),
-        reassigned(capture.backgrounds, plates),
-        reassigned(capture.masks, pictures),
-        {landmark: reassigned(views, points) for landmark, views in capture.features.items()},
+        reassign(capture.images, pictures),
+        reassign(capture.backgrounds, plates),
+        reassign(capture.masks, pictures),
+        {landmark: reassign(views, points) for landmark, views in capture.features.items()},
         _renamed(capture.digests, {"images": pictures, "masks": pictures, "background": plates}),
         capture.remarks,
-        reassigned(capture.soft_masks, pictures),
+        reassign(capture.soft_masks, pictures),
     )
 
 

@@ -108,14 +108,14 @@ def _convention_fault(rig: Rig) -> Message | None:
     """Poses that look at no common point as they are written, and all at one when read in another convention."""
     if _share_looking_at_one_point(rig) > DIVERGING_MOST:
         return None
-    for other, read, remedy in readings(rig):
+    for other, read, remedy in alternative_conventions(rig):
         if _share_looking_at_one_point(read) >= CONVERGING_LEAST:
             return compose("pose-convention", held=other, remedy=remedy)
     return None
 
 
-def readings(rig: Rig) -> list[tuple[Message, Rig, Message]]:
-    """The rig with its poses read in other conventions: what they would hold, the rig so read, and the remedy."""
+def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
+    """Reads the poses in other conventions. Returns what each would hold, the rig so read, and the remedy."""
     return [
         (other, Rig(tuple(replace(c, camera_from_world=read(c.camera_from_world)) for c in rig)), remedy)
         for other, (read, remedy) in _CONVENTIONS.items()

@@ -4,8 +4,8 @@ import difflib
 from collections.abc import Iterable
 
 
-def encodes(text: str) -> bool:
-    """Whether a text can be written as UTF-8: an escape of JSON can name half of a character, which cannot."""
+def is_encodable(text: str) -> bool:
+    """Tells whether a text can be written as UTF-8: an escape of JSON can name half of a character, which cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:

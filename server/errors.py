@@ -27,16 +27,16 @@ class Refused(EigenheadError):
         self.errors = tuple(message_of(error) for error in errors)
 
 
-class Unknown(Refused):
-    """A key that is needed and was not given, or is nobody's."""
+class Unauthenticated(Refused):
+    """Refuses a caller whose key is missing or belongs to nobody."""
 
 
 class Forbidden(Refused):
-    """What this caller may not do."""
+    """Refuses what this caller may not do."""
 
 
 class NotFound(Refused):
-    """What is not there."""
+    """Refuses what does not exist."""
 
     def __init__(self, what: Message, identity: str, hint: Message | None = None) -> None:
         """``what``: a thing of the catalogue; ``hint``: where to look for what there is."""
@@ -45,27 +45,27 @@ class NotFound(Refused):
 
 
 class Conflict(Refused):
-    """What the state of a thing forbids."""
+    """Refuses what the state of a thing forbids."""
 
 
 class Gone(Refused):
-    """What was there."""
+    """Refuses what existed and was removed."""
 
 
 class TooLarge(Refused):
-    """More bytes than the service takes."""
+    """Refuses more bytes than the service takes."""
 
 
-class Unusable(Refused):
-    """An input that is understood and cannot be used."""
+class InvalidInput(Refused):
+    """Refuses an input that is understood and cannot be used."""
 
 
 class TooMany(Refused):
-    """More at once than the caller may have."""
+    """Refuses more at once than the caller may have."""
 
 
 class Unavailable(Refused):
-    """What cannot be done now, and may go well another time: a rig, a worker."""
+    """Refuses what cannot be done now and may succeed later: a rig, a worker."""
 
 
 class DiskFull(Refused):
@@ -73,9 +73,9 @@ class DiskFull(Refused):
         super().__init__("disk-full", compose("service-disk-full"))
 
 
-def unusable_input(error: InputError) -> Unusable:
-    """An InputError as a refusal; its kind follows from its subject."""
+def unusable_input(error: InputError) -> InvalidInput:
+    """Converts an InputError to a refusal; its kind follows from its subject."""
     kind = type_of_input(error.subject)
     found = compose("faults-found", subject=error.subject, count=len(error.faults))
     detail = compose("input-unusable", found=found)
-    return Unusable(kind, detail, error.faults)
+    return InvalidInput(kind, detail, error.faults)

@@ -28,7 +28,7 @@ class Metrics:
         self.captures = Gauge("eigenhead_captures", "Captures kept", registry=self.registry)
         self.free = Gauge("eigenhead_disk_free_bytes", "Free space of the data folder", registry=self.registry)
         self.memory = Gauge("eigenhead_peak_memory_bytes", "Peak memory of the service process", registry=self.registry)
-        self.set_aside = Gauge("eigenhead_damaged_records", "Damaged records set aside", registry=self.registry)
+        self.quarantined = Gauge("eigenhead_damaged_records", "Damaged records set aside", registry=self.registry)
         self.lag = Histogram(
             "eigenhead_event_loop_lag_seconds",
             "How late the event loop wakes",
@@ -47,5 +47,5 @@ class Metrics:
         self.captures.set(captures)
         self.free.set(free)
         self.memory.set(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
-        self.set_aside.set(damaged)
+        self.quarantined.set(damaged)
         return generate_latest(self.registry)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import httpx
 
 from rig.messages.message import Message, compose
-from server.errors import Unusable
+from server.errors import InvalidInput
 
 ANY_PUBLIC = "https://*"
 PORTS = {"http": 80, "https": 443}
@@ -35,7 +35,7 @@ class Target:
 
 
 def target(url: str, origins: Collection[str]) -> Target:
-    """Where a request for ``url`` goes, if it may. Blocks on the name service. Raises Unusable ("url-refused")."""
+    """Where a request for ``url`` goes, if it may. Blocks on the name service. Raises InvalidInput ("url-refused")."""
     wanted = parsed(url)
     if wanted.userinfo:
         raise _refused(compose("url-with-user"))
@@ -54,7 +54,7 @@ def target(url: str, origins: Collection[str]) -> Target:
 
 
 def parsed(url: str) -> httpx.URL:
-    """A web address whose host can be looked up; nothing is. Raises Unusable ("url-refused")."""
+    """A web address whose host can be looked up; nothing is. Raises InvalidInput ("url-refused")."""
     try:
         wanted = httpx.URL(url)
         shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked
@@ -95,5 +95,5 @@ def _addresses(host: str, port: int) -> list[Address]:
     return [ipaddress.ip_address(str(place[0]).partition("%")[0]) for *_, place in found]
 
 
-def _refused(why: Message) -> Unusable:
-    return Unusable("url-refused", compose("url-refused", why=why), [compose("field-url-refused", why=why)])
+def _refused(why: Message) -> InvalidInput:
+    return InvalidInput("url-refused", compose("url-refused", why=why), [compose("field-url-refused", why=why)])

@@ -38,7 +38,7 @@ from pipeline.settings import FittingSettings, Settings
 from pipeline.silhouettes import own_pictures as own_pictures_module
 from pipeline.silhouettes.own_pictures import ExchangedPictures, OwnPictures, own_pictures
 from pipeline.silhouettes.segment import segment
-from rig.capture import Capture, refiled
+from rig.capture import Capture, reassign_images
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -104,7 +104,7 @@ def _exchanged_row(
     row: Row = {"worn": worn, "good_codes": [warning.code for warning in good.warnings], "error_mm": base_mm}
     for kind in KINDS:
         filed = _planted(kind, rig, rng)
-        plates_follow = refiled(capture, pictures=filed, plates=filed)
+        plates_follow = reassign_images(capture, pictures=filed, plates=filed)
         try:
             found = _asked(plates_follow, rig)
         except ExchangedPictures as refusal:

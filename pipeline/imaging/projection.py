@@ -12,7 +12,7 @@ RADIUS_MOST = 1e6  # instead of an endless turning radius, which compiled loops 
 def packed_lens(camera: Camera) -> Float[np.ndarray, " 10"]:
     """fx fy cx cy k1 k2 p1 p2 k3 and the turning radius."""
     k = camera.intrinsics
-    return np.append(k.values(), min(k.distortion.turning_radius(), RADIUS_MOST))
+    return np.append(k.values(), min(k.distortion.max_valid_radius(), RADIUS_MOST))
 
 
 def packed_camera(camera: Camera) -> Float[np.ndarray, " 22"]:

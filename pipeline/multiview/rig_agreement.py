@@ -22,7 +22,7 @@ from pipeline.multiview.camera_assignment import FITTING_MISFIT, INSET_PX, mean_
 from pipeline.multiview.tangency import outer_hull
 from rig.camera import Intrinsics
 from rig.messages.message import Message, compose
-from rig.plausibility import readings as other_conventions
+from rig.plausibility import alternative_conventions
 from rig.rig import Rig
 
 CAMERAS_LEAST = 4  # three have six planes at most: too few to refuse a capture by
@@ -56,7 +56,7 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
     square = all(camera.intrinsics.width == camera.intrinsics.height for camera in seen)
     readings = (*_READINGS, *(_SQUARE_READINGS if square else ()))
     found = [(_median_misfit(_read(hulls, seen, turn), seen), told) for told, turn in readings]
-    for other, read, remedy in other_conventions(seen):
+    for other, read, remedy in alternative_conventions(seen):
         told = compose("other-convention", convention=other, remedy=remedy)
         found.append((_median_misfit(hulls, read), told))
     believed = [(misfit, told) for misfit, told in found if misfit <= RIGHT_MOST]

@@ -27,7 +27,7 @@ from pipeline.results.write_template import write_template
 from pipeline.stages.bust import Bust
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
-from rig.capture import Capture, refiled
+from rig.capture import Capture, reassign_images
 from rig.formats.glb import write_glb
 from rig.formats.images import write_image
 from rig.formats.ply import write_ply
@@ -41,7 +41,7 @@ THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and e
 def write_result(folder: Path, result: Reconstruction, capture: Capture, template: Template | None = None) -> None:
     """Writes every file of the result of ``capture``, as it was read, and in the order of ``template``; each under a
     temporary name first. Raises OSError where the disk is full."""
-    capture = refiled(capture, pictures=result.views.assignment)
+    capture = reassign_images(capture, pictures=result.views.assignment)
     head, posable = head_mesh(result), result.evidence.posable
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
         jobs = [

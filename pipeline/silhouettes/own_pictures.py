@@ -25,7 +25,7 @@ from pipeline.multiview.camera_assignment import (
 )
 from pipeline.multiview.rig_agreement import loose_outlines, wrong_rig
 from pipeline.multiview.triangulation import NoPoint, triangulate
-from rig.capture import Capture, Features, refiled
+from rig.capture import Capture, Features, reassign_images
 from rig.errors import EigenheadError
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -84,7 +84,7 @@ def own_pictures(
     plates = misplaced_plates(capture, rig)
     if plates and exchanged == "refuse":
         raise ExchangedPictures(ring_messages(plates, compose("what-plates")), doubtful=False)
-    capture = refiled(capture, plates=plates) if plates else capture
+    capture = reassign_images(capture, plates=plates) if plates else capture
     silhouettes = segmented(capture)
     duplicates = duplicate_views(capture, silhouettes, rig)
     distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
@@ -191,7 +191,7 @@ def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[st
 def _filed_back(capture: Capture, pictures: Mapping[str, str], rig: Rig) -> Capture:
     """Pictures and plates under their cameras. Points may have been picked in the pictures as they were filed, or
     before: whichever contradicts itself less."""
-    moved = refiled(capture, pictures=pictures, plates=pictures, points=pictures)
+    moved = reassign_images(capture, pictures=pictures, plates=pictures, points=pictures)
     kept = replace(moved, features=capture.features)
     return min((moved, kept), key=lambda filed: _contradiction(filed.features, rig))
 

@@ -82,7 +82,7 @@ def lens_limit(camera: Camera) -> float:
     radii = np.linalg.norm(camera.undistort(corners), axis=1)
     radii = radii[np.isfinite(radii)]
     farthest = 2.0 * radii.max() if len(radii) == 4 else np.inf
-    return float(min(farthest, k.distortion.turning_radius(), 1e3))
+    return float(min(farthest, k.distortion.max_valid_radius(), 1e3))
 
 
 def instances(
@@ -101,7 +101,7 @@ def instances(
         pose = camera.camera_from_world
         row[:12] = np.column_stack([pose.rotation, pose.apply(origin_world)]).ravel()
         row[12:21] = camera.intrinsics.values()
-        row[21:24] = min(camera.intrinsics.distortion.turning_radius(), 1e6), lens_limit(camera), NEAR_MM
+        row[21:24] = min(camera.intrinsics.distortion.max_valid_radius(), 1e6), lens_limit(camera), NEAR_MM
         row[24:28] = tile
         if depth_ranges is not None:
             near, far = depth_ranges[index]

@@ -16,7 +16,7 @@ from starlette.types import Scope
 from rig.atomic_write import write_atomically
 from rig.messages.message import compose
 from server.address import is_loopback
-from server.errors import Forbidden, Unknown
+from server.errors import Forbidden, Unauthenticated
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.service import Service
 from server.settings import ServiceSettings
@@ -44,9 +44,9 @@ def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
 
 
 def permit(caller: Caller | None, scope: str) -> Caller:
-    """``caller``, if it may do ``scope``. Raises Unknown, Forbidden."""
+    """``caller``, if it may do ``scope``. Raises Unauthenticated, Forbidden."""
     if caller is None:
-        raise Unknown("key-missing", compose("sign-in-again"))
+        raise Unauthenticated("key-missing", compose("sign-in-again"))
     if not caller.may(scope):
         raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope=f"{scope!r}"))
     return caller

@@ -13,7 +13,7 @@ from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from server.http.json_bodies import JsonBodies
-from server.http.linger import Linger
+from server.http.linger import DrainRequestBody
 from server.http.openapi import describe, operation_name
 from server.http.routes import calibrations, captures, jobs, operations, rig, sessions, storage, uploads
 from server.metrics import Metrics
@@ -77,7 +77,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
             expose_headers=EXPOSED,
         )
     app.add_middleware(Watch, metrics=metrics)
-    app.add_middleware(Linger)  # outside Watch, which times the answer and not the client
+    app.add_middleware(DrainRequestBody)  # outside Watch, which times the answer and not the client
     describe(app)
     return app
 

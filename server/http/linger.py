@@ -16,7 +16,7 @@ PATIENCE_S = 2.0  # the rest of a short upload; who sends gigabytes shall hear s
 LINGER_S = 10.0  # a proxy hangs up within milliseconds of a whole answer; a client that sends on gets no longer
 
 
-class Linger:
+class DrainRequestBody:
     """Answers a request whose body was not read, on a connection that closes, once no more of it comes, or after
     ``patience_s``; then ends the answer once no more comes, or after ``linger_s``."""
 

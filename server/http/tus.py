@@ -13,7 +13,7 @@ from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.storage.records import UploadRecord
 from server.wire.multipart import BLOCK_BYTES
-from server.wire.patience import SILENT_S, patiently
+from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
 from server.wire.problems import Problem
 
 
@@ -23,7 +23,7 @@ async def append(
     stream: AsyncIterator[bytes],
     checksum: str | None,
     threads: Threads,
-    silent_s: float = SILENT_S,
+    silent_s: float = IDLE_TIMEOUT_S,
 ) -> int:
     """Appends a PATCH's body and returns the new offset. A wrong checksum takes the bytes back (460); a client that is
     silent for ``silent_s`` is given up (408), and what it sent stays."""
@@ -32,7 +32,7 @@ async def append(
     target = await threads.disk(path.open, "ab")
     size, pending, complete = before, bytearray(), False
     try:
-        async for chunk in patiently(stream, silent_s):
+        async for chunk in with_idle_timeout(stream, silent_s):
             size += len(chunk)
             if size > record.length:
                 raise Problem(413, "upload-too-large", compose("upload-longer-than-announced", bytes=record.length))

@@ -80,7 +80,7 @@ def _rig(service: Service) -> Check:
 
 
 def _records(service: Service) -> Check:
-    names = service.store.set_aside()
+    names = service.store.list_quarantined()
     detail = compose("records-damaged", count=len(names), names=names[:5]) if names else compose("no-record-damaged")
     return Check(ok=True, detail=detail)
 
@@ -88,7 +88,7 @@ def _records(service: Service) -> Check:
 def exposition(service: Service) -> bytes:
     """The metrics of this moment, in Prometheus' text format."""
     jobs = service.jobs.counts()
-    captures, damaged = len(service.store.ids("captures")), len(service.store.set_aside())
+    captures, damaged = len(service.store.ids("captures")), len(service.store.list_quarantined())
     return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)
 
 

@@ -86,7 +86,7 @@ class Jobs:
     ) -> Job:
         """Queues a reconstruction of a capture and returns the job. A known idempotency key returns the first job.
 
-        Raises InputError for work that cannot be done, Unusable for a webhook that may not be called, NotFound,
+        Raises InputError for work that cannot be done, InvalidInput for a webhook that may not be called, NotFound,
         DiskFull, Conflict where the key's first request was another one, TooMany.
         """
         wanted.check()

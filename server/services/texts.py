@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from rig.errors import InputError
 from rig.messages.message import compose
-from rig.text import encodes
+from rig.text import is_encodable
 
 TEXT_MOST = 500  # characters
 PLAIN = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f]*$"  # no control characters but tabs and line breaks, which notes have
@@ -18,7 +18,7 @@ def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
     for name, text in texts.items():
         if text is not None and len(text) > TEXT_MOST:
             faults.append(compose("text-too-long", field=name, most=TEXT_MOST))
-        elif text is not None and (CONTROL.search(text) or not encodes(text)):
+        elif text is not None and (CONTROL.search(text) or not is_encodable(text)):
             faults.append(compose("text-with-control-characters", field=name))
     if faults:
         raise InputError(subject, faults)

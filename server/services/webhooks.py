@@ -40,7 +40,7 @@ class Webhooks:
         self._engine, self._origins = engine, origins
 
     def add(self, url: str) -> NewWebhook:
-        """The new webhook with its secret, which is shown this once. Raises Unusable for what is no web address."""
+        """The new webhook with its secret, which is shown this once. Raises InvalidInput for what is no web address."""
         parsed(url)
         secret = "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode()
         made = NewWebhook(secrets.token_hex(14), url, secret)
@@ -82,8 +82,11 @@ class Webhooks:
             enqueue(options, message)
 
     def post(self, message: WebhookMessage) -> int:
-        """One attempt. Raises httpx.HTTPError where the other side does not take it, Unusable where a job's own webhook
-        may not be called any more; a removed webhook is done."""
+        """Makes one attempt to deliver; a removed webhook needs none.
+
+        Raises httpx.HTTPError where the other side does not take it, and InvalidInput where a job's own webhook may not
+        be called any more.
+        """
         if "own" in message:
             return self._post_own(message, message["own"])
         with self._engine.connect() as connection:

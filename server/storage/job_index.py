@@ -14,7 +14,7 @@ from sqlalchemy.exc import IntegrityError
 
 from server.storage.database import capture_index, job_index
 from server.storage.library import captures_with
-from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, words_of
+from server.storage.pages import CursorPage, Order, contains, folded, is_or_ends, page_of, words_of
 from server.storage.records import JobRequest
 
 ENQUEUED = ("DELAYED", "ENQUEUED")
@@ -80,7 +80,7 @@ class JobIndex:
                 )
         return len(bare)
 
-    def page(self, query: JobQuery, limit: int, cursor: str | None = None) -> PageOf:
+    def page(self, query: JobQuery, limit: int, cursor: str | None = None) -> CursorPage:
         """Raises InputError for a cursor of another list."""
         status = self._status.c
         rows = sa.select().select_from(self._status).where(status.name == self._workflow)

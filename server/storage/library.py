@@ -14,7 +14,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DataError
 
 from server.storage.database import capture_index, capture_tags, scrub, session_index
-from server.storage.pages import Order, PageOf, contains, folded, is_or_ends, page_of, storable, words_of
+from server.storage.pages import CursorPage, Order, contains, folded, is_or_ends, page_of, storable, words_of
 from server.storage.records import CaptureRecord, SessionRecord
 from server.storage.store import Store
 
@@ -76,7 +76,7 @@ class Library:
         """Lets go of what removed rows have left in the database's files."""
         scrub(self._engine)
 
-    def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> PageOf:
+    def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> CursorPage:
         """Raises InputError for a cursor of another list."""
         table = capture_index.c
         rows = sa.select().select_from(capture_index)
@@ -137,7 +137,7 @@ class Library:
         with self._engine.connect() as connection:
             return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
 
-    def sessions(self, sought: str, limit: int, cursor: str | None = None) -> PageOf:
+    def sessions(self, sought: str, limit: int, cursor: str | None = None) -> CursorPage:
         """Newest first. Raises InputError for a cursor of another list."""
         rows = sa.select().select_from(session_index)
         for word in words_of(sought):

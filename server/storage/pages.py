@@ -20,9 +20,11 @@ Value = str | int | None
 
 
 @dataclass(frozen=True, slots=True)
-class PageOf:
-    """Ids of one page, in their order; ``next`` is the cursor of the page after it, None on the last; ``total`` counts
-    what all pages hold."""
+class CursorPage:
+    """Holds the ids of one page, in their order.
+
+    ``next`` is the cursor of the page after it, None on the last; ``total`` counts what all pages hold.
+    """
 
     ids: tuple[str, ...]
     next: str | None
@@ -92,7 +94,7 @@ def no_cursor() -> InputError:
 
 def page_of(
     connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
-) -> PageOf:
+) -> CursorPage:
     """One page of ``rows``, which select nothing yet. ``searched``: finding the rows is what takes long, so that they
     are counted as they are found. Raises InputError."""
     wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
@@ -107,7 +109,7 @@ def page_of(
         total = found[0].total
     more = len(found) > limit
     ids = tuple(row.id for row in found[:limit])
-    return PageOf(ids, cursor_of(found[limit - 1].value, ids[-1], total) if more else None, total)
+    return CursorPage(ids, cursor_of(found[limit - 1].value, ids[-1], total) if more else None, total)
 
 
 def words_of(sought: str) -> Sequence[str]:

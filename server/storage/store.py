@@ -301,8 +301,8 @@ class Store:
                 if entry.is_dir(follow_symlinks=False):
                     yield from unfinished(Path(entry))
 
-    def set_aside(self) -> list[str]:
-        """Names of the damaged records that were moved out of the way."""
+    def list_quarantined(self) -> list[str]:
+        """Lists the names of the damaged records that were moved out of the way."""
         return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
 
     def _read(self, path: Path, wanted: RecordFormat[T], whole: Path) -> T | None:

@@ -7,12 +7,12 @@ import anyio
 import httpx
 
 from rig.messages.message import Message, compose
-from server.errors import Unusable
+from server.errors import InvalidInput
 from server.origins import target
 from server.services.service import Service
 from server.services.uploads import too_large
 from server.wire.multipart import BLOCK_BYTES
-from server.wire.patience import SILENT_S
+from server.wire.patience import IDLE_TIMEOUT_S
 
 REDIRECTS_MOST = 5
 CONNECT_S = 10.0
@@ -21,10 +21,10 @@ CONNECT_S = 10.0
 async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
     """Writes what lies at ``url`` into ``folder``; returns its path.
 
-    Raises Unusable for an address that may not be called ("url-refused") and for a server that does not give the
+    Raises InvalidInput for an address that may not be called ("url-refused") and for a server that does not give the
     archive ("import-failed"), TooLarge, DiskFull.
     """
-    patience = httpx.Timeout(SILENT_S, connect=CONNECT_S)
+    patience = httpx.Timeout(IDLE_TIMEOUT_S, connect=CONNECT_S)
     try:
         with anyio.fail_after(service.settings.import_s):
             async with httpx.AsyncClient(trust_env=False, timeout=patience) as client:  # a proxy would judge nothing
@@ -73,5 +73,5 @@ async def _receive(service: Service, answer: httpx.Response, path: Path) -> None
         raise _failed(compose("import-cut-off", received=received, length=length))
 
 
-def _failed(why: Message) -> Unusable:
-    return Unusable("import-failed", compose("import-failed", why=why), [why])
+def _failed(why: Message) -> InvalidInput:
+    return InvalidInput("import-failed", compose("import-failed", why=why), [why])

@@ -23,7 +23,7 @@ from server.services.uploads import too_large
 from server.settings import ServiceSettings
 from server.storage.records import CaptureRecord, JsonObject
 from server.storage.store import Store
-from server.wire.patience import SILENT_S, patiently
+from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
 from server.wire.problems import Problem
 
 BLOCK_BYTES = 1 << 20
@@ -78,7 +78,7 @@ async def receive_multipart(
         target.write(block)
 
     try:
-        async for chunk in patiently(request.stream(), SILENT_S):
+        async for chunk in with_idle_timeout(request.stream(), IDLE_TIMEOUT_S):
             received += len(chunk)
             if received > settings.body_bytes:
                 raise too_large(settings)

@@ -8,12 +8,14 @@ import anyio
 from rig.messages.message import compose
 from server.wire.problems import Problem
 
-SILENT_S = 30.0  # between two pieces: above the pauses of a network that changes, below what who sends again waits for
+IDLE_TIMEOUT_S = (
+    30.0  # between two pieces: above the pauses of a network that changes, below what who sends again waits for
+)
 
 
-async def patiently(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:
-    """The pieces of ``stream``. Raises a 408 problem if the next one does not come within ``silent_s``; how long the
-    whole takes does not matter."""
+async def with_idle_timeout(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:
+    """Yields the pieces of ``stream``. Raises a 408 problem if the next one does not come within ``silent_s``; how long
+    the whole takes does not matter."""
     while (piece := await _next(stream, silent_s)) is not None:
         yield piece
 

@@ -21,13 +21,13 @@ from server.errors import (
     DiskFull,
     Forbidden,
     Gone,
+    InvalidInput,
     NotFound,
     Refused,
     TooLarge,
     TooMany,
+    Unauthenticated,
     Unavailable,
-    Unknown,
-    Unusable,
     unusable_input,
 )
 from server.problem_types import PROBLEM_TYPES, URN, type_of_status
@@ -77,13 +77,13 @@ class ProblemDocument(TypedDict):
 
 STATUS_OF: dict[type[Refused], int] = {
     Refused: 400,
-    Unknown: 401,
+    Unauthenticated: 401,
     Forbidden: 403,
     NotFound: 404,
     Conflict: 409,
     Gone: 410,
     TooLarge: 413,
-    Unusable: 422,
+    InvalidInput: 422,
     TooMany: 429,
     Unavailable: 503,
     DiskFull: 507,

@@ -131,12 +131,12 @@ class Worker:
                     files = publish(job_id, fit(job_id, request))
                 except JobFailed as error:
                     log.warning("job failed", kind=error.kind, detail=error.detail.text)
-                    worker.settle(job_id, "failed", request.get("webhook"))
+                    worker.publish_outcome(job_id, "failed", request.get("webhook"))
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
                     raise
-                worker.settle(job_id, "succeeded", request.get("webhook"))
+                worker.publish_outcome(job_id, "succeeded", request.get("webhook"))
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
@@ -251,9 +251,9 @@ class Worker:
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 
-    def settle(self, job_id: str, state: str, job_webhook: JobWebhook | None = None) -> None:
-        """Tells the world how the job ended: the last event of its stream, with what the operator must see to, and the
-        webhooks, the job's own too."""
+    def publish_outcome(self, job_id: str, state: str, job_webhook: JobWebhook | None = None) -> None:
+        """Publishes how the job ended: as the last event of its stream, with the warnings that an operator must see to,
+        and to the webhooks, the job's own included."""
         warnings = warnings_of(self.store.folder("jobs", job_id) / "result" / "report.json")
         for warning in warnings:
             log.warning(warning["message"], code=warning["code"])

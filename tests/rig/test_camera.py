@@ -74,7 +74,7 @@ def test_a_point_on_a_pixel_s_ray_projects_to_that_pixel(lens: Distortion, u: fl
 def test_points_that_no_image_holds_are_nan() -> None:
     barrel = Distortion(k1=-0.3)
     ours = camera(barrel)
-    radius = barrel.turning_radius()
+    radius = barrel.max_valid_radius()
     assert radius == pytest.approx(np.sqrt(1 / 0.9))  # 1 + 3 k1 r^2 = 0
     local = np.array([[0.0, 0.0, -500.0], [0.99 * radius, 0.0, 1.0], [1.01 * radius, 0.0, 1.0]])
     pixels = ours.project(POSE.inverse().apply(local))
@@ -83,16 +83,16 @@ def test_points_that_no_image_holds_are_nan() -> None:
 
 def test_pixels_beyond_the_lens_have_no_ray() -> None:
     barrel = Distortion(k1=-0.3)
-    farthest = barrel.apply(np.array([[barrel.turning_radius(), 0.0]]))
+    farthest = barrel.apply(np.array([[barrel.max_valid_radius(), 0.0]]))
     assert np.isnan(barrel.remove(1.01 * farthest)).all()
     assert np.isfinite(barrel.remove(0.98 * farthest)).all()
 
 
-def test_turning_radius() -> None:
-    assert Distortion().turning_radius() == np.inf
-    assert Distortion(k1=0.2).turning_radius() == np.inf
+def test_max_valid_radius() -> None:
+    assert Distortion().max_valid_radius() == np.inf
+    assert Distortion(k1=0.2).max_valid_radius() == np.inf
     lens = LENSES[2]
-    r = np.linspace(0, lens.turning_radius() * 0.9999, 500)
+    r = np.linspace(0, lens.max_valid_radius() * 0.9999, 500)
     grown = r * (1 + lens.k1 * r**2 + lens.k2 * r**4 + lens.k3 * r**6)
     assert (np.diff(grown) > 0).all()
 

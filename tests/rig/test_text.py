@@ -1,11 +1,11 @@
 """Texts from outside: what can be stored, and what a mistyped word may have meant."""
 
-from rig.text import encodes, printable, suggest
+from rig.text import is_encodable, printable, suggest
 
 
 def test_half_a_character_is_escaped() -> None:
-    assert encodes("häad")
-    assert not encodes("a\ud800")
+    assert is_encodable("häad")
+    assert not is_encodable("a\ud800")
     assert printable("a\ud800") == "a\\ud800"
 
 

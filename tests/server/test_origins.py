@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from server.errors import Unusable
+from server.errors import InvalidInput
 from server.origins import ANY_PUBLIC, is_public, target
 
 
@@ -31,7 +31,7 @@ def resolve_to(monkeypatch: pytest.MonkeyPatch, *addresses: str) -> list[str]:
 def test_an_address_of_no_public_machine_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not is_public(ipaddress.ip_address(address))
     resolve_to(monkeypatch, "93.184.216.34", address)  # one of several is enough
-    with pytest.raises(Unusable, match="no public address"):
+    with pytest.raises(InvalidInput, match="no public address"):
         target("https://store.example/a.zip", [ANY_PUBLIC])
 
 
@@ -54,7 +54,7 @@ def test_a_named_origin_may_be_private_and_no_other_port_or_scheme_of_it(monkeyp
     assert (str(aim.url), aim.headers, aim.extensions) == ("http://10.0.0.5:9000/a.zip", {"Host": "nas.lab:9000"}, {})
     assert str(target("https://store.lab:443/a", allowed).url) == "https://10.0.0.5/a"
     for wrong in ("http://nas.lab/a", "https://nas.lab:9000/a", "http://store.lab/a", "http://nas.lab.evil:9000/a"):
-        with pytest.raises(Unusable, match="did not allow"):
+        with pytest.raises(InvalidInput, match="did not allow"):
             target(wrong, allowed)
 
 
@@ -78,7 +78,7 @@ def test_a_named_origin_may_be_private_and_no_other_port_or_scheme_of_it(monkeyp
 )
 def test_what_is_no_address_for_this_is_refused(url: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     resolve_to(monkeypatch, "93.184.216.34")
-    with pytest.raises(Unusable, match=why):
+    with pytest.raises(InvalidInput, match=why):
         target(url, [ANY_PUBLIC])
 
 
@@ -87,5 +87,5 @@ def test_a_name_that_nobody_knows_is_told(monkeypatch: pytest.MonkeyPatch) -> No
         raise socket.gaierror(-2, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
-    with pytest.raises(Unusable, match="nobody knows"):
+    with pytest.raises(InvalidInput, match="nobody knows"):
         target("https://store.example/a", [ANY_PUBLIC])

@@ -14,7 +14,7 @@ from server.console.coverage import Corners, Coverage, advice, detect_shot, summ
 from server.console.page import Action, Chosen, Page, remove_later, shared, show
 from server.console.removal import removals
 from server.console.shown_messages import shown_failure
-from server.errors import Conflict, Unusable
+from server.errors import Conflict, InvalidInput
 from server.services.captures import CaptureMetadata
 from server.services.records import Calibration
 from server.services.service import Service
@@ -150,7 +150,7 @@ def shoot(page: Page, event: BoardForm) -> Message:
     if not seen:
         service.store.remove_capture(identity)
         detail = compose("board-not-seen")
-        raise Unusable("no-board", detail)
+        raise InvalidInput("no-board", detail)
     shots.add(board, identity, found)
     shared.forget("calibration page")
     return compose("board-shot-taken", number=len(shots.taken), seen=seen, all=len(found))
@@ -169,7 +169,7 @@ def start_over(page: Page, event: object) -> None:
 def calibrate(page: Page, event: CalibrateForm) -> Message:
     if len(shots.taken) < SHOTS_LEAST:
         detail = compose("board-shots-too-few", count=len(shots.taken), needed=SHOTS_LEAST)
-        raise Unusable("too-few-shots", detail)
+        raise InvalidInput("too-few-shots", detail)
     captures = [capture for capture, _ in shots.taken]
     page.service.calibrations.add_shots(shots.board, captures, str(event.get("label") or "")[:500])
     shots.clear()

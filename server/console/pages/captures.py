@@ -15,7 +15,7 @@ from server.console.identity import permit
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
 from server.console.work_form import PresetLine, TemplateLine, WorkForm, chosen_work, preset_lines, template_lines
-from server.errors import NotFound, Unusable
+from server.errors import InvalidInput, NotFound
 from server.services.bulk import each
 from server.services.records import Session
 from server.services.service import Service
@@ -327,7 +327,7 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
     said = said_of(action, len(done.done))
     if done.refused:
         faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
-        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
+        raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
     return said
 
 

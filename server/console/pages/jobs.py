@@ -16,7 +16,7 @@ from server.console.page import Action, Chosen, Page, remove_all_later, remove_l
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.console.shown_messages import shown_failure
-from server.errors import Conflict, Unusable
+from server.errors import Conflict, InvalidInput
 from server.services.bulk import each
 from server.services.documents import JobLine
 from server.services.jobs import FINISHED, STATUSES
@@ -279,7 +279,7 @@ def bulk(page: Page, event: BulkForm) -> Message:
     said = compose("jobs-cancelled", count=count) if action == "cancel" else compose("jobs-queued-again", count=count)
     if done.refused:
         faults = [compose("located", where=one.id[-6:], fault=one.detail) for one in done.refused]
-        raise Unusable("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
+        raise InvalidInput("some-refused", compose("some-refused", done=said, refused=len(faults)), faults)
     return said
 
 

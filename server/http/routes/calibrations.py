@@ -13,7 +13,7 @@ from server.http.auth import ServiceOf, require
 from server.http.calibration_schemas import CalibrationList, CalibrationOut, NewCalibration
 from server.services.keys import Caller
 from server.wire.multipart import check_length, described_form, receive_calibration_pictures
-from server.wire.patience import SILENT_S, patiently
+from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
 from server.wire.problems import Problem, Responses, documented
 from server.wire.send_file import send_file
 
@@ -93,7 +93,7 @@ def remove_calibration(service: ServiceOf, caller: Taker, calibration_id: str) -
 
 async def _small_body(request: Request) -> bytes:
     body = bytearray()
-    async for chunk in patiently(request.stream(), SILENT_S):
+    async for chunk in with_idle_timeout(request.stream(), IDLE_TIMEOUT_S):
         body += chunk
         if len(body) > JSON_BYTES:
             raise Problem(413, "body-too-large", compose("json-body-too-large", bytes=JSON_BYTES))

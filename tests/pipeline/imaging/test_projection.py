@@ -80,7 +80,7 @@ def test_compiled_slopes_are_numpy_s(lens: Distortion) -> None:
 
 def test_what_no_image_holds_is_nowhere() -> None:
     barrel = Distortion(k1=-0.3)
-    ours, radius = camera(barrel), barrel.turning_radius()
+    ours, radius = camera(barrel), barrel.max_valid_radius()
     local = np.array([[0.0, 0.0, -500.0], [0.99 * radius, 0.0, 1.0], [1.01 * radius, 0.0, 1.0]]) * 100.0
     points = POSE.inverse().apply(local)
     gone = np.isnan(ours.project(points)).any(axis=1)

@@ -9,7 +9,7 @@ from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import Settings
 from pipeline.silhouettes.own_pictures import ExchangedPictures, WrongRig, misplaced_plates, own_pictures
 from pipeline.silhouettes.segment import segment
-from rig.capture import Capture, refiled
+from rig.capture import Capture, reassign_images
 from rig.studio.scene.layout import arrangement
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]  # the studio takes ten seconds for one capture
@@ -53,7 +53,7 @@ def test_a_good_capture_is_left_as_it_is(half_size_shot):
     ids=["cables", "cables, points picked before", "pictures alone", "plates alone"],
 )
 def test_an_exchange_is_named_and_filed_back(half_size_shot, planted, code):
-    found = judged(half_size_shot, refiled(half_size_shot.capture, **planted))
+    found = judged(half_size_shot, reassign_images(half_size_shot.capture, **planted))
     assert filed_right(half_size_shot, found)
     for landmark, views in half_size_shot.capture.features.items():
         assert found.capture.features[landmark].keys() == views.keys()
@@ -63,9 +63,9 @@ def test_an_exchange_is_named_and_filed_back(half_size_shot, planted, code):
 
 def test_an_exchange_is_refused_where_the_settings_say_so(half_size_shot):
     with pytest.raises(ExchangedPictures, match="cam04 and cam06 hold each other's pictures"):
-        judged(half_size_shot, refiled(half_size_shot.capture, pictures=EXCHANGE, plates=EXCHANGE), "refuse")
+        judged(half_size_shot, reassign_images(half_size_shot.capture, pictures=EXCHANGE, plates=EXCHANGE), "refuse")
     with pytest.raises(ExchangedPictures, match="clean plates"):
-        judged(half_size_shot, refiled(half_size_shot.capture, plates=EXCHANGE), "refuse")
+        judged(half_size_shot, reassign_images(half_size_shot.capture, plates=EXCHANGE), "refuse")
 
 
 def test_pictures_of_another_rig_are_refused(half_size_shot):
@@ -74,7 +74,7 @@ def test_pictures_of_another_rig_are_refused(half_size_shot):
 
 
 def test_a_duplicated_picture_is_left_to_its_own_camera(half_size_shot):
-    copied = refiled(half_size_shot.capture, pictures={"cam08": "cam07"}, plates={"cam08": "cam07"})
+    copied = reassign_images(half_size_shot.capture, pictures={"cam08": "cam07"}, plates={"cam08": "cam07"})
     found = judged(half_size_shot, copied)
     (warning,) = found.warnings
     assert warning.code == "picture-duplicated"
@@ -95,7 +95,7 @@ def test_segmentation_of_exchanged_cables_ends_where_that_of_good_ones_does(half
     def segmented(capture: Capture):
         return segment(capture, shot.rig, settings, report=lambda stage, share: None)
 
-    exchanged = refiled(shot.capture, pictures=EXCHANGE, plates=EXCHANGE)
+    exchanged = reassign_images(shot.capture, pictures=EXCHANGE, plates=EXCHANGE)
     found = own_pictures(exchanged, shot.rig, segmented, exchanged="repair")
     good = segmented(shot.capture)
     assert all(np.array_equal(found.silhouettes[name].mask, good[name].mask) for name in shot.rig.names)

@@ -176,7 +176,7 @@ def test_anywhere_in_front_it_equals_the_oracle(renderer, offset):
             assert_masks_agree(masks[camera.name], want)
 
 
-def test_no_point_folds_back_past_the_turning_radius(renderer):
+def test_no_point_folds_back_past_the_max_valid_radius(renderer):
     """A lens with k1 = -0.4 turns at r = 0.91: a sphere at r = 2 would come back near r = -1.2, in the image."""
     intrinsics = Intrinsics(200, 200, 80.0, 80.0, 99.5, 99.5, Distortion(k1=-0.4))
     camera = Camera("wide", intrinsics, RigidTransform.identity())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import load_model
-from rig.capture import Capture, refiled
+from rig.capture import Capture, reassign_images
 from rig.errors import WrongVariable
 from rig.formats.archive import pack_folder
 from rig.formats.cameras_file import write_rig_file
@@ -71,7 +71,7 @@ def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(
     masked: tuple[Capture, Rig], tmp_path: Path
 ) -> None:
     capture, rig = masked
-    write_capture(tmp_path / "shot", refiled(capture, pictures={"cam02": "cam07", "cam07": "cam02"}), rig)
+    write_capture(tmp_path / "shot", reassign_images(capture, pictures={"cam02": "cam07", "cam07": "cam02"}), rig)
     found = found_in(tmp_path / "shot")
     assert not found["faults"]
     assert [w for w in found["warnings"] if w["code"] == "cameras-exchanged" and "cam02 and cam07" in w["message"]]

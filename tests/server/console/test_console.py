@@ -27,7 +27,7 @@ from server.console.mount import path_below
 from server.console.pages.jobs import SettingsForm, chosen_settings, log_lines
 from server.console.removal import Removals
 from server.console.work_form import chosen_work
-from server.errors import Conflict, Forbidden, NotFound, Unknown
+from server.errors import Conflict, Forbidden, NotFound, Unauthenticated
 from server.services.keys import Keys
 from server.services.presets import settings_of
 from server.services.work import ReconstructionRequest
@@ -313,6 +313,6 @@ def test_a_session_is_worth_what_its_key_is(tmp_path: Path) -> None:
     keys.add("other", ("admin",))
     keys.remove(identity)
     assert caller_of(service, {"key_id": identity}) is None  # type: ignore[arg-type]
-    with pytest.raises(Unknown, match="sign in"):
+    with pytest.raises(Unauthenticated, match="sign in"):
         permit(None, "read")
     engine.dispose()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
-from server.http.linger import Linger
+from server.http.linger import DrainRequestBody
 from tests.support.services import RunningService
 
 BYTES = 8 << 20  # more than both sockets hold: some of it is still to be written when the answer is out
@@ -55,5 +55,5 @@ async def _sent_to(*, more: bool, body: bytes, linger_s: float) -> list[Message]
 
     scope: dict[str, Any] = {"type": "http", "http_version": "1.1"}
     scope["headers"] = [(b"connection", b"close"), (b"content-length", b"1000000")]
-    await Linger(app, patience_s=0.05, linger_s=linger_s)(scope, receive, send)
+    await DrainRequestBody(app, patience_s=0.05, linger_s=linger_s)(scope, receive, send)
     return sent

@@ -136,7 +136,7 @@ def test_a_damaged_one_holds_up_no_list(calibrations: Calibrations, store: Store
     damaged, whole = (calibrations.add_shots(BOARD, [board_shot(store, "1")], "").id for _ in range(2))
     (store.folder("calibrations", damaged) / "record.json").write_text("[]")
     assert [found.id for found in calibrations.find()] == [whole]
-    assert len(store.set_aside()) == 1
+    assert len(store.list_quarantined()) == 1
 
 
 def test_one_is_in_use_until_another_is(calibrations: Calibrations, store: Store, engine: Engine) -> None:

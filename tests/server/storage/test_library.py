@@ -13,7 +13,7 @@ from rig.errors import InputError
 from server.settings import ServiceSettings
 from server.storage.database import capture_index, open_database
 from server.storage.library import CaptureQuery, Library, subject_of
-from server.storage.pages import PageOf, page_of
+from server.storage.pages import CursorPage, page_of
 from server.storage.records import CAPTURE, CaptureRecord, SessionRecord
 from server.storage.store import Store
 from tests.server.storage.test_records import capture_record, stored
@@ -176,7 +176,7 @@ def test_a_page_of_people_passes_over_who_was_erased_meanwhile(
     for number in (1, 2):
         store.add_session(session(number, f"Anna {number}"))
 
-    def page_then_erasure(*arguments: Any, **named: Any) -> PageOf:
+    def page_then_erasure(*arguments: Any, **named: Any) -> CursorPage:
         page = page_of(*arguments, **named)
         store.remove_session(identity(1))
         return page

@@ -78,7 +78,7 @@ def test_a_damaged_record_is_set_aside(tmp_path: Path, damage: dict[str, object]
     path.write_text(json.dumps(json.loads(path.read_text()) | damage))
     with pytest.raises(NotFound):
         store.capture(record.id)
-    assert len(store.set_aside()) == 1
+    assert len(store.list_quarantined()) == 1
 
 
 def test_a_session_without_its_label_is_set_aside(tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_a_session_without_its_label_is_set_aside(tmp_path: Path) -> None:
     del document["label"]
     path.write_text(json.dumps(document))
     assert [*store.sessions()] == []
-    assert len(store.set_aside()) == 1
+    assert len(store.list_quarantined()) == 1
 
 
 def test_formats_are_not_mistaken_for_each_other() -> None:
@@ -197,4 +197,4 @@ def test_a_damaged_calibration_is_set_aside(tmp_path: Path, damage: str) -> None
     path.write_text(damage)
     with pytest.raises(NotFound):
         store.calibration(identity)
-    assert len(store.set_aside()) == 1
+    assert len(store.list_quarantined()) == 1

@@ -72,7 +72,7 @@ def test_a_large_file_is_written_on_the_way(tmp_path: Path) -> None:
 
 
 def test_a_client_that_vanished_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("server.wire.multipart.SILENT_S", 0.05)
+    monkeypatch.setattr("server.wire.multipart.IDLE_TIMEOUT_S", 0.05)
 
     async def stream() -> Any:
         yield part("file", DATA)

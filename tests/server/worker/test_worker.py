@@ -141,12 +141,12 @@ def test_a_cancelled_job_stops_also_where_it_does_not_listen(worker: Worker, cap
 def test_the_last_event_names_cameras_that_moved(worker: Worker, capture: str) -> None:
     worker.ingest(JOB, request(capture))
     worker.publish(JOB, worker.fit(JOB, request(capture, "moved")))
-    worker.settle(JOB, "succeeded")
+    worker.publish_outcome(JOB, "succeeded")
     assert events_of(worker)[-1] == {"state": "succeeded", "camera_moved": ["cam02 has moved by 5.0 px"]}
 
 
 def test_a_job_without_a_report_ends_without_a_word(worker: Worker) -> None:
-    worker.settle(JOB, "failed")
+    worker.publish_outcome(JOB, "failed")
     assert events_of(worker) == [{"state": "failed"}]
 
 
