@@ -141,8 +141,8 @@ def test_many_parameters_have_a_reason() -> None:
 
 def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
     """All but the object or class of a method."""
-    given = function.args
-    names = [each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    arguments = function.args
+    names = [each.arg for each in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
     return names[1:] if names[:1] in (["self"], ["cls"]) else names
 
 

@@ -53,8 +53,8 @@ def test_the_bill_of_materials_names_what_is_delivered() -> None:
     """With `make sbom`'s own options."""
     (options,) = re.findall(r"\$\(UV\) export (.*) --output-file", (ROOT / "Makefile").read_text(encoding="utf-8"))
     command = [uv(), "export", "--offline", *options.split()]
-    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
-    bill = json.loads(told)
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
+    bill = json.loads(printed)
     assert (bill["bomFormat"], bill["metadata"]["component"]["name"]) == ("CycloneDX", "eigenhead")
     versions = {part["name"]: part["version"] for part in bill["components"]}
     document = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

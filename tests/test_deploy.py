@@ -42,8 +42,8 @@ def test_systemd_accepts_the_unit(tmp_path: Path) -> None:
     (tmp_path / "eigenhead.service").write_text(re.sub(r"^ExecStart=\S+", "ExecStart=/bin/true", text, flags=re.M))
     command = ["systemd-analyze", "verify", "--man=no", str(tmp_path / "eigenhead.service")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    told = [line for line in done.stderr.splitlines() if "eigenhead.service" in line]
-    assert told == []
+    complaints = [line for line in done.stderr.splitlines() if "eigenhead.service" in line]
+    assert complaints == []
 
 
 def test_no_container_publishes_a_port_without_tls() -> None:
@@ -96,15 +96,15 @@ def test_caddy_accepts_its_file() -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "status", "told"), [("demo", 0, "try_debian: skipped: "), ("sleep", 2, "unknown step sleep")]
+    ("step", "status", "text"), [("demo", 0, "try_debian: skipped: "), ("sleep", 2, "unknown step sleep")]
 )
-def test_a_debian_is_tried_only_where_one_can_be_made(step: str, status: int, told: str) -> None:
+def test_a_debian_is_tried_only_where_one_can_be_made(step: str, status: int, text: str) -> None:
     """debootstrap lies in /usr/sbin, which this path leaves out; without root it is not even looked for."""
     command = ["bash", str(DEPLOY / "try_debian.sh"), step]
     environment = {"PATH": "/usr/bin:/bin", "HOME": "/nonexistent"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == status
-    assert told in done.stderr
+    assert text in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -119,10 +119,10 @@ def test_a_debian_is_tried_only_where_one_can_be_made(step: str, status: int, to
 def test_an_array_of_slurm_is_one_share_a_job(tmp_path: Path, variables: dict[str, str], share: str) -> None:
     (tmp_path / "eigenhead").write_text('#!/bin/sh\nprintf "%s|" "$@"\n')
     (tmp_path / "eigenhead").chmod(0o755)
-    told = {f"SLURM_ARRAY_TASK_{name}": value for name, value in variables.items()}
+    array = {f"SLURM_ARRAY_TASK_{name}": value for name, value in variables.items()}
     done = subprocess.run(
         [DEPLOY / "batch.slurm", "a study.csv", "heads", "--detail", "photo"],
-        env=os.environ | told | {"EIGENHEAD": str(tmp_path / "eigenhead")},
+        env=os.environ | array | {"EIGENHEAD": str(tmp_path / "eigenhead")},
         capture_output=True, text=True, timeout=20, check=True,
     )  # fmt: skip
     assert done.stdout == f"batch|a study.csv|--out|heads|--shard|{share}|--detail|photo|"

@@ -199,8 +199,8 @@ def test_the_walk_with_curl_and_a_backup_elsewhere(shell: Callable[..., str], tm
     key = shell(f"cd {ROOT} && .venv/bin/eigenhead keys add lab --data {data}").strip()
     with running_service(data) as service:
         shell("until curl -fsS $URL/readyz; do sleep 0.5; done", URL=service.url)
-        told = shell(block("walk-through", "http.md"), URL=service.url, KEY=key)
-        assert "event: end" in told
+        printed = shell(block("walk-through", "http.md"), URL=service.url, KEY=key)
+        assert "event: end" in printed
         shell(block("backup"), DATA=str(data), BACKUP=str(copy))
     with running_service(copy) as restored:
         (job,) = (folder.name for folder in (copy / "jobs").iterdir())

@@ -160,12 +160,12 @@ def main() -> None:
             n: f["bytes"] for n, f in client.get(f"/v1/jobs/{job}").json()["files"].items() if n.endswith("glb")
         }
         v.check_clean()
-    told = {
+    timings = {
         name: [round(statistics.median(took), 3), round(max(took), 3)] if isinstance(took, list) else took
         for name, took in figures.items()
     }
     machine = {"cores": len(os.sched_getaffinity(0)), "load": [round(load, 1) for load in os.getloadavg()[:2]]}
-    figures_of_all = {"s [median, slowest]": told, "bytes": bytes_of, "machine": machine}
+    figures_of_all = {"s [median, slowest]": timings, "bytes": bytes_of, "machine": machine}
     sys.stdout.write(json.dumps(figures_of_all, indent=1) + "\n")
 
 

@@ -81,6 +81,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=8)
     parser.add_argument("--seed", type=int, default=5)
-    given = parser.parse_args()
+    options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    logging.info(json.dumps(run(given.subjects, given.seed), indent=1))
+    logging.info(json.dumps(run(options.subjects, options.seed), indent=1))

@@ -95,8 +95,8 @@ def main() -> None:
     if arguments.surface:
         settings = replace(settings, outputs=replace(settings.outputs, surface=arguments.surface))
     with Renderer.create() as renderer, tempfile.TemporaryDirectory() as scratch:
-        given = (arguments.capture, Path(scratch), model, settings, renderer, arguments.steps)
-        rounds = [one_round(*given) for _ in range(1 + arguments.rounds)][1:]  # the first reads what was compiled
+        inputs = (arguments.capture, Path(scratch), model, settings, renderer, arguments.steps)
+        rounds = [one_round(*inputs) for _ in range(1 + arguments.rounds)][1:]  # the first reads what was compiled
     stages = list(rounds[0].wall)
     found: dict[str, object] = {"rounds": arguments.rounds, "detail": arguments.detail or "default"}
     for name, rows in (("s", [row.wall for row in rounds]), ("cpu_s", [row.cpu for row in rounds])):

@@ -68,10 +68,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("write", "time"))
     parser.add_argument("capture", type=Path)
-    given, options = parser.parse_known_args()
-    if given.what == "write":
-        found = write(given.capture)
+    arguments, options = parser.parse_known_args()
+    if arguments.what == "write":
+        found = write(arguments.capture)
         sys.stdout.write(f"{len(found)} cameras of {found.cameras[0].intrinsics.width} pixels across\n")
     else:
-        took_s, cpu_s, most_gb = cost(given.capture, *options)
+        took_s, cpu_s, most_gb = cost(arguments.capture, *options)
         sys.stdout.write(f"{took_s:.1f} s, {cpu_s:.1f} s of all cores together, {most_gb:.2f} GB\n")

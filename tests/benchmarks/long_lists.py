@@ -76,14 +76,18 @@ def fill_jobs(engine: sa.Engine, jobs: Jobs, captures: list[str], count: int) ->
     schema = None if engine.dialect.name == "sqlite" else "dbos"
     tables = sa.MetaData()
     tables.reflect(engine, schema=schema, only=["workflow_status", "workflow_input", "workflow_output"])
-    status, given, made = (
+    status, input_table, made = (
         tables.tables[(f"{schema}." if schema else "") + n]
         for n in ("workflow_status", "workflow_input", "workflow_output")
     )
     output = base64.b64encode(pickle.dumps(FILES)).decode()
     with engine.connect() as connection:
         row = dict(connection.execute(sa.select(status).where(status.c.workflow_uuid == template.id)).mappings().one())
-        inputs = dict(connection.execute(sa.select(given).where(given.c.workflow_uuid == template.id)).mappings().one())
+        inputs = dict(
+            connection.execute(sa.select(input_table).where(input_table.c.workflow_uuid == template.id))
+            .mappings()
+            .one()
+        )
     words = words_of_job({"capture_id": captures[0], "model": None, "settings": {"detail": "fine"}})
     for start in range(0, count, AT_ONCE):
         rows: list[list[dict[str, Any]]] = [[], [], [], []]
@@ -92,8 +96,13 @@ def fill_jobs(engine: sa.Engine, jobs: Jobs, captures: list[str], count: int) ->
             state = "ENQUEUED" if left <= QUEUED else "PENDING" if left <= QUEUED + RUNNING else "SUCCESS"
             state = "ERROR" if state == "SUCCESS" and number % 20 == 0 else state
             ended = EPOCH_MS + 1000 * number + 60_000 if state in ("SUCCESS", "ERROR") else None
-            own = {"workflow_uuid": job, "status": state, "created_at": EPOCH_MS + 1000 * number, "completed_at": ended}
-            rows[0].append({**row, **own, "executor_id": "gone" if state == "PENDING" else None})
+            columns = {
+                "workflow_uuid": job,
+                "status": state,
+                "created_at": EPOCH_MS + 1000 * number,
+                "completed_at": ended,
+            }
+            rows[0].append({**row, **columns, "executor_id": "gone" if state == "PENDING" else None})
             rows[1].append({**inputs, "workflow_uuid": job})
             if state == "SUCCESS":
                 blank = dict.fromkeys(column.name for column in made.c)
@@ -102,7 +111,7 @@ def fill_jobs(engine: sa.Engine, jobs: Jobs, captures: list[str], count: int) ->
                 {"job_id": job, "capture_id": capture, "session": None, "words": words.replace(template.id, job)}
             )
         with engine.begin() as connection:
-            for table, values in zip((status, given, made, job_index), rows, strict=True):
+            for table, values in zip((status, input_table, made, job_index), rows, strict=True):
                 if values:
                     connection.execute(sa.insert(table), values)
 

@@ -74,13 +74,13 @@ def _generalisation(cages: Float[np.ndarray, "N V 3"]) -> float:
 
 
 def _cpu_seconds() -> float:
-    own, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
-    return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
+    process, children = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
+    return process.ru_utime + process.ru_stime + children.ru_utime + children.ru_stime
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=138)
     parser.add_argument("--halves", action="store_true", help="register each half with a model of the other, too")
-    asked = parser.parse_args()
-    print(json.dumps(run(asked.subjects, asked.halves), indent=1))  # noqa: T201
+    options = parser.parse_args()
+    print(json.dumps(run(options.subjects, options.halves), indent=1))  # noqa: T201

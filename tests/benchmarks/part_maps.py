@@ -106,15 +106,15 @@ def measure(
     done = reconstruct(ReconstructionContext(capture, rig, model, Settings(), renderer))
     landmarks = {name: point.position_mm for name, point in done.evidence.landmarks.items()}
     region = model.levels["full"].face_region
-    given = capture.images, done.views.silhouettes, rig, done.mesh_world, region, landmarks, PartSettings()
+    inputs = capture.images, done.views.silhouettes, rig, done.mesh_world, region, landmarks, PartSettings()
     started = time.process_time()
-    maps = classify_parts(*given, report=lambda stage, share: None)
+    maps = classify_parts(*inputs, report=lambda stage, share: None)
     seconds = time.process_time() - started
     counts = np.zeros((4, 4))
     for name, found in maps.items():
-        own = np.where(found.probability.max(axis=2) > 0.5, 1 + found.probability.argmax(axis=2), 0)
+        labels = np.where(found.probability.max(axis=2) > 0.5, 1 + found.probability.argmax(axis=2), 0)
         true = np.where(done.views.silhouettes[name].mask, truth[name], 0)
-        counts += np.bincount((4 * true.astype(int) + own).ravel(), minlength=16).reshape(4, 4)
+        counts += np.bincount((4 * true.astype(int) + labels).ravel(), minlength=16).reshape(4, 4)
     counts = counts[1:]
     row = {
         "right": sum(counts[i, i + 1] for i in range(3)) / counts.sum(),

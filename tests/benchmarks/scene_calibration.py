@@ -64,11 +64,11 @@ def studio(seed: int, views: int, *, masks: bool = False) -> tuple[SceneCalibrat
     with Renderer.create() as renderer, tempfile.TemporaryDirectory() as folder:
         subject = drawn_subject(load_model(), rng)
         taken = simulate(subject, rig_from_directions(directions_deg(views)), PRESET, rng, renderer=renderer)
-        own = Capture(taken.capture.images)
+        photographs = Capture(taken.capture.images)
         if masks:
             found = segment(taken.capture, taken.rig, SegmentationSettings(), report=lambda stage, share: None)
-            own = replace(own, masks={name: one.mask for name, one in found.items()})
-        write_capture(Path(folder), own, taken.rig)
+            photographs = replace(photographs, masks={name: one.mask for name, one in found.items()})
+        write_capture(Path(folder), photographs, taken.rig)
         return calibrate_scene(Path(folder)), taken.scene.true_rig
 
 
@@ -115,8 +115,8 @@ if __name__ == "__main__":
     parser.add_argument("--captures", type=int, default=10)
     parser.add_argument("--views", type=int, default=30)
     parser.add_argument("--masks", action="store_true")
-    given = parser.parse_args()
-    if given.what == "buddha":
-        _print_buddha(given.every, given.size)
+    options = parser.parse_args()
+    if options.what == "buddha":
+        _print_buddha(options.every, options.size)
     else:
-        _print_studio(given.captures, given.views, masks=given.masks)
+        _print_studio(options.captures, options.views, masks=options.masks)

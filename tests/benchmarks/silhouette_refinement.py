@@ -53,12 +53,12 @@ class Head:
 
 def heads_of(renderer: Renderer, rig: Rig, count: int, rng: np.random.Generator, *, bare: bool) -> list[Head]:
     model, heads = load_model(), []
-    for own in rng.spawn(count):
-        vertices, faces, pose = dressed_head(model, rig, own, MODES, bare=bare)
+    for head_rng in rng.spawn(count):
+        vertices, faces, pose = dressed_head(model, rig, head_rng, MODES, bare=bare)
         with renderer.silhouette_set(rig, faces) as drawn:
             masks = drawn.masks(pose.apply(vertices))
-        turn = rotation_from_vector(np.radians(START_DEG) * own.standard_normal(3) / np.sqrt(3.0))
-        shift = START_MM * own.standard_normal(3) / np.sqrt(3.0)
+        turn = rotation_from_vector(np.radians(START_DEG) * head_rng.standard_normal(3) / np.sqrt(3.0))
+        shift = START_MM * head_rng.standard_normal(3) / np.sqrt(3.0)
         start = Similarity(1.0, turn @ pose.rotation, pose.translation + shift)
         seen = {name: silhouette_from_mask(mask) for name, mask in masks.items()}
         heads.append(Head(seen, pose.apply(vertices)[: model.levels["full"].count], start))

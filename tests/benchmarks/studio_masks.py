@@ -45,12 +45,12 @@ def main() -> None:
     captures = range(arguments.first, arguments.first + arguments.captures)
     rows = []
     with Renderer.create() as renderer:
-        for seed, given in itertools.product(captures, faults):
-            taken, silhouettes = take(seed, renderer, *given)
+        for seed, planted in itertools.product(captures, faults):
+            taken, silhouettes = take(seed, renderer, *planted)
             if arguments.bare:
                 bare = Capture(taken.capture.images)
                 silhouettes = segment(bare, taken.rig, SegmentationSettings(), report=lambda *_: None)
-            kind = "".join(f" {fault.kind}" for fault in given)
+            kind = "".join(f" {fault.kind}" for fault in planted)
             for name, silhouette in silhouettes.items():
                 off = rms(silhouette, coverage(taken, name, RESOLUTION_PX))
                 overlap = iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5)

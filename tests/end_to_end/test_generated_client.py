@@ -68,10 +68,10 @@ def folder(service: RunningService, tmp_path_factory: pytest.TempPathFactory) ->
         block("sh").replace("$URL", service.url).replace("docs/client.yaml", f"{ROOT}/docs/client.yaml")
     )
     command[0] = str(Path(sys.executable).with_name("openapi-python-client"))
-    told = subprocess.run(
+    generated = subprocess.run(
         [*command, "--fail-on-warning"], cwd=place, capture_output=True, text=True, timeout=120, check=False
     )
-    assert told.returncode == 0, told.stdout + told.stderr
+    assert generated.returncode == 0, generated.stdout + generated.stderr
     with tarfile.open(place / "anna.tar", "w") as archive:
         archive.add(small_capture(place / "capture"), ".")
     return place
@@ -100,8 +100,8 @@ def test_every_operation_has_its_method(folder: Path, service: RunningService) -
 
 
 def test_the_guides_lines_upload_wait_and_fetch(folder: Path, service: RunningService, key: str) -> None:
-    told = run(block("python"), folder, service, key)
-    assert "succeeded" in told
+    printed = run(block("python"), folder, service, key)
+    assert "succeeded" in printed
     (job,) = httpx.get(service.url + "/v1/jobs", headers={"Authorization": f"Bearer {key}"}).json()["jobs"]
     assert job["settings"]["detail"] == "photo"
     for name in ("head.ply", "head.glb"):

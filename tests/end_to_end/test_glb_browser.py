@@ -175,6 +175,6 @@ def test_three_js_shows_the_head_as_we_do(
 
 
 def test_the_obj_on_request_is_the_world_mesh(result: Path) -> None:
-    asked, written = read_mesh(result / "head.obj"), read_mesh(result / "head.ply")
+    requested, written = read_mesh(result / "head.obj"), read_mesh(result / "head.ply")
     assert {"head.mtl", "head.png"} <= {path.name for path in result.iterdir()}
-    np.testing.assert_allclose(asked.vertices[asked.faces], written.vertices[written.faces], atol=1e-3)
+    np.testing.assert_allclose(requested.vertices[requested.faces], written.vertices[written.faces], atol=1e-3)

@@ -45,9 +45,9 @@ class Proxied:
     certificate: Path
 
     def client(self, **headers: str) -> httpx.Client:
-        given = {"Authorization": f"Bearer {self.key}"} | headers
+        all_headers = {"Authorization": f"Bearer {self.key}"} | headers
         context = ssl.create_default_context(cafile=str(self.certificate))
-        return httpx.Client(base_url=self.url, headers=given, verify=context, timeout=30, trust_env=False)
+        return httpx.Client(base_url=self.url, headers=all_headers, verify=context, timeout=30, trust_env=False)
 
 
 @pytest.fixture(scope="module")

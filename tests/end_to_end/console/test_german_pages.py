@@ -79,7 +79,7 @@ def misfits(page: Page, folder: Path, name: str) -> list[str]:
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_timeout(400)
         page.screenshot(path=folder / f"{name}-{width}.png")
-        found += [f"{name} at {width}: {told}" for told in (*page.evaluate(OUTSIDE), *violations(page))]
+        found += [f"{name} at {width}: {misfit}" for misfit in (*page.evaluate(OUTSIDE), *violations(page))]
     page.set_viewport_size({"width": 1366, "height": 768})
     return found
 

@@ -39,15 +39,15 @@ def test_a_head_opens_where_it_was_begun_and_never_over_what_is_typed(
         page.locator("#reconstruct").click()
         expect(page).to_have_title(re.compile("% Captures"))
         page.get_by_label("Expression").type("smi")
-        told = page.locator(".message", has_text="A head is ready.")
-        expect(told).to_be_visible(timeout=30_000)
+        message = page.locator(".message", has_text="A head is ready.")
+        expect(message).to_be_visible(timeout=30_000)
         expect(page).to_have_title("Head ready - eigenhead")
         page.keyboard.type("le")  # who has read it, goes on
         expect(page).to_have_title("Captures - eigenhead")
         expect(page.get_by_label("Expression")).to_have_value("smile")
         assert page.evaluate("tones") == 2
         keep_widths(page, screenshots, "head-ready")
-        told.get_by_role("link").click()
+        message.get_by_role("link").click()
         page.wait_for_selector("canvas[data-loaded$=head]", timeout=30_000)
         mine.check_clean()
         other.check_clean()

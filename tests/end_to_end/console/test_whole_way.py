@@ -132,9 +132,9 @@ def check_viewer(page: Page, screenshots: Path, tmp_path: Path) -> None:
     assert box is not None
     for x in (0.46, 0.54):
         page.mouse.click(box["x"] + x * box["width"], box["y"] + 0.45 * box["height"])
-    told = page.get_by_text("mm, straight")
-    expect(told).to_be_visible()
-    distance = float((told.text_content() or "").split()[0])
+    measured = page.get_by_text("mm, straight")
+    expect(measured).to_be_visible()
+    distance = float((measured.text_content() or "").split()[0])
     assert 5 < distance < 120, "two points of a face"
     page.screenshot(path=screenshots / "result-measure.png")
     page.keyboard.press("m")

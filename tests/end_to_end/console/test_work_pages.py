@@ -51,14 +51,14 @@ def test_points_that_contradict_are_told_before_they_are_saved(
     page.reload()
     expect(first).to_contain_text("2 views", timeout=30_000)  # not saved, and still there
     page.locator("#save").click()
-    asked = page.locator("#contradictions")
-    expect(asked).to_contain_text("views contradict each other")
+    dialog = page.locator("#contradictions")
+    expect(dialog).to_contain_text("views contradict each other")
     keep_widths(page, screenshots, "features-contradiction")
     stored = f"{service.url}/v1/captures/{capture}/features"
     assert httpx.get(stored).json()["points"] == {}
     page.locator("#save-anyway").click()
     expect(page.get_by_text("Saved.")).to_be_visible()
-    expect(asked).to_have_count(0)
+    expect(dialog).to_have_count(0)
     assert len(httpx.get(stored).json()["points"]["exocanthion_right"]) == 2
     v.check_clean()
 
