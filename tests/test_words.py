@@ -7,7 +7,6 @@ and its tests that are not done yet. Both lists may only shrink: an entry that n
 
 import ast
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -79,30 +78,27 @@ NOT_DONE = {
     "tests/pipeline/verification",
 }
 
-
-def names_of(node: ast.AST) -> Iterator[str]:
-    """Yields the names that a node of a syntax tree spells itself."""
-    match node:
-        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=str(name)):
-            yield name
-        case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
-            yield name
-        case ast.ExceptHandler(name=str(name)) | ast.alias(asname=str(name)) | ast.MatchAs(name=str(name)):
-            yield name
+SPELLED: dict[type[ast.AST], str] = {  # the field in which a node of a syntax tree spells a name of its own
+    ast.Name: "id",
+    ast.Attribute: "attr",
+    ast.arg: "arg",
+    ast.keyword: "arg",
+    ast.FunctionDef: "name",
+    ast.AsyncFunctionDef: "name",
+    ast.ClassDef: "name",
+    ast.ExceptHandler: "name",
+    ast.alias: "asname",
+    ast.MatchAs: "name",
+}
 
 
 def words_of(source: str) -> list[tuple[str, int]]:
     """Lists the names in a module and their lines. Hypothesis' decorator ``given`` is not one of ours."""
-    tree = ast.parse(source)
-    decorators = {
-        id(decorator.func)
-        for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef)
-        for decorator in function.decorator_list
-        if isinstance(decorator, ast.Call)
-    }
-    nodes = (node for node in ast.walk(tree) if id(node) not in decorators)
-    return [(name, getattr(node, "lineno", 0)) for node in nodes for name in names_of(node)]
+    nodes = list(ast.walk(ast.parse(source)))
+    calls = (call for node in nodes for call in getattr(node, "decorator_list", ()) if isinstance(call, ast.Call))
+    decorators = {id(call.func) for call in calls}
+    named = ((getattr(node, SPELLED.get(type(node), ""), None), node) for node in nodes if id(node) not in decorators)
+    return [(name, getattr(node, "lineno", 0)) for name, node in named if name]
 
 
 @cache
