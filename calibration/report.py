@@ -35,7 +35,7 @@ def write_report(calibration: Calibration, html: Path, document: Path | None = N
 
 
 def report_page(calibration: Calibration) -> str:
-    """The HTML page."""
+    """Returns the HTML page."""
     figures = calibration.figures()
     summary = (
         f"{len(calibration.rig)} cameras, {figures['corners']} corners used "
@@ -128,7 +128,7 @@ def _parameter_table(calibration: Calibration) -> str:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Rows of cells that are markup already."""
+    """Returns rows of cells that are markup already."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{top}</tr>{body}</table>"

@@ -126,7 +126,7 @@ class Calibration:
     warnings: tuple[Message, ...]
 
     def figures(self) -> Figures:
-        """The numbers of ``calibrate --json``."""
+        """Returns the numbers of ``calibrate --json``."""
         everything = np.concatenate([miss for _, _, miss in self.misses.values()])
         cameras: dict[str, CameraFigures] = {}
         for camera in self.rig:
@@ -157,7 +157,7 @@ class Calibration:
         return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
     def verdict(self) -> Verdict:
-        """Whether it is worth using, and what it lacks."""
+        """Tells whether it is worth using, and what it lacks."""
         cameras = self.figures()["cameras"]
         evidence = {
             name: CameraEvidence(c["views"], c["focal_share"], c["pose_sigma_px"], c["covered"])
@@ -166,7 +166,7 @@ class Calibration:
         return judge(evidence, self.checks)
 
     def document(self) -> CalibrationDocument:
-        """Everything but the residuals, as JSON."""
+        """Returns everything but the residuals, as JSON."""
         names = self.rig.names
         offsets: OffsetsDocument | None = None
         if self.offsets is not None:

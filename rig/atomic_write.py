@@ -28,6 +28,6 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: boo
 
 
 def unfinished(folder: Path, name: str = "*") -> Iterator[Path]:
-    """Temporary files in ``folder`` of a write to ``name`` that goes on, or that a kill or the power cut short; ``*``
-    stands for any text, as in ``Path.glob``."""
+    """Returns temporary files in ``folder`` of a write to ``name`` that goes on, or that a kill or the power cut short;
+    ``*`` stands for any text, as in ``Path.glob``."""
     return folder.glob(f".{name}.*.part")

@@ -7,7 +7,7 @@ CACHE = "EIGENHEAD_CACHE"
 
 
 def cache_folder() -> Path:
-    """EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. It need not exist."""
+    """Returns EIGENHEAD_CACHE, else $XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead. It need not exist."""
     configured = os.environ.get(CACHE)
     if configured:
         return Path(configured)

@@ -24,7 +24,7 @@ def _turning_radius(k1: float, k2: float, k3: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Distortion:
-    """Brown-Conrady coefficients. https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html"""
+    """Holds Brown-Conrady coefficients. https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html"""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -44,15 +44,15 @@ class Distortion:
         return _turning_radius(self.k1, self.k2, self.k3)
 
     def apply(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Distorted places of ``X / Z, Y / Z``."""
+        """Distorts ``X / Z, Y / Z``."""
         return _distorted(normalised, self.opencv())
 
     def jacobian(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
-        """d(distorted) / d(normalised)."""
+        """Computes the derivative of the distorted by the normalised coordinates."""
         return _distortion_slopes(normalised, self.opencv())
 
     def remove(self, distorted: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Inverse of ``apply`` by Newton's method; NaN where no point inside the turning radius maps there."""
+        """Inverts ``apply`` by Newton's method; NaN where no point inside the turning radius maps there."""
         if self.is_zero:
             return distorted.copy()
         limit = self.max_valid_radius()
@@ -73,7 +73,7 @@ class Distortion:
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """Image size and projection of one camera, in pixels."""
+    """Holds image size and projection of one camera, in pixels."""
 
     width: int
     height: int
@@ -84,14 +84,14 @@ class Intrinsics:
     distortion: Distortion = field(default_factory=Distortion)
 
     def values(self) -> Float[np.ndarray, " 9"]:
-        """fx fy cx cy k1 k2 p1 p2 k3, as ``lens_image`` takes them."""
+        """Returns fx fy cx cy k1 k2 p1 p2 k3, as ``lens_image`` takes them."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion.opencv()])
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def scaled(self, factor: float) -> "Intrinsics":
-        """The same camera at another resolution: pixel centres move, ``u' = (u + 1/2) factor - 1/2``."""
+        """Returns the same camera at another resolution: pixel centres move, ``u' = (u + 1/2) factor - 1/2``."""
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
@@ -100,7 +100,8 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A calibrated camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm), of a left perturbation.
+    """Describes a calibrated camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm), of a left
+    perturbation.
 
     ``recorded``: the lens of its picture files where ``intrinsics`` is the pinhole that they are undistorted to;
     ``serial``: of its body, as its picture files have it.
@@ -119,30 +120,30 @@ class Camera:
 
     @property
     def axis_world(self) -> Float[np.ndarray, " 3"]:
-        """Unit vector along which the camera looks."""
+        """Returns the unit vector along which the camera looks."""
         return self.camera_from_world.rotation[2]
 
     def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Pixels of world points (mm); NaN behind the camera and past the turning point of the distortion."""
+        """Projects world points (mm) to pixels; NaN behind the camera and past the turning point of the distortion."""
         return self._image(self.camera_from_world.apply(points_world))
 
     def project_with_jacobian(
         self, points_world: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-        """Pixels, and their derivative by the world point (px / mm)."""
+        """Returns pixels, and their derivative by the world point (px / mm)."""
         points = self.camera_from_world.apply(points_world)
         with np.errstate(divide="ignore", invalid="ignore"):
             by_point, _ = lens_jacobians(points, self.intrinsics.values())
         return self._image(points), by_point @ self.camera_from_world.rotation
 
     def rays_world(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-        """Unit directions, in the world frame, of the rays through ``pixels``."""
+        """Returns unit directions, in the world frame, of the rays through ``pixels``."""
         normalised = self.undistort(pixels)
         rays = np.concatenate([normalised, np.ones((len(pixels), 1))], axis=1) @ self.camera_from_world.rotation
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def undistort(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """``X / Z, Y / Z`` of ``pixels``."""
+        """Computes ``X / Z, Y / Z`` of ``pixels``, without distortion."""
         k = self.intrinsics
         return k.distortion.remove((pixels - (k.cx, k.cy)) / (k.fx, k.fy))
 
@@ -178,7 +179,8 @@ class CameraStack:
     def project_with_jacobian(
         self, point_world: Float[np.ndarray, " 3"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-        """The point's pixel in each camera, and its derivative by the point (px / mm); NaN as in ``Camera.project``."""
+        """Returns the point's pixel in each camera, and its derivative by the point (px / mm); NaN as in
+        ``Camera.project``."""
         points = self.rotations @ point_world + self.translations
         with np.errstate(divide="ignore", invalid="ignore"):
             by_point, _ = lens_jacobians(points, self.lenses)
@@ -189,7 +191,7 @@ class CameraStack:
 
 
 def lens_image(points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2"]:
-    """Pixels of points in front of a camera, in its frame (mm).
+    """Returns pixels of points in front of a camera, in its frame (mm).
 
     ``lens``: fx fy cx cy (px) k1 k2 p1 p2 k3, the same for all points or one a point. Nothing is tested: neither that a
     point lies in front, nor that it is inside the distortion's turning radius.
@@ -200,7 +202,7 @@ def lens_image(points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]
 def lens_jacobians(
     points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]
 ) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 9"]]:
-    """Derivatives of ``lens_image`` by the point (px / mm) and by the lens's nine values."""
+    """Returns derivatives of ``lens_image`` by the point (px / mm) and by the lens's nine values."""
     normalised, z = points[:, :2] / points[:, 2:], points[:, 2]
     (x, y), focal = normalised.T, lens[..., :2, None]
     slopes = focal * _distortion_slopes(normalised, lens[..., 4:])

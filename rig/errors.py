@@ -6,7 +6,7 @@ from rig.messages.message import Message, compose, message_of
 
 
 class EigenheadError(Exception):
-    """Root of every error this project raises on purpose; its ``message`` is fit for an operator."""
+    """Is the root of every error that this project raises on purpose; its ``message`` is fit for an operator."""
 
     def __init__(self, message: Message | str) -> None:
         self.message = message_of(message)
@@ -14,14 +14,14 @@ class EigenheadError(Exception):
 
 
 class Cancelled(EigenheadError):
-    """The owner of the work asked it to stop; raised by a progress report."""
+    """Ends work that its owner stopped; a progress report raises it."""
 
     def __init__(self) -> None:
         super().__init__(compose("cancelled"))
 
 
 class InputError(EigenheadError):
-    """Input that cannot be used. ``faults`` names every fault found, not only the first."""
+    """Refuses input that cannot be used. ``faults`` names every fault found, not only the first."""
 
     def __init__(self, subject: str, faults: Iterable[Message | str]) -> None:
         self.subject = subject
@@ -34,9 +34,9 @@ class InputError(EigenheadError):
 
 
 class WrongVariable(InputError):
-    """A variable of the environment that cannot be used: a fault of nobody's capture."""
+    """Refuses a variable of the environment that cannot be used: a fault of nobody's capture."""
 
 
 def how_to_install(extra: str) -> Message:
-    """What to type for an optional part of the project, in a checkout and beside a wheel."""
+    """Returns what to type for an optional part of the project, in a checkout and beside a wheel."""
     return compose("install-extra", extra=extra)

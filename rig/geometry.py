@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidTransform:
-    """b_from_a: ``x_b = rotation @ x_a + translation`` (mm)."""
+    """Moves a to b: ``x_b = rotation @ x_a + translation`` (mm)."""
 
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, " 3"]
@@ -29,7 +29,8 @@ class RigidTransform:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """b_from_a: ``x_b = scale * rotation @ x_a + translation`` (mm); the paper's ``T(x) = s (R x + t')``, t = s t'."""
+    """Maps a to b: ``x_b = scale * rotation @ x_a + translation`` (mm); the paper's ``T(x) = s (R x + t')``, t = s
+    t'."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
@@ -56,7 +57,7 @@ class Similarity:
 
 
 def cross_matrix(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
-    """``[v]x``, so that ``cross_matrix(v) @ w == cross(v, w)``."""
+    """Returns the matrix ``[v]x``, so that ``cross_matrix(v) @ w == cross(v, w)``."""
     matrix = np.zeros((*vector.shape[:-1], 3, 3))
     x, y, z = np.moveaxis(vector, -1, 0)
     matrix[..., 0, 1], matrix[..., 0, 2] = -z, y
@@ -66,7 +67,7 @@ def cross_matrix(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3
 
 
 def rotation_from_vector(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
-    """Rodrigues' formula: rotation by ``|vector|`` radians about ``vector``."""
+    """Computes the rotation by ``|vector|`` radians about ``vector`` (Rodrigues' formula)."""
     angle = np.sqrt((vector * vector).sum(axis=-1))[..., None, None]
     skew = cross_matrix(vector)
     # Below 1e-4 rad the series keeps full precision where sin(a)/a and (1-cos a)/a^2 lose digits.
@@ -77,7 +78,7 @@ def rotation_from_vector(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray
 
 
 def vector_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
-    """Inverse of ``rotation_from_vector``, with the angle in [0, pi]."""
+    """Inverts ``rotation_from_vector``, with the angle in [0, pi]."""
     # Through the unit quaternion (x, y, z, w): the largest of its four squared entries is at least 1/4, so that the
     # division below is safe at every angle, pi included.
     r = rotation
@@ -98,7 +99,7 @@ def vector_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation closest to ``matrix`` in the Frobenius norm."""
+    """Returns the rotation closest to ``matrix`` in the Frobenius norm."""
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
@@ -106,8 +107,8 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def rigid_fit(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> RigidTransform:
-    """target_from_source: the motion T that minimises ``sum_j w_j |target_j - T(source_j)|^2`` (Kabsch 1976), equal
-    weights by default; never a reflection."""
+    """Estimates target_from_source: the motion T that minimises ``sum_j w_j |target_j - T(source_j)|^2`` (Kabsch 1976),
+    equal weights by default; never a reflection."""
     share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     source_mean, target_mean = share @ source, share @ target
     rotation = nearest_rotation(((source - source_mean) * share[:, None]).T @ (target - target_mean)).T
@@ -117,7 +118,8 @@ def rigid_fit(
 def look_at(
     centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
 ) -> RigidTransform:
-    """camera_from_world of a camera at ``centre`` that looks at ``target``, ``up`` towards the top of its image."""
+    """Computes camera_from_world of a camera at ``centre`` that looks at ``target``, ``up`` towards the top of its
+    image."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

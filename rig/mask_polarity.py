@@ -22,7 +22,7 @@ MIDDLE_MARGIN = 0.3  # from one half
 def subject_convention(
     mask: Bool[np.ndarray, "h w"], middle_px: Float[np.ndarray, " 2"] | None = None
 ) -> Convention | None:
-    """What a mask alone says: whether white or black is its subject; None where it contradicts itself.
+    """Returns what a mask alone says: whether white or black is its subject; None where it contradicts itself.
 
     Args:
         mask: True where it is white.
@@ -46,7 +46,7 @@ def subject_convention(
 def inverted_masks(
     masks: Mapping[str, Bool[np.ndarray, "_ _"]], middles_px: Mapping[str, Float[np.ndarray, " 2"]]
 ) -> list[str]:
-    """The masks of a capture whose subject is black; undecided ones are taken as most of the others.
+    """Returns the masks of a capture whose subject is black; undecided ones are taken as most of the others.
 
     Args:
         masks: by camera, True where they are white.

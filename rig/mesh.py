@@ -15,18 +15,19 @@ class Mesh:
     colours: UInt8[np.ndarray, "v 3"] | None = None
 
     def normals(self) -> Float[np.ndarray, "v 3"]:
-        """Unit vertex normals, each the area-weighted mean of its faces'; (0, 0, 1) where no face has an area."""
+        """Computes unit vertex normals, each the area-weighted mean of its faces'; (0, 0, 1) where no face has an
+        area."""
         return vertex_normals(self.vertices, self.faces)
 
 
 def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Normals whose length is twice the face's area."""
+    """Computes face normals whose length is twice the face's area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
 
 def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
-    """Unit, area-weighted vertex normals."""
+    """Computes unit, area-weighted vertex normals."""
     per_face = face_normals(vertices, faces)
     normals = np.empty_like(vertices)
     corners = faces.ravel()
@@ -39,7 +40,7 @@ def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 
 
 def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Directed edges that only one face has: the open rim of the mesh."""
+    """Finds the directed edges that only one face has: the open rim of the mesh."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     low, high = edges.min(axis=1).astype(np.int64), edges.max(axis=1)
     # One number for both ends: whole rows sort thirty times as long.

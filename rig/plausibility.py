@@ -29,8 +29,8 @@ CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the co
 
 
 def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[Message]:
-    """Faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base line.
-    ``any_unit``: a known length beside them will tell the unit."""
+    """Returns faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base
+    line. ``any_unit``: a known length beside them will tell the unit."""
     faults = [fault for camera in rig if (fault := _lens_fault(camera))]
     convention = _convention_fault(rig)
     return faults + ([convention] if convention else [] if any_unit else _spread_faults(rig))
@@ -96,7 +96,8 @@ def _spread_faults(rig: Rig) -> list[Message]:
 
 
 def frame_mm(rig: Rig) -> float:
-    """What the pictures' longer side shows at the point nearest to all optical axes: the median over the cameras."""
+    """Returns what the pictures' longer side shows at the point nearest to all optical axes: the median over the
+    cameras."""
     sides = []
     for camera in rig:
         k, distance = camera.intrinsics, float(np.linalg.norm(camera.centre_world - rig.centre_world()))

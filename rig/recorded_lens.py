@@ -61,7 +61,7 @@ class RecordedLens:
     def undistort(
         self, picture: Shaped[np.ndarray, "h w ..."], matrix: Float[np.ndarray, "3 3"], *, smooth: bool = True
     ) -> Shaped[np.ndarray, "h w ..."]:
-        """The picture that a pinhole with ``matrix`` would have taken; ``smooth`` interpolates (not for masks).
+        """Returns the picture that a pinhole with ``matrix`` would have taken; ``smooth`` interpolates (not for masks).
 
         Pixels that the recorded picture does not hold are black, in a photograph and in its clean plate alike.
         """

@@ -12,7 +12,7 @@ from rig.messages.message import compose
 
 
 class UnknownCamera(EigenheadError, KeyError):
-    """A name that no camera of the rig has."""
+    """Refuses a name that no camera of the rig has."""
 
     def __init__(self, name: str, names: tuple[str, ...]) -> None:
         known = compose("rig-cameras", cameras=names) if names else compose("rig-empty")
@@ -24,7 +24,7 @@ class UnknownCamera(EigenheadError, KeyError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
-    """The cameras, in the order of their file."""
+    """Holds the cameras, in the order of their file."""
 
     cameras: tuple[Camera, ...]
 
@@ -60,7 +60,7 @@ class Rig:
         return Rig(tuple(replace(camera, intrinsics=camera.intrinsics.scaled(factor)) for camera in self.cameras))
 
     def centre_world(self) -> Float[np.ndarray, " 3"]:
-        """The point nearest to all optical axes (least squares): where the subject is meant to be."""
+        """Returns the point nearest to all optical axes (least squares): where the subject is meant to be."""
         normal, right = np.zeros((3, 3)), np.zeros(3)
         for camera in self.cameras:
             off_axis = np.eye(3) - np.outer(camera.axis_world, camera.axis_world)
@@ -69,7 +69,8 @@ class Rig:
         return np.linalg.solve(normal + 1e-9 * np.eye(3), right)
 
     def front_camera(self) -> str:
-        """The camera in the middle of the fan: the one whose direction is nearest to the mean of all directions."""
+        """Returns the camera in the middle of the fan: the one whose direction is nearest to the mean of all
+        directions."""
         directions = np.stack([camera.centre_world for camera in self.cameras]) - self.centre_world()
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         return self.cameras[int(np.argmax(directions @ directions.mean(axis=0)))].name

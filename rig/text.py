@@ -14,7 +14,7 @@ def is_encodable(text: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """The text with what cannot be written as UTF-8 escaped, so that a message can quote it."""
+    """Returns the text with what cannot be written as UTF-8 escaped, so that a message can quote it."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 

@@ -60,7 +60,8 @@ class BundleSolution:
         return self.evidence.cost
 
     def covariance(self) -> Float[np.ndarray, "q q"]:
-        """Of all parameters, cameras (intrinsics, pose) first, then boards, then offsets; zero for what was fixed."""
+        """Returns the covariance of all parameters: cameras (intrinsics, pose) first, then boards, then offsets; zero
+        for what was fixed."""
         full = np.zeros((len(self.free), len(self.free)))
         # Scaled to a unit diagonal first: parameters span from 1e-4 (distortion) to 1e3 (mm).
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self.normal), 1e-12))
@@ -115,13 +116,13 @@ def solve(
 
 
 def bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:
-    """The complete problem: corners, lenses, square pixels, and which parameters move."""
+    """Returns the complete problem: corners, lenses, square pixels, and which parameters move."""
     mask = free_mask(state, free)
     return Problem((corners, prior, AspectTerm()), len(mask), moved_state, mask)
 
 
 def free_mask(state: BundleState, free: Free) -> Bool[np.ndarray, " q"]:
-    """Of all parameters, which move."""
+    """Returns a mask of the parameters that move."""
     cameras, shots = len(state.intrinsics), len(state.board_rotations)
     per_camera = np.zeros((cameras, PER_CAMERA), dtype=bool)
     per_camera[:, : len(INTRINSICS)] = free.intrinsics

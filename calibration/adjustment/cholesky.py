@@ -16,7 +16,7 @@ class NotPositiveDefinite(np.linalg.LinAlgError):
 
 
 def factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Lower triangular ``L`` with ``L L^T = matrix``. Raises NotPositiveDefinite."""
+    """Returns the lower triangular ``L`` with ``L L^T = matrix``. Raises NotPositiveDefinite."""
     lower = np.ascontiguousarray(np.tril(matrix))
     if not factor_lower(lower):
         raise NotPositiveDefinite

@@ -64,7 +64,7 @@ class CornersAt:
             equations.gradient[at] += product[:-1, -1]
 
     def by_view(self) -> Float[np.ndarray, "n 2 22"]:
-        """Derivatives by the parameters of the corner's own view: camera (15), board (6), time offset (1)."""
+        """Returns derivatives by the parameters of the corner's own view: camera (15), board (6), time offset (1)."""
         state, seen = self.state, self.term.seen
         world, inside, camera = corner_positions(state, seen)
         behind = inside[:, 2] < DEPTH_LEAST_MM
@@ -80,7 +80,7 @@ class CornersAt:
         return rows
 
     def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
-        """Derivatives by all parameters, mostly zeros: for tests and other solvers."""
+        """Returns derivatives by all parameters, mostly zeros: for tests and other solvers."""
         seen, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
         for view, at in enumerate(places(seen, len(self.state.intrinsics), size)):

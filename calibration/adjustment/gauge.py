@@ -21,7 +21,7 @@ SUBJECT_RADIUS_MM = 110.0
 
 
 def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 60) -> Float[np.ndarray, "n 3"]:
-    """Points spread evenly over a sphere about the point the cameras look at (a Fibonacci lattice)."""
+    """Returns points spread evenly over a sphere about the point the cameras look at (a Fibonacci lattice)."""
     index = np.arange(count) + 0.5
     height, angle = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5)) * index
     ring = np.sqrt(1 - height**2)
@@ -35,7 +35,7 @@ def moved(camera: Camera, step: Float[np.ndarray, " 6"]) -> Camera:
 
 
 def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
-    """Derivative of the pixels by a left perturbation of camera_from_world."""
+    """Returns the derivative of the pixels by a left perturbation of camera_from_world."""
     _, by_world = camera.project_with_jacobian(points_world)
     by_camera = by_world @ camera.camera_from_world.rotation.T
     points = camera.camera_from_world.apply(points_world)
@@ -43,7 +43,8 @@ def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Flo
 
 
 def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c 6 6"]:
-    """Per camera, the mean squared image motion (px^2) of ``points_world`` as a quadratic form of the perturbation."""
+    """Computes per camera the mean squared image motion (px^2) of ``points_world`` as a quadratic form of the
+    perturbation."""
     metrics = []
     for camera in rig:
         jacobian = pose_jacobian(camera, points_world)
@@ -53,7 +54,8 @@ def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.n
 
 
 def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
-    """Left perturbations of all cameras that a motion of the world (rotation, translation, and scale) amounts to."""
+    """Returns the left perturbations of all cameras that a motion of the world (rotation, translation, and scale)
+    amounts to."""
     columns = []
     for camera in rig:
         rotation, translation = camera.camera_from_world.rotation, camera.camera_from_world.translation
@@ -125,9 +127,9 @@ def _brought_together(rig: Rig, reference: Rig) -> Rig:
 
 
 def image_distance(rig: Rig, reference: Rig, *, scale: bool = False) -> Float[np.ndarray, " c"]:
-    """Per camera, the RMS distance in pixels between where ``rig`` and ``reference`` see the subject's region, worlds
-    aligned: the size of a calibration error as a fit to silhouettes meets it. Each rig projects with its own lenses: a
-    principal point and a rotation that make up for each other are no error."""
+    """Computes per camera the RMS distance in pixels between where ``rig`` and ``reference`` see the subject's region,
+    worlds aligned: the size of a calibration error as a fit to silhouettes meets it. Each rig projects with its own
+    lenses: a principal point and a rotation that make up for each other are no error."""
     points = subject_points(reference)
     aligned = align_world(rig, reference, scale=scale)
     misses = [camera.project(points) - reference[camera.name].project(points) for camera in aligned]
@@ -135,13 +137,14 @@ def image_distance(rig: Rig, reference: Rig, *, scale: bool = False) -> Float[np
 
 
 def intrinsics_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:
-    """Derivative of the pixels by fx fy cx cy k1 k2 p1 p2 k3."""
+    """Returns the derivative of the pixels by fx fy cx cy k1 k2 p1 p2 k3."""
     return lens_jacobians(camera.camera_from_world.apply(points_world), camera.intrinsics.values())[1]
 
 
 def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "6 15"]:
-    """The pose perturbation that acts on the subject's image like an error of intrinsics (first nine) and pose: what a
-    reader who takes the intrinsics for exact must allow the pose. A principal point 10 px off is almost a turn."""
+    """Returns the pose perturbation that acts on the subject's image like an error of intrinsics (first nine) and pose:
+    what a reader who takes the intrinsics for exact must allow the pose. A principal point 10 px off is almost a
+    turn."""
     by_pose = pose_jacobian(camera, points_world).reshape(-1, 6)
     by_lens = intrinsics_jacobian(camera, points_world).reshape(-1, 9)
     good = np.isfinite(by_pose).all(axis=1) & np.isfinite(by_lens).all(axis=1)
@@ -150,8 +153,9 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
 
 
 def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[np.ndarray, " c"]:
-    """Per camera, the standard deviation in pixels (2D) with which it sees the subject's region, worlds aligned, under
-    the joint covariance of all intrinsics (first nine) and poses: what ``image_distance`` to the truth will be."""
+    """Computes per camera the standard deviation in pixels (2D) with which it sees the subject's region, worlds
+    aligned, under the joint covariance of all intrinsics (first nine) and poses: what ``image_distance`` to the truth
+    will be."""
     points, count = subject_points(rig), len(rig)
     by_pose = [pose_jacobian(camera, points).reshape(-1, 6) for camera in rig]
     by_lens = [intrinsics_jacobian(camera, points).reshape(-1, 9) for camera in rig]

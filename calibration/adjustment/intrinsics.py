@@ -54,7 +54,7 @@ class Lens:
 
     @property
     def weakness(self) -> Message | None:
-        """Why these views do not determine the lens well; None if they do."""
+        """Tells why these views do not determine the lens well; None if they do."""
         if self.views < VIEWS_LEAST:
             return compose("lens-views-too-few", camera=self.camera, views=self.views, needed=VIEWS_LEAST)
         share = self.sigma[0] / self.intrinsics.fx
@@ -74,7 +74,7 @@ def estimate_lenses(detections: Detections) -> dict[str, Lens]:
 
 
 def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) -> Lens:
-    """Intrinsics and board poses of one camera (one or more views)."""
+    """Returns intrinsics and board poses of one camera (one or more views)."""
     shots = [view.shot for view in views]
     seen = observations(views, [views[0].camera], shots, board)
     state = _start(views, size, board)
@@ -110,7 +110,8 @@ def _lens(
 
 
 def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
-    """Robust standard deviation of one coordinate, px: the median of a 2D Gaussian's radius is 1.1774 sigma."""
+    """Returns the robust standard deviation of one coordinate, px: the median of a 2D Gaussian's radius is 1.1774
+    sigma."""
     if not len(misses):
         return 1.0
     return max(float(np.median(np.linalg.norm(misses, axis=1))) / 1.1774, CORNER_SIGMA_LEAST)
@@ -134,7 +135,7 @@ def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> Bundle
 
 
 def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTransform]) -> BundleState:
-    """The state of one camera at the world's origin."""
+    """Returns the state of one camera at the world's origin."""
     return BundleState(
         intrinsics.values()[None],
         np.eye(3)[None],

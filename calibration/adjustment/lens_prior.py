@@ -26,7 +26,7 @@ class LensPrior:
     information: Float[np.ndarray, "c 9 9"]
 
     def combine(self, mean: Float[np.ndarray, "c 9"], information: Float[np.ndarray, "c 9 9"]) -> "LensPrior":
-        """Two independent pieces of knowledge joined."""
+        """Combines two independent pieces of knowledge."""
         total = self.information + information
         pull = np.einsum("cij,cj->ci", self.information, self.mean) + np.einsum("cij,cj->ci", information, mean)
         return LensPrior(np.linalg.solve(total, pull[:, :, None])[:, :, 0], total)
@@ -76,7 +76,7 @@ class AspectsAt:
         return float((self.residual**2).sum())
 
     def slopes(self) -> Float[np.ndarray, "c 2"]:
-        """By fx and fy of the camera."""
+        """Returns the derivatives by fx and fy of the camera."""
         return np.stack([4.0 * self.fy, -4.0 * self.fx], axis=1) / ((self.fx + self.fy)[:, None] ** 2 * ASPECT_PRIOR)
 
     def add_to(self, equations: NormalEquations) -> None:
@@ -87,7 +87,7 @@ class AspectsAt:
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
-    """What is known of any lens before a board is seen."""
+    """Returns what is known of any lens before a board is seen."""
     mean, sigma = [], []
     for width, height in sizes:
         long = max(width, height)
@@ -99,5 +99,5 @@ def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
 
 
 def fixed_prior(intrinsics: Float[np.ndarray, "c 9"]) -> LensPrior:
-    """For lenses that do not move: ``Free(intrinsics=False)``."""
+    """Returns a prior that holds lenses still: ``Free(intrinsics=False)``."""
     return LensPrior(intrinsics, np.zeros((len(intrinsics), 9, 9)))

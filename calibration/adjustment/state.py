@@ -35,7 +35,7 @@ class Observations:
         return np.repeat(np.arange(len(self.camera)), np.diff(self.starts))
 
     def subset(self, kept: Bool[np.ndarray, " n"]) -> "Observations":
-        """Only the corners ``kept``; views stay, possibly empty."""
+        """Selects the corners ``kept``; views stay, possibly empty."""
         counts = np.bincount(self.view_of[kept], minlength=len(self.camera))
         starts = np.concatenate([[0], np.cumsum(counts)])
         return replace(self, starts=starts, points=self.points[kept], pixels=self.pixels[kept])
@@ -58,7 +58,8 @@ class BundleState:
 
 
 def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[str], board: Board) -> Observations:
-    """What every view found, end to end: corners (px) and their places on the board (mm), by camera and shot."""
+    """Returns what every view found, end to end: corners (px) and their places on the board (mm), by camera and
+    shot."""
     corners = board.corners()
     counts = [len(view.found.ids) for view in views]
     return Observations(
@@ -71,18 +72,19 @@ def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[
 
 
 def intrinsics_of(values: Float[np.ndarray, " 9"], size: tuple[int, int]) -> Intrinsics:
-    """From ``fx fy cx cy k1 k2 p1 p2 k3``, the order of a bundle's unknowns; ``size`` is width and height, px."""
+    """Builds intrinsics from ``fx fy cx cy k1 k2 p1 p2 k3``, the order of a bundle's unknowns; ``size`` is width and
+    height, px."""
     fx, fy, cx, cy, *lens = (float(value) for value in values)
     return Intrinsics(*size, fx, fy, cx, cy, Distortion(*lens))
 
 
 def camera_of(state: BundleState, index: int, name: str, size: tuple[int, int]) -> Camera:
-    """The camera at ``index`` as the adjustment has it, camera_from_world in mm."""
+    """Returns the camera at ``index`` as the adjustment has it, camera_from_world in mm."""
     return Camera(name, intrinsics_of(state.intrinsics[index], size), state.camera_pose(index))
 
 
 def moved_state(state: BundleState, step: Float[np.ndarray, " q"]) -> BundleState:
-    """The state after a step of all parameters: cameras (intrinsics, pose), boards, time offsets."""
+    """Returns the state after a step of all parameters: cameras (intrinsics, pose), boards, time offsets."""
     cameras, shots = len(state.intrinsics), len(state.board_rotations)
     per_camera = step[: cameras * PER_CAMERA].reshape(cameras, PER_CAMERA)
     per_shot = step[cameras * PER_CAMERA : cameras * PER_CAMERA + shots * PER_SHOT].reshape(shots, PER_SHOT)
@@ -115,7 +117,7 @@ def orthonormal(state: BundleState) -> BundleState:
 def corner_positions(
     state: BundleState, seen: Observations
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """World and camera coordinates of all corners, and the camera index of each."""
+    """Returns world and camera coordinates of all corners, and the camera index of each."""
     camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
     world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
     if state.offsets.any():
@@ -127,7 +129,7 @@ def corner_positions(
 
 
 def residuals(state: BundleState, seen: Observations) -> Float[np.ndarray, "n 2"]:
-    """Projected less detected, pixels; ``BEHIND_PX`` where a corner falls behind its camera."""
+    """Returns projected less detected, pixels; ``BEHIND_PX`` where a corner falls behind its camera."""
     _, inside, camera = corner_positions(state, seen)
     behind = inside[:, 2] < DEPTH_LEAST_MM
     inside[behind] = (0.0, 0.0, 1.0)

@@ -16,7 +16,7 @@ from rig.rig import Rig
 
 
 def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Unit vector, in the rig's present frame, that the cameras hold to be up."""
+    """Returns the unit vector, in the rig's present frame, that the cameras hold to be up."""
     rights = np.stack([camera.camera_from_world.rotation[0] for camera in rig])
     ups = -np.stack([camera.camera_from_world.rotation[1] for camera in rig])
     values, vectors = np.linalg.eigh(rights.T @ rights)
@@ -28,8 +28,9 @@ def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
 
 
 def in_world_frame(rig: Rig, front: str | None = None) -> Rig:
-    """The same rig in the project's world frame. ``front`` names the front camera; without it the middle one of the
-    fan is taken. Covariances are those of left perturbations and do not change. Raises InputError if it is unknown."""
+    """Returns the same rig in the project's world frame. ``front`` names the front camera; without it the middle one of
+    the fan is taken. Covariances are those of left perturbations and do not change. Raises InputError if it is
+    unknown."""
     if front is not None and front not in rig:
         raise InputError("front camera", [compose("front-of-other-rig", front=f"{front!r}", cameras=rig.names)])
     origin, up = rig.centre_world(), up_direction(rig)

@@ -56,7 +56,7 @@ class Board:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Inner corners as (columns, rows), OpenCV's pattern size."""
+        """Returns the inner corners as (columns, rows), OpenCV's pattern size."""
         return self.columns - 1, self.rows - 1
 
     @property
@@ -69,7 +69,7 @@ class Board:
         return self.columns * self.rows // 2
 
     def corners(self) -> Float[np.ndarray, "n 3"]:
-        """The inner corners in the board frame, mm, row by row."""
+        """Returns the inner corners in the board frame, mm, row by row."""
         x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
         return self.square_mm * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
@@ -93,14 +93,15 @@ class Board:
 
     @property
     def is_chiral(self) -> bool:
-        """Whether a picture of the pattern differs from every picture of its mirror image: only then can a mirrored
-        camera be told from its own pictures. A checkerboard with an odd side, or a square one, is its own image."""
+        """Tells whether a picture of the pattern differs from every picture of its mirror image: only then can a
+        mirrored camera be told from its own pictures. A checkerboard with an odd side, or a square one, is its own
+        image."""
         if self.kind == "charuco":
             return True
         return self.columns % 2 == 0 and self.rows % 2 == 0 and self.columns != self.rows
 
     def squares(self) -> Bool[np.ndarray, "rows columns"]:
-        """True where a square is black."""
+        """Marks where a square is black."""
         row, column = np.indices((self.rows, self.columns))
         white_first = self.kind == "charuco" and self.legacy and self.rows % 2 == 0
         return ((row + column) % 2 == 0) ^ self.inverted ^ white_first
@@ -125,7 +126,7 @@ def read_board(path: Path) -> Board:
 
 
 def board_from_document(document: Mapping[str, Any], subject: str = "board.toml") -> Board:
-    """The board of decoded TOML. Raises InputError naming every fault."""
+    """Returns the board of decoded TOML. Raises InputError naming every fault."""
     known = set(Board.__dataclass_fields__)
     strange = [key for key in document if key not in known]
     faults = [compose("board-key-unknown", key=f"{key!r}", known=sorted(known)) for key in strange]

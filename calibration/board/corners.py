@@ -34,7 +34,7 @@ class Found:
 
 
 def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
-    """The board in one picture, or None. Corners are in the board's order, sub-pixel."""
+    """Returns the board in one picture, or None. Corners are in the board's order, sub-pixel."""
     picture = 255 - grey if board.inverted else grey
     found = (_charuco if board.kind == "charuco" else _checkerboard)(picture, board)
     if found is None or len(found[0]) < CORNERS_LEAST or not is_flat_grid(board, *found):
@@ -43,7 +43,7 @@ def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
 
 
 def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 2"]) -> bool:
-    """Whether ``corners`` are, up to a lens's distortion, the image of the board's grid seen from its front."""
+    """Tells whether ``corners`` are, up to a lens's distortion, the image of the board's grid seen from its front."""
     flat = board.corners()[ids, :2] / board.square_mm
     if np.linalg.matrix_rank(flat - flat.mean(axis=0)) < 2:
         return False
@@ -55,8 +55,8 @@ def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.nda
 
 
 def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
-    """Width in pixels of the board's edges, 10 to 90 %, in the blurrier of its two directions; infinite where no edge
-    rises within the room that the pattern leaves (half a square, or the rim around a marker)."""
+    """Returns the width in pixels of the board's edges, 10 to 90 %, in the blurrier of its two directions; infinite
+    where no edge rises within the room that the pattern leaves (half a square, or the rim around a marker)."""
     ids, corners = found
     flat = board.corners()[ids, :2] / board.square_mm
     homography = _homography(flat, corners)
@@ -106,7 +106,7 @@ def _checkerboard(grey: np.ndarray, board: Board) -> Corners | None:
 
 
 def in_board_order(grey: np.ndarray, corners: np.ndarray, board: Board) -> Float[np.ndarray, "rows columns 2"]:
-    """The corners in a right-handed order that the board's colours allow."""
+    """Returns the corners in a right-handed order that the board's colours allow."""
     columns, rows = board.grid
     grid = corners.reshape(rows, columns, 2)
     across, down = (grid[:, -1] - grid[:, 0]).mean(axis=0), (grid[-1] - grid[0]).mean(axis=0)
@@ -134,7 +134,8 @@ def _contrast(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> fl
 
 
 def pattern_continues(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> bool:
-    """Whether squares alternate even outside the board's outline: then it is a part of a board with more squares."""
+    """Tells whether squares alternate even outside the board's outline: then it is a part of a board with more
+    squares."""
     inside = abs(_contrast(grey, grid))
     rows, columns = grid.shape[:2]
     flat = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
@@ -170,7 +171,7 @@ def _sector_based_exhaustive(grey: np.ndarray, board: Board) -> np.ndarray | Non
 
 
 def classic_corners(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    """Corners (px, row by row) by OpenCV's adaptive threshold; None where the whole board is not found."""
+    """Returns corners (px, row by row) by OpenCV's adaptive threshold; None where the whole board is not found."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     ok, corners = cv2.findChessboardCorners(grey, board.grid, flags=flags)
     return _refine(grey, corners.reshape(-1, 2), 0.35, board) if ok else None

@@ -81,7 +81,7 @@ class WrongBoard(EigenheadError):
 
 
 def reasons_of(notes: Iterable[PictureNote]) -> list[Message]:
-    """Each reason, said once for all cameras that have it."""
+    """Returns each reason, said once for all cameras that have it."""
     pictures: dict[Message, list[str]] = {}
     for note in notes:
         pictures.setdefault(note.reason, []).append(f"{note.camera}/{note.picture}")

@@ -37,7 +37,8 @@ class Layout:
 
 
 def find_markers(grey: UInt8[np.ndarray, "h w"], dictionary: str) -> dict[int, Float[np.ndarray, "4 2"]]:
-    """The markers of one of OpenCV's dictionaries in a picture; a number that is there twice cannot be told apart."""
+    """Returns the markers of one of OpenCV's dictionaries in a picture; a number that is there twice cannot be told
+    apart."""
     return _detected(grey, cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)))
 
 
@@ -49,8 +50,8 @@ def _detected(grey: np.ndarray, dictionary: cv2.aruco.Dictionary) -> dict[int, F
 
 
 def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
-    """The layout that explains the markers of most pictures, one of as many columns as ``board`` where there is one;
-    None where none does."""
+    """Returns the layout that explains the markers of most pictures, one of as many columns as ``board`` where there is
+    one; None where none does."""
     shown = [markers for markers in pictures if len(markers) >= MARKERS_LEAST]
     if not shown:
         return None
@@ -129,7 +130,7 @@ def _size(name: str) -> int:
 
 
 def is_april_grid(markers: Markers) -> bool:
-    """Whether markers stand in every cell of a grid, numbered from row to row, as on Kalibr's AprilGrid."""
+    """Tells whether markers stand in every cell of a grid, numbered from row to row, as on Kalibr's AprilGrid."""
     if len(markers) < MARKERS_LEAST:
         return False
     numbers = np.array(sorted(markers))
@@ -148,7 +149,8 @@ def is_april_grid(markers: Markers) -> bool:
 
 
 def board_of(layout: Layout, board: Board) -> Board | None:
-    """The described board with the pattern and the first number of ``layout``; None where its squares are others."""
+    """Returns the described board with the pattern and the first number of ``layout``; None where its squares are
+    others."""
     if layout.columns != board.columns or abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
         return None
     return replace(board, legacy=layout.legacy, first_marker=layout.first_marker)

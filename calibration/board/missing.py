@@ -22,7 +22,8 @@ from rig.messages.message import Message, compose
 
 
 def explain(grey: UInt8[np.ndarray, "h w"], board: Board) -> Message | None:
-    """Why ``detect`` finds nothing in a picture that does show a pattern; None if it shows none that is recognised."""
+    """Tells why ``detect`` finds nothing in a picture that does show a pattern; None if it shows none that is
+    recognised."""
     inverse = replace(board, inverted=not board.inverted)
     mirrored = detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None
     inverted = detect(grey, inverse) is not None
@@ -77,7 +78,7 @@ def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None:
-    """What is wrong with the described board by the markers that pictures show; None where nothing is."""
+    """Returns what is wrong with the described board by the markers that pictures show; None where nothing is."""
     layout = find_layout(pictures, board)
     if layout is None:
         if any(map(is_april_grid, pictures)):

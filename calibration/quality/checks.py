@@ -35,7 +35,8 @@ class Check:
 
 
 def check_cheirality(state: BundleState, seen: Observations, board: Board) -> Check:
-    """Every corner lies before its camera, every board shows its face, and the rotations are proper."""
+    """Checks that every corner lies before its camera, that every board shows its face and that the rotations are
+    proper."""
     camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
     world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
     points = np.einsum("nij,nj->ni", state.camera_rotations[camera], world) + state.camera_translations[camera]
@@ -58,7 +59,7 @@ def check_held_out(
     free: Free,
     tick: Callable[[], None] = lambda: None,
 ) -> Check:
-    """Cameras estimated without every fifth shot must see those shots' boards as well as the others'."""
+    """Checks that cameras estimated without every fifth shot see those shots' boards as well as the others'."""
     several = np.flatnonzero(np.bincount(seen.shot, minlength=len(state.board_rotations)) >= 2)
     held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     if len(held) < 2 or len(several) - len(held) < 4:
@@ -77,8 +78,8 @@ def check_held_out(
 
 
 def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
-    """The square size against a second distance on the print, and the print's height against its width as the cameras
-    see it."""
+    """Checks the square size against a second distance on the print, and the print's height against its width as the
+    cameras see it."""
     pairs = [
         ("width", board.measured_width_mm, board.columns),
         ("height", board.measured_height_mm, board.rows),
@@ -99,7 +100,7 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
 
 
 def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
-    """Every camera's pose is known to a fraction of a pixel at the subject."""
+    """Checks that every camera's pose is known to a fraction of a pixel at the subject."""
     loose = [name for name, value in zip(rig.names, pose_sigma_px, strict=True) if not value < LOOSE_PX]
     worst = int(np.argmax(pose_sigma_px))
     detail = compose("poses-determined", px=pose_sigma_px.max(), camera=rig.names[worst])
@@ -108,7 +109,7 @@ def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
 
 
 def check_against_previous(rig: Rig, previous: Rig | None) -> list[Check]:
-    """Names, handedness, scale and lenses against the last calibration, as far as cameras are shared."""
+    """Compares names, handedness, scale and lenses with the last calibration, as far as cameras are shared."""
     names = [name for name in rig.names if previous is not None and name in previous]
     if previous is None or len(names) < 3:
         return [
@@ -194,8 +195,8 @@ def _check_lenses(now: Rig, then: Rig) -> Check:
 def measure_aspect(
     state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> tuple[float, float]:
-    """Height of the board's squares over their width as the cameras see it, and its standard deviation: three solutions
-    with the board stretched, and the parabola through their costs."""
+    """Returns the height of the board's squares over their width as the cameras see it, and its standard deviation:
+    three solutions with the board stretched, and the parabola through their costs."""
     step = 0.003
     costs = []
     for stretch in (-step, 0.0, step):
@@ -209,5 +210,5 @@ def measure_aspect(
 
 
 def failed(checks: Sequence[Check]) -> list[Check]:
-    """The checks that do not hold; what could not be judged is not among them."""
+    """Returns the checks that do not hold; what could not be judged is not among them."""
     return [check for check in checks if check.passed is False]

@@ -55,7 +55,7 @@ def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
 
 
 def square_side_px(view: View, board: Board) -> float:
-    """Typical side of a square in the picture."""
+    """Returns the typical side of a square in the picture."""
     columns = board.grid[0]
     place = dict(zip(view.found.ids.tolist(), view.found.corners, strict=True))
     sides = [
@@ -83,14 +83,14 @@ def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detec
 
 
 def view_rms(state: BundleState, seen: Observations) -> Float[np.ndarray, " v"]:
-    """Root mean square reprojection error of each view, px."""
+    """Returns the root mean square reprojection error of each view, px."""
     squares = (residuals(state, seen) ** 2).sum(axis=1)
     counts = np.bincount(seen.view_of, minlength=len(seen.camera))
     return np.sqrt(np.bincount(seen.view_of, squares, minlength=len(seen.camera)) / np.maximum(counts, 1))
 
 
 def bad_views(state: BundleState, seen: Observations) -> np.ndarray:
-    """True per view that the joint solution does not explain. A robust solution lets one camera of a shot keep the
+    """Marks the views that the joint solution does not explain. A robust solution lets one camera of a shot keep the
     board and the rest of the shot fail; what is wrong with such a shot is for ``explain_shot`` to say."""
     rms = view_rms(state, seen)
     return rms > max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
@@ -106,7 +106,7 @@ def explain_shot(
     boards: dict[str, RigidTransform],
     noise_px: float,
 ) -> list[Dropped]:
-    """What to leave out of a shot in which ``bad`` views contradict the rig, and why."""
+    """Decides what to leave out of a shot in which ``bad`` views contradict the rig, and why."""
     cameras = {
         name: Camera(name, intrinsics_of(state.intrinsics[i], detections.sizes[name]), state.camera_pose(i))
         for i, name in enumerate(names)
@@ -151,8 +151,8 @@ def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Bo
 def board_scale(
     views: Sequence[View], cameras: dict[str, Camera], board: Board, start: RigidTransform
 ) -> tuple[float, float] | None:
-    """The size of a shot's board, as a multiple of the described one, that its cameras agree on, and the RMS (px) they
-    then have; None where fewer than two see it."""
+    """Returns the size of a shot's board, as a multiple of the described one, that its cameras agree on, and the RMS
+    (px) they then have; None where fewer than two see it."""
     if len({view.camera for view in views}) < 2:
         return None
     triples = [(cameras[v.camera], board.corners()[v.found.ids], v.found.corners) for v in views]

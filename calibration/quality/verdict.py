@@ -37,7 +37,7 @@ class Verdict:
 
 
 def judge(cameras: Mapping[str, CameraEvidence], checks: Sequence[Check]) -> Verdict:
-    """By its weakest camera."""
+    """Judges a calibration by its weakest camera."""
     severe, mild = [], []
 
     def of(test: str, least: float, most: float) -> list[str]:

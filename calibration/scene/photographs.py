@@ -39,7 +39,7 @@ class Photographs:
 
 
 def find_photographs(folder: Path) -> Photographs:
-    """The photographs of ``folder``. Raises InputError naming every fault."""
+    """Returns the photographs of ``folder``. Raises InputError naming every fault."""
     if not folder.is_dir():
         raise InputError(folder.name, [compose("no-folder-of-photographs")])
     root = capture_root(folder)
@@ -67,8 +67,8 @@ def find_photographs(folder: Path) -> Photographs:
 
 
 def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """The masks (True = subject) that lie beside one shot's photographs, in masks/. Raises InputError for one that is
-    damaged or of another size."""
+    """Returns the masks (True = subject) that lie beside one shot's photographs, in masks/. Raises InputError for one
+    that is damaged or of another size."""
     root = capture_root(folder)
     if photographs.shots != (ONE_SHOT,) or not (root / "masks").is_dir():
         return {}

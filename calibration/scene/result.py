@@ -76,7 +76,7 @@ class SceneCalibration:
         return [compose("located", where=name, fault=why) for name, why in self.left_out.items()]
 
     def figures(self) -> SceneFigures:
-        """The numbers of ``calibrate --from scene --json``."""
+        """Returns the numbers of ``calibrate --from scene --json``."""
         misses = self.structure.residuals()
         cameras: dict[str, SceneCameraFigures] = {}
         for index, camera in enumerate(self.rig):
@@ -99,7 +99,7 @@ class SceneCalibration:
         }
 
     def document(self) -> SceneDocument:
-        """Everything but points and residuals, as JSON."""
+        """Returns everything but points and residuals, as JSON."""
         return {
             "figures": self.figures(),
             "front": self.front,

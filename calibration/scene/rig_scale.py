@@ -43,7 +43,7 @@ def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) 
 
 
 def times(rig: Rig, factor: float) -> Rig:
-    """The rig with all lengths times ``factor``, its covariances with them."""
+    """Returns the rig with all lengths times ``factor``, its covariances with them."""
     grows = np.diag([1.0, 1.0, 1.0, factor, factor, factor])
     return Rig(
         tuple(

@@ -45,14 +45,14 @@ class Scale:
 
     @property
     def assumed(self) -> bool:
-        """Whether nothing was measured."""
+        """Tells whether nothing was measured."""
         return self.source == ASSUMED
 
 
 def find_scale(
     structure: Structure, known: KnownLength | None, photographs: Photographs, head: Float[np.ndarray, "v 3"]
 ) -> Scale:
-    """The scale from ``known``, or from ``head``, the vertices (mm) of a model's mean head, where that is None.
+    """Returns the scale from ``known``, or from ``head``, the vertices (mm) of a model's mean head, where that is None.
 
     Raises InputError where the photographs that joined do not show the known length."""
     if isinstance(known, PointDistance):
@@ -65,7 +65,8 @@ def find_scale(
 
 
 def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
-    """From the centres of two cameras; a lens's entrance pupil is known to some millimetres from outside."""
+    """Computes the scale from the centres of two cameras; a lens's entrance pupil is known to some millimetres from
+    outside."""
     lost = [name for name in known.cameras if name not in rig]
     if lost:
         raise InputError("scale.json", [compose("scale-camera-lost", camera=name) for name in lost])
@@ -78,7 +79,7 @@ def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
 
 
 def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
-    """From two points that were picked in two views or more each."""
+    """Computes the scale from two points that were picked in two views or more each."""
     ends, faults = [], []
     for name, views in (("first", known.first), ("second", known.second)):
         joined = {camera: pixel for camera, pixel in views.items() if camera in rig}
@@ -108,7 +109,7 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 
 
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
-    """Corners (px) of the tags of a dictionary, by shot and number, then by camera."""
+    """Returns corners (px) of the tags of a dictionary, by shot and number, then by camera."""
     detector = _tag_detector(known)
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
     for camera, shots in photographs.files.items():
@@ -149,7 +150,7 @@ def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) 
 
 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
-    """From the sides of all tags that two views or more show, the median over tags."""
+    """Computes the scale from the sides of all tags that two views or more show, the median over tags."""
     found = []
     for number, views in tags.items():
         joined = {camera: corners for camera, corners in views.items() if camera in rig}
@@ -175,7 +176,7 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
 
 
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
-    """From the median distance of points from their middle, as in ``head`` (mm)."""
+    """Computes the scale from the median distance of points from their middle, as in ``head`` (mm)."""
     points = _looked_at(structure)
     ratio = _spread(head) / _spread(points)
     provenance = compose("scale-by-head")

@@ -76,7 +76,7 @@ def calibrate_scene(
 
 
 def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, Message]]:
-    """The structure with why views are left out of it. Raises CalibrationRefused where too few joined."""
+    """Returns the structure with why views are left out of it. Raises CalibrationRefused where too few joined."""
     names = list(matches.sizes)
     joined = structure.rig.names if structure is not None else ()
     left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
@@ -90,7 +90,7 @@ def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, di
 def placed(
     structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, Message], front: str | None
 ) -> SceneCalibration:
-    """The calibration in millimetres and in the world frame, with its covariances."""
+    """Returns the calibration in millimetres and in the world frame, with its covariances."""
     if front in left_out:
         raise CalibrationRefused([compose("front-left-out", camera=str(front), why=left_out[str(front)])])
     here = transformed(structure, structure.rig, scale.factor)
@@ -124,8 +124,8 @@ def placed(
 
 
 def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
-    """The calibration with the poses that the subject's silhouettes agree on, if pairs of views that were held out do;
-    the calibration itself where there are too few masks."""
+    """Returns the calibration with the poses that the subject's silhouettes agree on, if pairs of views that were held
+    out do; the calibration itself where there are too few masks."""
     rig = calibration.rig
     known = [name for name in rig.names if name in masks]
     if len(known) < VIEWS_LEAST:
@@ -137,7 +137,7 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
 
 
 def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
-    """The structure times ``factor``, in the frame in which its cameras are those of ``moved``."""
+    """Returns the structure times ``factor``, in the frame in which its cameras are those of ``moved``."""
     before, after = structure.rig.cameras[0].camera_from_world, moved.cameras[0].camera_from_world
     new_from_old = after.inverse() @ before
     cameras = tuple(

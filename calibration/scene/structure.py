@@ -50,7 +50,7 @@ class Structure:
         return 5 if len(self.rig) >= CENTRE_VIEWS else 3
 
     def residuals(self) -> Float[np.ndarray, "n 2"]:
-        """Projected less observed, px."""
+        """Returns projected less observed, px."""
         projected = np.empty_like(self.pixels)
         for index, camera in enumerate(self.rig):
             of_camera = self.camera_of == index
@@ -59,7 +59,7 @@ class Structure:
 
 
 def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Structure | None:
-    """The largest set of cameras that join, with their points; None where no pair of views starts one.
+    """Returns the largest set of cameras that join, with their points; None where no pair of views starts one.
 
     Lenses of their own are started from the one that explains all views best, and keep its distortion: a view of a
     head cannot tell its focal length from its distance, nor its 300 points a lens's bend from their own noise."""
@@ -153,7 +153,7 @@ def _camera(name: str, image: Any, lens: Any) -> Camera:
 
 
 def why_not(name: str, matches: Matches, joined: Collection[str]) -> Message:
-    """Why a view did not join the others, and what to add."""
+    """Tells why a view did not join the others, and what to add."""
     features = matches.features[name]
     if features < FEATURES_LEAST:
         return compose("join-points-bare", points=features)

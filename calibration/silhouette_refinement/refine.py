@@ -67,7 +67,7 @@ class Residuals:
     px: Float[np.ndarray, " n"]
 
     def of(self, camera: str) -> Float[np.ndarray, " k"]:
-        """Those that a camera takes part in."""
+        """Selects the tangencies that a camera takes part in."""
         return self.px[[camera in pair for pair in self.cameras]]
 
 
@@ -151,8 +151,8 @@ def _joined(parts: Sequence[Residuals]) -> Residuals:
 
 
 def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig, pairs: Pairs | None = None) -> Residuals:
-    """Residuals of all captures' outer tangencies, or of those of some ``pairs`` of cameras: the same ones whatever the
-    rig, so that two rigs compare."""
+    """Returns the residuals of all captures' outer tangencies, or of those of some ``pairs`` of cameras: the same ones
+    whatever the rig, so that two rigs compare."""
     found = [_tangencies(capture, rig, pairs, outer=True) for capture in captures]
     misses = [tangency_residuals(PackedTangencies.of(tangencies, rig), rig) for tangencies in found]
     return Residuals(tuple(t.cameras for tangencies in found for t in tangencies), np.concatenate(misses))
@@ -168,7 +168,7 @@ def _forgiven(misses: Float[np.ndarray, " n"], noise_px: float) -> Float[np.ndar
 
 
 def noise_of(misses: Float[np.ndarray, " n"]) -> float:
-    """Robust standard deviation, px."""
+    """Returns the robust standard deviation, px."""
     return max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(misses)))) if len(misses) else NOISE_LEAST_PX
 
 
@@ -191,9 +191,9 @@ def minimise_tangencies(
     heads: Heads | None,
     pairs: Pairs | None = None,
 ) -> Rig:
-    """The cameras of least tangency cost over all captures, with the start as prior; then of that and the rims of the
-    heads. Only the tangencies of ``pairs`` of cameras count where they are given. The result's covariances are those of
-    the last step, in the subject's gauge."""
+    """Returns the cameras of least tangency cost over all captures, with the start as prior; then of that and the rims
+    of the heads. Only the tangencies of ``pairs`` of cameras count where they are given. The result's covariances are
+    those of the last step, in the subject's gauge."""
     here = _Refining(captures, start, focal, prior_px, pairs)
     correction = here.prior.centre
     solution = None
@@ -239,18 +239,18 @@ class _Refining:
     def step(
         self, correction: Float[np.ndarray, " p"], terms: tuple[Term[Float[np.ndarray, " p"]], ...]
     ) -> Solution[Float[np.ndarray, " p"]]:
-        """One step on ``terms`` and the prior."""
+        """Takes one step on ``terms`` and the prior."""
         return minimise(Problem((*terms, self.prior), len(correction), np.add), correction, ONE_STEP)
 
     def tangency_term(self, correction: Float[np.ndarray, " p"], *, outer: bool) -> TangencyTerm:
-        """The tangencies of all captures as the corrected cameras find them, and their robust noise."""
+        """Returns the tangencies of all captures as the corrected cameras find them, and their robust noise."""
         rig = self.rig(correction)
         found = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
         seen = PackedTangencies.of(found, rig)
         return TangencyTerm(seen, self.start, self.focal, noise_of(tangency_residuals(seen, rig)))
 
     def rim_terms(self, correction: Float[np.ndarray, " p"], heads: Heads) -> list[Quadratic]:
-        """What the rim of each capture's head says of the cameras."""
+        """Returns what the rim of each capture's head says of the cameras."""
         rig, poses = self.rig(correction), _pose_places(self.start, focal=self.focal)
         terms = []
         for capture, place in zip(self.captures, heads.starts, strict=True):
@@ -291,8 +291,8 @@ def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"
 
 
 def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Information of N(0, information^-1) about what ``projection`` leaves, whatever the world's own motion; and, since
-    no image determines that, a prior that keeps it at zero.
+    """Returns the information of N(0, information^-1) about what ``projection`` leaves, whatever the world's own
+    motion; and, since no image determines that, a prior that keeps it at zero.
 
     With S the projection, I - S = A B of rank 6, and M the information: the least of (x - A t)^T M (x - A t) over all
     motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A rig moved as a whole then costs nothing, as it costs

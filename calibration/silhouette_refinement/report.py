@@ -60,7 +60,7 @@ class RefinementRun:
     warnings: tuple[Message, ...] = ()
 
     def document(self) -> RefinementDocument:
-        """What ``refine --json`` prints."""
+        """Returns what ``refine --json`` prints."""
         found = self.refinement
         return {
             "kept": found.kept,
@@ -81,7 +81,7 @@ class RefinementRun:
 
 
 def refinement_page(run: RefinementRun) -> str:
-    """The HTML page."""
+    """Returns the HTML page."""
     found = run.refinement
     verdict = "kept" if found.kept else "rejected: the calibration stays as it was"
     kind = "good" if found.kept else "bad"

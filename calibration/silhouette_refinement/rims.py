@@ -34,7 +34,7 @@ class Heads:
     settings: FittingSettings = field(default_factory=FittingSettings)
 
     def subset(self, chosen: Sequence[int]) -> "Heads":
-        """The heads of some of the captures."""
+        """Returns the heads of some of the captures."""
         return replace(self, starts=[self.starts[i] for i in chosen])
 
 

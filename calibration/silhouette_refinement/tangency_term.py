@@ -80,7 +80,7 @@ def per_camera(*, focal: bool) -> int:
 
 
 def corrected(rig: Rig, correction: Float[np.ndarray, " p"], *, focal: bool) -> Rig:
-    """The rig with every camera moved, and with ``focal`` zoomed, by its part of the correction."""
+    """Returns the rig with every camera moved, and with ``focal`` zoomed, by its part of the correction."""
     cameras = []
     for camera, step in zip(rig, correction.reshape(len(rig), -1), strict=True):
         cameras.append(zoomed(moved(camera, step[:6]), float(step[6])) if focal else moved(camera, step))
@@ -88,13 +88,13 @@ def corrected(rig: Rig, correction: Float[np.ndarray, " p"], *, focal: bool) -> 
 
 
 def zoomed(camera: Camera, log_scale: float) -> Camera:
-    """The camera with both focal lengths scaled."""
+    """Returns the camera with both focal lengths scaled."""
     lens, scale = camera.intrinsics, float(np.exp(log_scale))
     return replace(camera, intrinsics=replace(lens, fx=lens.fx * scale, fy=lens.fy * scale))
 
 
 def tangency_residuals(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, " n"]:
-    """The module's residual (px)."""
+    """Returns the module's residual (px)."""
     base, rays = _bases(seen, rig), _rays(seen, rig)
     across = np.cross(rays[:, 0], rays[:, 1])
     return _gain(seen, base, rays) * (base * across).sum(axis=1)

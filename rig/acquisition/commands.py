@@ -53,7 +53,7 @@ class RigCheck:
 
     @property
     def healthy(self) -> bool:
-        """Whether a capture would succeed now."""
+        """Tells whether a capture would succeed now."""
         return not any(fault.is_error for fault in self.faults)
 
 
@@ -129,7 +129,8 @@ def board_shots(
 
 
 def board_shot(session: RigSession) -> Shot:
-    """One shot of a calibration board, with a session that is open and warm: needs no calibration and no clean plates.
+    """Takes one shot of a calibration board, with a session that is open and warm: needs no calibration and no clean
+    plates.
 
     Holds the pictures of the cameras that deliver, and the faults without those of views that the board itself hides.
     Raises ShotFailed where no camera delivers."""
@@ -143,7 +144,7 @@ def board_shot(session: RigSession) -> Shot:
 
 
 def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:
-    """New clean plates of the empty studio, beside rig.toml. Raises ShotFailed; the old ones then stay."""
+    """Takes new clean plates of the empty studio, beside rig.toml. Raises ShotFailed; the old ones then stay."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         return session.take_plates()
@@ -169,7 +170,7 @@ def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
 def contact_sheet(
     names: tuple[str, ...], images: Mapping[str, ImageRgb], faults: tuple[Fault, ...], tile_width: int = 320
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """All cameras in one picture, each with its name and the codes of its faults."""
+    """Returns all cameras in one picture, each with its name and the codes of its faults."""
     tile_height = tile_width * 3 // 4
     columns = math.ceil(math.sqrt(len(names)))
     rows = math.ceil(len(names) / columns)

@@ -52,12 +52,12 @@ class Registration:
 
     @property
     def conclusive(self) -> bool:
-        """Whether the plate has texture enough to say anything."""
+        """Tells whether the plate has texture enough to say anything."""
         return self.patches >= _PATCHES_LEAST
 
 
 def exposure(image: ImageRgb) -> Exposure:
-    """Exposure of a picture."""
+    """Returns the exposure of a picture."""
     red, green, blue = cv2.split(image)
     low, high = cv2.min(cv2.min(red, green), blue), cv2.max(cv2.max(red, green), blue)
     clipped, lit = np.count_nonzero(low == 255), np.count_nonzero(high > 2)
@@ -65,7 +65,7 @@ def exposure(image: ImageRgb) -> Exposure:
 
 
 def noise_of(plates: Sequence[ImageRgb]) -> float | None:
-    """Standard deviation of the temporal noise, from pictures of one still scene; None of a single one.
+    """Returns the standard deviation of the temporal noise, from pictures of one still scene; None of a single one.
 
     From differences of neighbours in time (variance 2 sigma^2): the variance within blocks of 16 px, which light that
     drifts leaves alone, and the median over the blocks, which something that moves in a corner leaves alone.
@@ -75,7 +75,7 @@ def noise_of(plates: Sequence[ImageRgb]) -> float | None:
 
 
 def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
-    """Whether something moved between the clean plates: a 16 px block that changed by 8 standard deviations."""
+    """Tells whether something moved between the clean plates: a 16 px block that changed by 8 standard deviations."""
     first = cv2.resize(plates[0].astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
     limit = max(8.0 * noise * np.sqrt(2) / 16, 4.0)  # a block's mean has 1/16 of the noise; 4 values are no person
     for plate in plates[1:]:
@@ -87,7 +87,7 @@ def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
 
 
 def blur_px(image: ImageRgb) -> float | None:
-    """Standard deviation of the edge spread; None where the picture has no edges.
+    """Returns the standard deviation of the edge spread; None where the picture has no edges.
 
     A step of height A blurred to a standard deviation s has the gradient energy A^2 / (2 sqrt(pi) s) across it. Two
     more blurs of known size, s1 and s2, give energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 + s1^2)) no longer

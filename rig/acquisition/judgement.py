@@ -23,7 +23,7 @@ MOVED_DARK_PX = 3.0  # the same with the lamps off: up to 2.6 px without any mov
 
 
 def plate_level(plate: ImageRgb | None) -> float:
-    """Mean value that a picture before this clean plate should have."""
+    """Returns the mean value that a picture before this clean plate should have."""
     return LEVEL_WITHOUT_PLATES if plate is None else max(float(plate[::4, ::4].mean()), 1.0)
 
 
@@ -44,7 +44,7 @@ def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, Picture
 def judge(
     images: Mapping[str, ImageRgb], checks: Mapping[str, PictureCheck], plates: Plates, shot: ShotConfig
 ) -> list[Fault]:
-    """The faults that can be seen in the pictures of a shot."""
+    """Returns the faults that can be seen in the pictures of a shot."""
     levels = {name: plate_level(plates.first.get(name)) for name in checks}
     return judge_checks(
         checks, levels, shot, lambda name, registration: _whose_view(name, images[name], registration, plates)
@@ -57,7 +57,7 @@ def judge_checks(
     shot: ShotConfig,
     whose_view: OtherView = lambda name, registration: None,
 ) -> list[Fault]:
-    """The faults that measured pictures have.
+    """Returns the faults that measured pictures have.
 
     Args:
         levels: mean value that each camera's picture should have; the light of those that are absent is not judged.

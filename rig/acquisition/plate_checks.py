@@ -26,7 +26,8 @@ class PlatesRefused(ShotFailed):
 
 
 def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str], shot: ShotConfig) -> list[Fault]:
-    """What the pictures of an empty studio alone show. ``live``: cameras whose pictures are of today, not recorded."""
+    """Returns what the pictures of an empty studio alone show. ``live``: cameras whose pictures are of today, not
+    recorded."""
     faults = []
     for name, images in taken.items():
         if name in live and any(np.array_equal(images[0], other) for other in images[1:2]):

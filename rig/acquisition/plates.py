@@ -47,7 +47,8 @@ NO_PLATES = Plates({}, {}, {}, None)
 
 
 def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
-    """The plates of ``folder``; cameras without any are left out. Raises InputError for a file that is no picture."""
+    """Returns the plates of ``folder``; cameras without any are left out. Raises InputError for a file that is no
+    picture."""
     files = {name: found for name in names if (found := _files(folder, name))}
     with ThreadPoolExecutor(4) as pool:
         first = dict(zip(files, pool.map(lambda found: read_image(found[0]), files.values()), strict=True))
@@ -132,7 +133,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 
 def plates_versions(folder: Path) -> list[PlatesVersion]:
-    """The plates in use and those kept beside them, newest first."""
+    """Returns the plates in use and those kept beside them, newest first."""
     kept = [path for path in _versions(folder).glob("*Z") if path.is_dir()] if _versions(folder).is_dir() else []
     found = [_version_of(path) for path in kept]
     if folder.is_dir():

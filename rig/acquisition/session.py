@@ -91,7 +91,7 @@ class RigSession:
             feed.wait_opened(deadline_s)
 
     def close(self) -> tuple[str, ...]:
-        """Lamps off, everything closed; the cameras whose driver hangs. Safe to call twice."""
+        """Switches the lamps off and closes everything. Returns the cameras whose driver hangs. Safe to call twice."""
         if self._box is not None:
             if not self.config.lights.keep_on:
                 self._try_box(lambda box: box.set_lights(0))
@@ -106,11 +106,11 @@ class RigSession:
         return hanging
 
     def states(self) -> Mapping[str, FeedState]:
-        """What is known of each camera at this moment; those without a driver are left out."""
+        """Returns what is known of each camera at this moment; those without a driver are left out."""
         return {name: feed.state() for name, feed in self._feeds.items()}
 
     def trigger_error(self) -> Message | None:
-        """Why the box cannot be used; None where it can, or where there is none to use."""
+        """Tells why the box cannot be used; None where it can, or where there is none to use."""
         return None if self._box_error is None else self._box_error.message
 
     def warm_up(self) -> None:
@@ -132,7 +132,7 @@ class RigSession:
             return {name: frame.image for name, frame in frames.items()}
 
     def shoot(self) -> Shot:
-        """One synchronised shot. Never raises for a device: the shot's faults say what is wrong."""
+        """Takes one synchronised shot. Never raises for a device: the shot's faults say what is wrong."""
         with self._busy:
             self._lights_on()
             self._glance()

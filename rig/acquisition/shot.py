@@ -85,16 +85,16 @@ class Fault:
 
     @property
     def is_error(self) -> bool:
-        """Whether it ends the capture."""
+        """Tells whether it ends the capture."""
         return self.code not in WARNINGS
 
     @property
     def remedy(self) -> Message:
-        """What to do."""
+        """Returns what an operator should do."""
         return REMEDIES[self.code]
 
     def document(self) -> FaultDocument:
-        """For JSON."""
+        """Returns the JSON form."""
         return {
             "code": self.code,
             "camera": self.camera,
@@ -187,18 +187,18 @@ class SyncCertificate:
 
     @property
     def spread_s(self) -> float | None:
-        """Largest less smallest skew; None where fewer than two frames came."""
+        """Returns the largest less smallest skew; None where fewer than two frames came."""
         skews = [camera.skew_s for camera in self.cameras if camera.skew_s is not None]
         return max(skews) - min(skews) if len(skews) > 1 else None
 
     def lines(self) -> list[str]:
-        """One a camera, for people."""
+        """Returns one line a camera, for people to read."""
         width = max(len(line.camera) for line in self.cameras)
         skews = {line.camera: "" if line.skew_s is None else f"  {line.skew_s * 1000:+.1f} ms" for line in self.cameras}
         return [f"{line.camera:<{width}}  {line.status}{skews[line.camera]}" for line in self.cameras]
 
     def document(self) -> SyncDocument:
-        """For JSON; times in milliseconds."""
+        """Returns the JSON form, with times in milliseconds."""
         return {
             "trigger_utc": self.trigger_utc,
             "fired": self.trigger_s is not None,
@@ -226,7 +226,7 @@ class PictureCheck:
     registration: Registration | None
 
     def document(self) -> CheckDocument:
-        """For JSON."""
+        """Returns the JSON form."""
         registration = self.registration
         return {
             "mean": round(self.exposure.mean, 2),
@@ -248,11 +248,11 @@ class Shot:
 
     @property
     def complete(self) -> bool:
-        """Whether it is worth reconstructing: every camera's picture, of one moment, of its own view."""
+        """Tells whether it is worth reconstructing: every camera's picture, of one moment, of its own view."""
         return not any(fault.is_error for fault in self.faults)
 
     def document(self) -> ShotDocument:
-        """For shot.json in the capture folder."""
+        """Returns what shot.json in the capture folder holds."""
         return {
             "format": "eigenhead-shot/1",
             "sync": self.certificate.document(),
@@ -284,7 +284,7 @@ def certify(
     uncertainty_s: float,
     skew_most_s: float,
 ) -> tuple[SyncCertificate, list[Fault]]:
-    """The certificate, and the faults of time in it: "late-trigger", "late" and "dropped"."""
+    """Returns the certificate, and the faults of time in it: "late-trigger", "late" and "dropped"."""
     skews = {name: frame.time_s - timings[name].due_s for name, frame in frames.items() if frame is not None}
     if trigger_s is None:
         skews = {}

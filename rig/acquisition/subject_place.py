@@ -38,7 +38,8 @@ class SubjectPlace:
 
 
 def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
-    """The largest part of a picture that differs from the clean plate; None where nothing as large as a head does."""
+    """Returns the largest part of a picture that differs from the clean plate; None where nothing as large as a head
+    does."""
     if image.shape != plate.shape:
         return None
     here, there = (np.float32(_reduced(picture)) + 1.0 for picture in (image, plate))
@@ -49,7 +50,7 @@ def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
 
 
 def subject_of_mask(mask: Bool[np.ndarray, "h w"]) -> SubjectPlace | None:
-    """The same of a ready mask."""
+    """Returns the same of a ready mask."""
     return _place(_reduced(mask.astype(np.uint8)) > 0, mask.shape)
 
 

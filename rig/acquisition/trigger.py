@@ -82,7 +82,7 @@ class BoxClock:
     uncertainty_s: float
 
     def host_from_box(self, box_us: int) -> float:
-        """Host time of a box time less than 35 minutes away, across the wrap of the 32-bit counter."""
+        """Returns the host time of a box time less than 35 minutes away, across the wrap of the 32-bit counter."""
         difference = (box_us - self.box_us + CLOCK_PERIOD_US // 2) % CLOCK_PERIOD_US - CLOCK_PERIOD_US // 2
         return self.host_s + difference * 1e-6
 
@@ -164,7 +164,7 @@ class TriggerBox:
         return Fired(clock.host_from_box(box_us), clock.uncertainty_s, asked_s, shot)
 
     def status(self) -> BoxStatus:
-        """State (IDLE, ARMED or FIRING), shots since power-up, lights, and lines lost to noise."""
+        """Returns the state (IDLE, ARMED or FIRING), shots since power-up, lights, and lines lost to noise."""
         fields = _fields(self._command("STATUS"))
         try:
             return BoxStatus(fields["STATE"], int(fields["SHOTS"]), int(fields["LIGHTS"], 16), int(fields["BAD"]))

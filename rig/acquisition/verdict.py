@@ -55,7 +55,7 @@ class ViewCheck:
     looked: bool
 
     def document(self) -> ViewDocument:
-        """For JSON."""
+        """Returns the JSON form."""
         measured: ViewDocument = {} if self.picture is None else {**_known(self.picture.document())}
         if self.looked:
             measured["subject"] = None if self.place is None else _place_document(self.place)
@@ -77,7 +77,7 @@ def check_view(
 
 
 def view_faults(views: Mapping[str, ViewCheck], limits: ShotConfig) -> list[Fault]:
-    """Everything that is wrong with the pictures of a capture."""
+    """Returns everything that is wrong with the pictures of a capture."""
     pictures = {name: view.picture for name, view in views.items() if view.picture is not None}
     levels = {name: view.level for name, view in views.items() if view.level is not None}
     return without_consequences([*judge_checks(pictures, levels, limits), *_place_faults(views)])

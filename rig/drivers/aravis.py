@@ -84,7 +84,7 @@ class Aravis:
             function.restype, function.argtypes = result, [*arguments, POINTER(POINTER(_GError))]
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """The function's result; text results as str."""
+        """Returns the function's result; text results as str."""
         function = getattr(self._aravis, name)
         if name in _PLAIN:
             result = function(*arguments)
@@ -110,5 +110,5 @@ class Aravis:
 
 @cache
 def library() -> Aravis:
-    """The one loaded library. Raises OSError where it is not installed."""
+    """Returns the one loaded library. Raises OSError where it is not installed."""
     return Aravis()

@@ -57,7 +57,7 @@ class Driver(Protocol):
         ...
 
     def retrieve(self) -> ImageRgb:
-        """The frame of the last grab, as the camera sees it (not rotated)."""
+        """Returns the frame of the last grab, as the camera sees it (not rotated)."""
         ...
 
     def trigger(self) -> None:
@@ -106,11 +106,11 @@ class DriverMissing(DriverError):
 
 
 def grab_frame(driver: Driver, timeout_s: float) -> Frame:
-    """The next frame, decoded. Raises as ``grab`` and ``retrieve`` do."""
+    """Returns the next frame, decoded. Raises as ``grab`` and ``retrieve`` do."""
     arrival = driver.grab(timeout_s)
     return Frame(driver.retrieve(), arrival.time_s, arrival.sequence)
 
 
 def upright(image: ImageRgb, rotation_deg: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """The picture turned clockwise by a multiple of 90 degrees."""
+    """Returns the picture turned clockwise by a multiple of 90 degrees."""
     return np.ascontiguousarray(np.rot90(image, -rotation_deg // 90)) if rotation_deg else image

@@ -64,7 +64,7 @@ class CameraFeed:
         self._stop.set()
 
     def close(self, deadline_s: float) -> bool:
-        """Ends the thread; False where the driver hangs and had to be left behind."""
+        """Ends the thread. Returns False where the driver hangs and had to be left behind."""
         self.stop()
         if self._thread.ident is not None:
             self._thread.join(max(0.0, deadline_s - time.monotonic()))
@@ -84,13 +84,13 @@ class CameraFeed:
             )
 
     def wait_opened(self, deadline_s: float) -> bool:
-        """Whether the camera is open before the deadline. Returns early where opening failed."""
+        """Tells whether the camera is open before the deadline. Returns early where opening failed."""
         with self._changed:
             self._changed.wait_for(lambda: self._opened or self._error is not None, _left(deadline_s))
             return self._opened
 
     def wait_frames(self, count: int, deadline_s: float) -> bool:
-        """Whether the camera delivered ``count`` frames since it was opened, before the deadline."""
+        """Tells whether the camera delivered ``count`` frames since it was opened, before the deadline."""
         with self._changed:
             self._changed.wait_for(lambda: self._count >= count, _left(deadline_s))
             return self._count >= count
@@ -113,7 +113,8 @@ class CameraFeed:
             self._wanted_from_s = self._due_s = None
 
     def collect(self, earliest_s: float, deadline_s: float) -> Frame | None:
-        """The first wanted frame that arrived at ``earliest_s`` or later; None where none came before the deadline."""
+        """Returns the first wanted frame that arrived at ``earliest_s`` or later; None where none came before the
+        deadline."""
 
         def first() -> Frame | None:
             return next((frame for frame in self._frames if frame.time_s >= earliest_s), None)

@@ -44,7 +44,7 @@ _discovery = threading.Lock()  # the device list is one for the whole process
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """The driver for a GenICam camera. Raises DriverMissing."""
+    """Returns the driver for a GenICam camera. Raises DriverMissing."""
     try:
         return GenicamDriver(camera, library())
     except OSError as error:

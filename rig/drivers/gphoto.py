@@ -24,7 +24,7 @@ _ports_by_serial: dict[str, str] = {}
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """The driver for a DSLR. Raises DriverMissing."""
+    """Returns the driver for a DSLR. Raises DriverMissing."""
     try:
         return GphotoDriver(camera, importlib.import_module("gphoto2"))
     except ImportError as error:

@@ -58,7 +58,7 @@ class MjpegStream:
         self._socket.close()
 
     def next_part(self, timeout_s: float) -> tuple[float, bytes]:
-        """Arrival (time.monotonic) of the next part, and its body. A part cut by a timeout is resumed."""
+        """Returns the arrival (time.monotonic) of the next part, and its body. A part cut by a timeout is resumed."""
         deadline_s = time.monotonic() + timeout_s
         if self._part is None:
             self._take_until(self._boundary, deadline_s, HEAD_MOST)

@@ -24,7 +24,7 @@ _NEAR = 0.05
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """The driver for an address or a device path."""
+    """Returns the driver for an address or a device path."""
     return MjpegDriver(camera) if camera.identity.startswith(_ADDRESSES) else VideoCaptureDriver(camera)
 
 

@@ -14,6 +14,6 @@ class _DriverModule(Protocol):
 
 
 def driver_for(camera: CameraConfig, folder: Path) -> Driver:
-    """The camera's driver, not opened yet. ``folder`` is where rig.toml lies. Raises DriverMissing."""
+    """Returns the camera's driver, not opened yet. ``folder`` is where rig.toml lies. Raises DriverMissing."""
     module = cast(_DriverModule, importlib.import_module(f".{camera.driver}", __package__))
     return module.make(camera, folder)

@@ -19,7 +19,7 @@ _FPS = 10.0
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """The driver for a camera of a recorded capture."""
+    """Returns the driver for a camera of a recorded capture."""
     return ReplayDriver(camera, folder)
 
 

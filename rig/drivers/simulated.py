@@ -20,7 +20,7 @@ _FPS = 10.0
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """The driver for a camera of the studio around a mesh file."""
+    """Returns the driver for a camera of the studio around a mesh file."""
     file, _, name = camera.identity.partition("#")
     return SimulatedDriver(camera, name or camera.name, mesh_file=folder / file)
 

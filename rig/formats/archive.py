@@ -53,7 +53,7 @@ DIRECTORY_BYTES_MOST = 4 << 20  # a zip's list of members: 5000 of them with lon
 
 @dataclass(frozen=True, slots=True)
 class ArchiveLimits:
-    """What one archive may hold. 64 cameras with 32 clean plates each are about 2,200 files."""
+    """Limits what one archive may hold. 64 cameras with 32 clean plates each are about 2,200 files."""
 
     members: int = 5000
     total_bytes: int = 16 << 30
@@ -76,7 +76,7 @@ class _Member:
 
     @property
     def shown(self) -> str:
-        """The name as messages have it; what may be garbled is not shown."""
+        """Returns the name as messages have it; what may be garbled is not shown."""
         text = re.sub(r"[^\x00-\x7f]", "?", self.name) if self.guessed else self.name
         return f"{text!r:.120}"
 
@@ -102,7 +102,7 @@ class _Faults:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether the content (not the name) of ``path`` begins like a .zip, .tar or .tar.gz."""
+    """Tells whether the content (not the name) of ``path`` begins like a .zip, .tar or .tar.gz."""
     return _format(path) is not None
 
 

@@ -29,7 +29,7 @@ def decoded_name(raw: bytes) -> tuple[str, bool]:
 
 
 def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
-    """The name in UTF-8 that Info-ZIP writes beside one in another encoding, where it belongs to ``raw``."""
+    """Returns the name in UTF-8 that Info-ZIP writes beside one in another encoding, where it belongs to ``raw``."""
     at = 0
     while at + 4 <= len(extra):
         kind, size = struct.unpack_from("<HH", extra, at)
@@ -65,7 +65,7 @@ def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[st
 
 
 def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[Message]:
-    """What no member may be called, kept or not; messages call it ``shown``."""
+    """Returns what no member may be called, kept or not; messages call it ``shown``."""
     if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
         return [compose("member-name-invisible", member=shown)]
     if "\\" in name or re.match(r"^[A-Za-z]:", name):
@@ -84,7 +84,7 @@ def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[
 
 
 def name_faults(part: str, shown: str, *, name_length: int) -> list[Message]:
-    """What a file or folder that is kept may not be called."""
+    """Returns what a file or folder that is kept may not be called."""
     faults = []
     if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
         faults.append(compose("member-name-invisible", member=shown))

@@ -47,12 +47,12 @@ HEAD_BYTES = 1 << 16  # of an XMP file that other programs wrote to, the names o
 
 
 def find_rig_file(folder: Path) -> Path | None:
-    """The file in ``folder`` that holds the rig, for ``read_rig_file``; None if there is none."""
+    """Returns the file in ``folder`` that holds the rig, for ``read_rig_file``; None if there is none."""
     return next(rig_files(folder), None)
 
 
 def rig_files(folder: Path) -> Iterator[Path]:
-    """The files in ``folder`` that may hold the rig, one a program; the first is the one that is read.
+    """Yields the files in ``folder`` that may hold the rig, one a program; the first is the one that is read.
 
     In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
     ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
@@ -91,12 +91,13 @@ def rig_files(folder: Path) -> Iterator[Path]:
 
 
 def read_rig_file(path: Path) -> Rig:
-    """The rig in a file of any known format. Raises InputError naming every fault found in it."""
+    """Returns the rig in a file of any known format. Raises InputError naming every fault found in it."""
     return read_cameras(path).rig
 
 
 def read_cameras(path: Path) -> CamerasRead:
-    """The rig in a file of any known format, with what its reader noticed. Raises InputError naming every fault."""
+    """Returns the rig in a file of any known format, with what its reader noticed. Raises InputError naming every
+    fault."""
     if path.name == "transforms.json":
         return read_transforms(path)
     if path.suffix == ".json":
@@ -113,7 +114,7 @@ def read_cameras(path: Path) -> CamerasRead:
 
 
 def rig_file_parts(path: Path) -> tuple[Path, ...]:
-    """The files from which ``read_rig_file`` reads ``path``: of most formats one."""
+    """Returns the files from which ``read_rig_file`` reads ``path``: of most formats one."""
     if path.suffix in (".bin", ".txt"):
         return path, path.with_stem("images")
     if path.suffix == ".xmp":

@@ -64,7 +64,7 @@ def document_from_rig(rig: Rig) -> CamerasDocument:
 
 
 def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
-    """The rig in a decoded ``cameras.json``. Raises InputError naming every fault."""
+    """Returns the rig in a decoded ``cameras.json``. Raises InputError naming every fault."""
     if not isinstance(document, dict) or not isinstance(document.get("cameras"), list):
         raise InputError(subject, [compose("no-camera-list")])
     faults: list[Message] = []
@@ -105,7 +105,7 @@ def _shared_serials(cameras: list[Camera]) -> list[Message]:
 
 
 def name_fault(name: Any) -> Message | None:
-    """Why ``name`` cannot be a camera's name, which becomes a file name; None if it can."""
+    """Tells why ``name`` cannot be a camera's name, which becomes a file name; None if it can."""
     if not isinstance(name, str) or not 0 < len(name) <= 64:
         return compose("camera-name-length", name=f"{name!r:.80}", most=64)
     if not all(c.isascii() and (c.isalnum() or c in "-_.") for c in name) or name.startswith("."):

@@ -83,7 +83,7 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
 
 
 def read_rig_of(rig_file: Path) -> CamerasRead:
-    """``read_cameras`` of a capture's file. Raises InputError whose faults name the file."""
+    """Calls ``read_cameras`` on a capture's file. Raises InputError whose faults name the file."""
     try:
         return read_cameras(rig_file)
     except InputError as error:
@@ -91,7 +91,7 @@ def read_rig_of(rig_file: Path) -> CamerasRead:
 
 
 def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
-    """Pictures that belong to no camera, and folders of pictures that are nobody's."""
+    """Returns pictures that belong to no camera, and folders of pictures that are nobody's."""
     remarks = [stray_sentence(files.strays, rig)] if files.strays else []
     known = ("images", *BESIDE_PICTURES, *rig.names)
     for path in sorted(folder.iterdir()):
@@ -122,12 +122,13 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
 
 
 def has_known_length(folder: Path) -> bool:
-    """Whether a length beside cameras tells their unit: scale.json, unless it told that when the cameras were found."""
+    """Tells whether a length beside cameras tells their unit: scale.json, unless it told that when the cameras were
+    found."""
     return (folder / SCALE).is_file() and not (folder / "calibration.json").is_file()
 
 
 def capture_root(folder: Path) -> Path:
-    """``folder``, or the single folder in it, and in that: an archive may hold enclosing folders."""
+    """Returns ``folder``, or the single folder in it, and in that: an archive may hold enclosing folders."""
     if not folder.is_dir():
         raise InputError(str(folder.name or folder), [compose("no-capture-folder")])
     for _ in range(ENCLOSING_MOST):
@@ -164,8 +165,8 @@ def read_shot(
     pixels_most: int | None = None,
     with_features: bool = True,
 ) -> Capture:
-    """The images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``, but those
-    of ``files``, which were found before."""
+    """Returns the images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``, but
+    those of ``files``, which were found before."""
     if files is None:
         files = find_files(folder, rig)
         faults += files.faults
@@ -281,7 +282,7 @@ def _decode(
 
 
 def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
-    """What is said of a picture whose size (width, height) is not that of its camera."""
+    """Describes a picture whose size (width, height) is not that of its camera."""
     of_picture, of_camera = f"{size[0]} x {size[1]}", f"{k.width} x {k.height}"
     fault = compose("picture-size-differs", picture=where, size=of_picture, wanted=of_camera)
     if size == (k.height, k.width):

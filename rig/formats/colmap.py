@@ -52,7 +52,7 @@ COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 
 def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
-    """The rig in a COLMAP model: every image is a camera of this project, named after the image file."""
+    """Returns the rig in a COLMAP model: every image is a camera of this project, named after the image file."""
     files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
     binary = suffix == ".bin"

@@ -22,7 +22,7 @@ class FeaturesDocument(TypedDict):
 
 
 def features_from_bytes(data: bytes, rig: Rig, faults: list[Message]) -> Features:
-    """The points of a ``features.json``; appends every fault to ``faults``."""
+    """Returns the points of a ``features.json``; appends every fault to ``faults``."""
     try:
         document = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -32,7 +32,7 @@ def features_from_bytes(data: bytes, rig: Rig, faults: list[Message]) -> Feature
 
 
 def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Features:
-    """The points of a decoded ``features.json``; appends every fault to ``faults``."""
+    """Returns the points of a decoded ``features.json``; appends every fault to ``faults``."""
     if not isinstance(document, dict) or not isinstance(document.get("points"), dict):
         faults.append(compose("of-file", file=FILE, fault=compose("features-no-points")))
         return {}

@@ -24,7 +24,7 @@ BYTES_MOST = 1 << 29  # a sparse model of a rig is a few megabytes; its 2D point
 
 
 class Malformed(ValueError):
-    """What a parser of ours finds wrong with the bytes of a file."""
+    """Reports what a parser of this project finds wrong with the bytes of a file."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -32,7 +32,7 @@ class Malformed(ValueError):
 
 
 def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
-    """``parse`` of the file's bytes, with whatever damage it meets reported as InputError."""
+    """Applies ``parse`` to the file's bytes, with whatever damage it meets reported as InputError."""
     try:
         if path.stat().st_size > BYTES_MOST:
             raise InputError(path.name, [compose("file-large", most_mib=BYTES_MOST >> 20)])
@@ -47,8 +47,8 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
 
 
 def camera_names(files: list[str]) -> list[str]:
-    """Camera names: the pictures' names without their endings or, where those repeat (``cam00/shot.png``), the names of
-    the innermost folders that tell them all apart."""
+    """Returns camera names: the pictures' names without their endings or, where those repeat (``cam00/shot.png``), the
+    names of the innermost folders that tell them all apart."""
     paths = [tuple(part for part in file.replace("\\", "/").split("/") if part not in ("", ".")) for file in files]
     stems = [picture_stem(path[-1]) if path else "" for path in paths]
     if len(set(stems)) == len(stems):
@@ -63,8 +63,9 @@ def camera_names(files: list[str]) -> list[str]:
 def lens_entry(
     parameters: Mapping[str, float], where: str, faults: list[Message], *, fisheye: bool = False
 ) -> dict[str, str | float]:
-    """The ``distortion`` of ``eigenhead-cameras/1`` of coefficients in OpenCV's names; those that are missing are 0.
-    The one place where a foreign lens gets its model: a coefficient that it does not have is a fault, unless 0."""
+    """Returns the ``distortion`` of ``eigenhead-cameras/1`` of coefficients in OpenCV's names; those that are missing
+    are 0. The one place where a foreign lens gets its model: a coefficient that it does not have is a fault, unless
+    0."""
     model: LensModel | None = "kannala-brandt" if fisheye else None
     if model is None and any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
         model = "rational"
@@ -77,7 +78,8 @@ def lens_entry(
 
 
 def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[Message]) -> np.ndarray:
-    """``value`` as an array; on a fault, one of NaN of the wanted shape, so that the other faults are still found."""
+    """Converts ``value`` to an array; on a fault, to one of NaN of the wanted shape, so that the other faults are still
+    found."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -90,7 +92,7 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
 
 
 def xml_root(data: bytes) -> ElementTree.Element:
-    """The root of an XML file without declarations of its own: entities may unfold to any size."""
+    """Returns the root of an XML file without declarations of its own: entities may unfold to any size."""
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise Malformed(compose("xml-declares"))
     try:
@@ -100,8 +102,8 @@ def xml_root(data: bytes) -> ElementTree.Element:
 
 
 def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
-    """Width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold them.
-    Where there is none, a fault that says where to put it."""
+    """Returns width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold
+    them. Where there is none, a fault that says where to put it."""
     from rig.formats.images import picture_size  # decoders, which most formats do without
 
     for place in (folder, folder / "images", folder.parent / "images"):
@@ -120,7 +122,7 @@ def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
 def brown_conrady(
     radial: Sequence[float], radius: float, focal: float, where: str, faults: list[Message]
 ) -> list[float]:
-    """k1 k2 k3 of a radial polynomial k1 k2 k3 k4 ..., fitted over the picture where k4 is not zero.
+    """Computes k1 k2 k3 of a radial polynomial k1 k2 k3 k4 ..., fitted over the picture where k4 is not zero.
 
     Args:
         radius: how far the picture reaches, of ``X / Z``.

@@ -27,7 +27,7 @@ Table = Mapping[str, ForeignKey]
 
 
 def says_nothing(value: object, rule: ForeignKey) -> bool:
-    """Whether ``value`` is missing, or is one of those at which the key has no meaning."""
+    """Tells whether ``value`` is missing, or is one of those at which the key has no meaning."""
     return all(_is_one_of(part, rule.silent) for part in _parts(value))
 
 

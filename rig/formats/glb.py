@@ -40,7 +40,7 @@ def glb_bytes(
     skin: Skin | None = None,
     extras: Mapping[str, Any] | None = None,
 ) -> bytes:
-    """glTF 2.0 binary of a mesh given in the head frame (mm): metres, y up, face towards +z.
+    """Encodes a glTF 2.0 binary of a mesh in the head frame (mm): metres, y up, face towards +z.
 
     glTF's ``COLOR_0`` is linear, ours is sRGB, so it is converted, as 16 bits so that dark tones survive.
     https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes
@@ -131,7 +131,7 @@ def _texture(skin: Skin, view: int) -> dict[str, Any]:
 
 
 def write_glb(path: Path, mesh: Mesh, **properties: Any) -> None:
-    """``glb_bytes`` to a file, under a temporary name first."""
+    """Writes ``glb_bytes`` to a file, under a temporary name first."""
     write_atomically(path, glb_bytes(mesh, **properties))
 
 

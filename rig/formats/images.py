@@ -61,7 +61,8 @@ PNG_OPTIONS = [
 
 
 def is_picture(path: Path) -> bool:
-    """Whether it is a file (no folder, pipe or link to nothing) that is named as a picture, and not a hidden one."""
+    """Tells whether it is a file (no folder, pipe or link to nothing) that is named as a picture, and not a hidden
+    one."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
@@ -82,7 +83,7 @@ def write_image(
 
 
 def read_image(path: Path) -> ImageRgb:
-    """An RGB image. Raises InputError."""
+    """Returns an RGB image. Raises InputError."""
     pixels, _, fault = decode_image_file(path, path.name, "colour")
     if pixels is None:
         assert fault is not None
@@ -91,13 +92,14 @@ def read_image(path: Path) -> ImageRgb:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height as the header says: a small file may claim any size. Raises InputError where there is none."""
+    """Returns width and height as the header says: a small file may claim any size. Raises InputError where there is
+    none."""
     with _faults_of(path.name):
         return _header_size(path.read_bytes(), path.suffix.lower())[0]
 
 
 def open_picture(path: Path) -> Image.Image:
-    """The picture for Pillow, decoded as far as it must be: for thumbnails. Raises InputError."""
+    """Returns the picture for Pillow, decoded as far as it must be: for thumbnails. Raises InputError."""
     if path.suffix.lower() in (*RAW_SUFFIXES, *HEIC_SUFFIXES):
         return Image.fromarray(read_image(path))
     with _faults_of(path.name):
@@ -107,8 +109,8 @@ def open_picture(path: Path) -> Image.Image:
 def decode_image_file(
     path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Pixels at ``share`` of their number across (a mask's are all there), the sha256 of the file, and the fault (then
-    no pixels).
+    """Returns the pixels at ``share`` of their number across (a mask's are all there), the sha256 of the file, and the
+    fault (then no pixels).
 
     Pixels are RGB (``colour``), one channel (``grey``), or of a ``mask`` the one channel that holds it, in the file's
     own numbers (``rig.formats.mask_values``). ``bits``: that samples of 16 use (``rig.formats.picture_samples``)."""

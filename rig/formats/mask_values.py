@@ -52,7 +52,7 @@ class MaskReading:
 
 
 def mask_plane(pixels: Pixels) -> Plane | Message:
-    """The one channel of decoded pixels (BGR order) that holds the mask, or why there is none.
+    """Returns the one channel of decoded pixels (BGR order) that holds the mask, or why there is none.
 
     That is the alpha of a cut-out; of two colours the channel in which they differ most; of a picture that was cut out
     on one colour 1 where it has another."""

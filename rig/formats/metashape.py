@@ -37,8 +37,8 @@ Similarity = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]  # 
 
 
 def read_metashape(path: Path) -> CamerasRead:
-    """The aligned cameras of a Metashape export that are switched on, named by their labels or, where those repeat, by
-    their groups. Raises InputError naming every fault."""
+    """Returns the aligned cameras of a Metashape export that are switched on, named by their labels or, where those
+    repeat, by their groups. Raises InputError naming every fault."""
     root = parsed(path, xml_root)
     reading = Reading(path.name)
     chunk = _chunk(root, reading)

@@ -11,7 +11,7 @@ MATERIAL = "skin"
 
 
 def obj_bytes(mesh: Mesh) -> bytes:
-    """Wavefront OBJ with the vertex colours that MeshLab and Blender read after the position."""
+    """Encodes a Wavefront OBJ with the vertex colours that MeshLab and Blender read after the position."""
     colours = mesh.colours if mesh.colours is not None else np.full(mesh.vertices.shape, 200, np.uint8)
     text = io.StringIO()
     np.savetxt(text, np.concatenate([mesh.vertices, colours / 255.0], axis=1), fmt="v %.4f %.4f %.4f %.4f %.4f %.4f")
@@ -27,7 +27,7 @@ def textured_obj_bytes(
     faces_uv: Int[np.ndarray, "f 3"],
     library: str,
 ) -> bytes:
-    """Wavefront OBJ whose vertices are the mesh's own: only texture coordinates are doubled at seams.
+    """Encodes a Wavefront OBJ whose vertices are the mesh's own: only texture coordinates are doubled at seams.
 
     Args:
         mesh: the surface.
@@ -47,6 +47,6 @@ def textured_obj_bytes(
 
 
 def mtl_bytes(image: str) -> bytes:
-    """The material of ``textured_obj_bytes``; ``image`` is the texture's file name beside it."""
+    """Returns the material of ``textured_obj_bytes``; ``image`` is the texture's file name beside it."""
     lines = ("newmtl skin", "Ka 1 1 1", "Kd 1 1 1", "Ks 0.04 0.04 0.04", "Ns 20", "illum 2", f"map_Kd {image}", "")
     return "\n".join(lines).encode()

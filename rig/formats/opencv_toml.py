@@ -25,7 +25,7 @@ UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}  # millimetres in each
 
 
 def read_toml(path: Path) -> CamerasRead:
-    """The rig in caliscope's ``camera_array.toml`` or in an aniposelib calibration."""
+    """Returns the rig in caliscope's ``camera_array.toml`` or in an aniposelib calibration."""
     document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
     tables, reading = document.get("cameras"), Reading(path.name)
     if isinstance(tables, dict):

@@ -31,8 +31,8 @@ POSE_KEY = re.compile(r"(R|Rot|T)_")
 
 
 def read_yaml(path: Path) -> CamerasRead:
-    """The rig in ``intri.yml`` and the ``extri.yml`` beside it, or in ``path`` alone. Raises InputError naming every
-    fault."""
+    """Returns the rig in ``intri.yml`` and the ``extri.yml`` beside it, or in ``path`` alone. Raises InputError naming
+    every fault."""
     parts = [path.with_name(name) for name in FILES] if path.name in FILES else [path, path]
     lenses, poses = (parsed(part, _matrices) for part in parts)
     held = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]

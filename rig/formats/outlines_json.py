@@ -21,7 +21,7 @@ FRACTION_BITS = 4  # of a pixel, in which polygons are filled
 
 
 def read_outlines(path: Path, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """Masks (True = subject) of the cameras of ``rig`` that the file has. Raises InputError."""
+    """Returns masks (True = subject) of the cameras of ``rig`` that the file has. Raises InputError."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         if document["format"] != OUTLINES_FORMAT:

@@ -45,7 +45,7 @@ WORD = re.compile(r"\d+|[^\W\d_]+")
 
 
 def is_junk(name: str) -> bool:
-    """Whether a file manager added a file or folder of that name, or it is hidden."""
+    """Tells whether a file manager added a file or folder of that name, or it is hidden."""
     return name.casefold() in {junk.casefold() for junk in JUNK} or name.startswith(".")
 
 

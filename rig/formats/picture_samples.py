@@ -29,8 +29,8 @@ TIFF = (b"II*\x00", b"MM\x00*")
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """What the files of one kind hold: ``bits`` that their samples of 16 use (None: they have 8), and whether they are
-    a sensor's mosaic."""
+    """Describes what the files of one kind hold: ``bits`` that their samples of 16 use (None: they have 8), and whether
+    they are a sensor's mosaic."""
 
     bits: int | None
     mosaic: bool
@@ -47,7 +47,8 @@ def measure_samples(paths: Sequence[Path]) -> Samples:
 
 
 def used_bits(largest: int) -> int:
-    """The bits that samples up to ``largest`` use, of those that devices have; all where only a few are unused."""
+    """Returns the bits that samples up to ``largest`` use, of those that devices have; all where only a few are
+    unused."""
     return next((bits for bits in USED_BITS if largest < 2**bits), WHOLE_BITS)
 
 
@@ -82,7 +83,8 @@ def _depth_and_channels(path: Path) -> tuple[int, int]:
 
 
 def is_mosaic(pixels: Num[np.ndarray, "h w"]) -> bool:
-    """Whether a grey picture is a sensor's mosaic: a pixel is more like the next but one, which has its own filter."""
+    """Tells whether a grey picture is a sensor's mosaic: a pixel is more like the next but one, which has its own
+    filter."""
     values = pixels.astype(np.float32)
     if min(values.shape) < 3:
         return False

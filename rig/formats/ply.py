@@ -41,9 +41,10 @@ def ply_bytes(
     corner_uv: Float[np.ndarray, "f 3 2"] | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
-    """Binary little-endian PLY. ``quality`` is the standard deviation (mm), ``views`` how many images coloured it,
-    ``part`` what a vertex belongs to (a property more, where it is given). ``corner_uv``: texture coordinates of the
-    faces' corners, v downwards; as MeshLab has them, ``texcoord`` is a list of six with v upwards."""
+    """Encodes a binary little-endian PLY. ``quality`` is the standard deviation (mm), ``views`` how many images
+    coloured it, ``part`` what a vertex belongs to (a property more, where it is given). ``corner_uv``: texture
+    coordinates of the faces' corners, v downwards; as MeshLab has them, ``texcoord`` is a list of six with v
+    upwards."""
     kind = PLY_VERTEX if part is None else np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):
@@ -75,7 +76,7 @@ def ply_bytes(
 
 
 def write_ply(path: Path, mesh: Mesh, **properties: Any) -> None:
-    """``ply_bytes`` to a file, under a temporary name first."""
+    """Writes ``ply_bytes`` to a file, under a temporary name first."""
     write_atomically(path, ply_bytes(mesh, **properties))
 
 

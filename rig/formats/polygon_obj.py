@@ -24,7 +24,8 @@ KEPT_STATEMENTS = ("o", "g", "s", "usemtl")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolygonMesh:
-    """A mesh as its file tells it. Polygons lie one after the other in ``corners``; v of ``uv`` points upwards."""
+    """Holds a mesh as its file describes it. Polygons lie one after the other in ``corners``; v of ``uv`` points
+    upwards."""
 
     vertices: Float[np.ndarray, "v 3"]
     sizes: Int[np.ndarray, " p"]  # corners of each polygon, 3 or more
@@ -39,7 +40,7 @@ class PolygonMesh:
 
 
 def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "f 3"]:
-    """Rows of ``corners`` that make triangles of polygons of these sizes."""
+    """Returns rows of ``corners`` that make triangles of polygons of these sizes."""
     first = np.cumsum(sizes) - sizes
     count = sizes - 2
     owner = np.repeat(np.arange(len(sizes)), count)
@@ -48,7 +49,7 @@ def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "f 3"]:
 
 
 def read_polygons(path: Path) -> PolygonMesh:
-    """The mesh of an OBJ file, in its own units and order. Raises InputError naming every fault found."""
+    """Returns the mesh of an OBJ file, in its own units and order. Raises InputError naming every fault found."""
     try:
         size = path.stat().st_size
         if size > MOST_BYTES:
@@ -138,7 +139,7 @@ class _Reading:
         return len(self.vertices) > MOST_VERTICES or len(self.corners) > MOST_CORNERS or len(self.uv) > MOST_CORNERS
 
     def finished(self, name: str) -> PolygonMesh:
-        """The arrays. Raises InputError."""
+        """Returns the arrays. Raises InputError."""
         faults = self.faults[:FAULTS_TOLD]
         if len(self.faults) > FAULTS_TOLD:
             faults.append(compose("lines-more", more=len(self.faults) - FAULTS_TOLD))
@@ -167,7 +168,7 @@ class _Reading:
 
 
 def rows_without(corner_uv: Int[np.ndarray, " c"]) -> bool:
-    """Whether any corner has a texture coordinate."""
+    """Tells whether any corner has a texture coordinate."""
     return bool(corner_uv.size and corner_uv.max() >= 0)
 
 
@@ -180,7 +181,8 @@ def polygon_obj_bytes(
     comments: Iterable[str] = (),
     library: str | None = None,
 ) -> bytes:
-    """The same file with other vertex positions: order, polygons, texture coordinates, groups and materials are kept.
+    """Returns the same file with other vertex positions: order, polygons, texture coordinates, groups and materials are
+    kept.
 
     Args:
         mesh: what the file had.

@@ -23,7 +23,7 @@ RELATIONS = (
 
 
 def stl_bytes(mesh: Mesh) -> bytes:
-    """Binary STL. Its vertices are rounded before anything is derived, so that equal corners stay equal."""
+    """Encodes a binary STL. Its vertices are rounded before anything is derived, so that equal corners stay equal."""
     vertices = mesh.vertices.astype("<f4")
     normals = face_normals(vertices.astype(float), mesh.faces)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -33,8 +33,8 @@ def stl_bytes(mesh: Mesh) -> bytes:
 
 
 def threemf_bytes(mesh: Mesh) -> bytes:
-    """3MF core 1.3 (https://github.com/3MFConsortium/spec_core), one object, no times: the same mesh is the same
-    bytes."""
+    """Encodes 3MF core 1.3 (https://github.com/3MFConsortium/spec_core), one object, no times: the same mesh is the
+    same bytes."""
     text = io.StringIO()
     text.write(
         '<?xml version="1.0" encoding="UTF-8"?>\n<model unit="millimeter" xml:lang="en-US" '

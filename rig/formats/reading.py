@@ -18,7 +18,8 @@ VALUE_MOST = 40  # characters of a value
 
 @dataclass(frozen=True, slots=True)
 class CamerasRead:
-    """A rig, what its reader noticed and did not mind, and the cameras of the file that take no part, with reasons."""
+    """Holds a rig, what its reader noticed and accepted, and the cameras of the file that take no part, with
+    reasons."""
 
     rig: Rig
     remarks: tuple[Message, ...] = ()
@@ -50,7 +51,7 @@ class Reading:
         self.left_out[name] = why
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
-        """The rig of ``eigenhead-cameras/1`` entries. Raises InputError naming every fault."""
+        """Returns the rig of ``eigenhead-cameras/1`` entries. Raises InputError naming every fault."""
         warnings: list[Message] = []
         for (key, rule), cases in self._meant.items():
             whose, value = _whose([name for name, _ in cases], key), shown(cases[0][1])
@@ -87,8 +88,8 @@ class Reading:
 
 
 def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Message]:
-    """Faults that differ only in the names of cameras and of their files, as one sentence that names the first and how
-    many others there are."""
+    """Returns faults that differ only in the names of cameras and of their files, as one sentence that names the first
+    and how many others there are."""
     ordered = sorted(set(names), key=len, reverse=True)
     name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
     plate = re.compile(r"\b(background/)\S+")

@@ -51,8 +51,8 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 
 
 def read_xmp(folder: Path) -> CamerasRead:
-    """The rig in a folder of XMP files, a camera each, but for those that are not aligned or not used for meshing.
-    Raises InputError naming every fault."""
+    """Returns the rig in a folder of XMP files, a camera each, but for those that are not aligned or not used for
+    meshing. Raises InputError naming every fault."""
     reading = Reading(f"{folder.name}/*.xmp")
     entries = []
     components = set()
@@ -93,7 +93,7 @@ def write_xmp(rig: Rig, folder: Path) -> None:
 
 
 def read_csv(path: Path) -> CamerasRead:
-    """The rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
+    """Returns the rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
     rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(data.decode("utf-8-sig")))))
     if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
         raise InputError(path.name, [compose("no-camera-csv", columns=",".join(COLUMNS))])

@@ -128,12 +128,12 @@ class RigConfig:
 
     @property
     def calibration_file(self) -> Path | None:
-        """The calibration that this rig uses, if it names one."""
+        """Returns the calibration that this rig uses, if it names one."""
         return None if self.calibration is None else self.folder / self.calibration
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Camera names in the file's order."""
+        """Returns camera names in the file's order."""
         return tuple(camera.name for camera in self.cameras)
 
 
@@ -162,8 +162,8 @@ def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject:
 def adjusted(
     config: RigConfig, cameras: Mapping[str, Mapping[str, float | None]], outputs: tuple[int, ...] | None
 ) -> RigConfig:
-    """The rig with other ``exposure_ms``, ``gain_db`` and ``white_balance_k`` of cameras, and other lamps (None: those
-    of rig.toml). Raises InputError that names every fault."""
+    """Returns the rig with other ``exposure_ms``, ``gain_db`` and ``white_balance_k`` of cameras, and other lamps
+    (None: those of rig.toml). Raises InputError that names every fault."""
     changed = dataclasses.replace(
         config,
         cameras=tuple(dataclasses.replace(camera, **cameras.get(camera.name, {})) for camera in config.cameras),

@@ -24,7 +24,7 @@ KINDS = ("points", "tag", "cameras")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointDistance:
-    """Pixels of two points of the scene by camera, and how far apart they are."""
+    """Holds the pixels of two points of the scene by camera, and how far apart they are."""
 
     first: Mapping[str, Float[np.ndarray, " 2"]]
     second: Mapping[str, Float[np.ndarray, " 2"]]
@@ -33,7 +33,7 @@ class PointDistance:
 
 @dataclass(frozen=True, slots=True)
 class TagSize:
-    """Tags of one of OpenCV's ArUco dictionaries, of one size."""
+    """Describes tags of one of OpenCV's ArUco dictionaries, of one size."""
 
     dictionary: str
     size_mm: float
@@ -41,7 +41,7 @@ class TagSize:
 
 @dataclass(frozen=True, slots=True)
 class CameraDistance:
-    """How far apart the centres of two cameras are."""
+    """Holds how far apart the centres of two cameras are."""
 
     cameras: tuple[str, str]
     distance_mm: float
@@ -60,7 +60,7 @@ def read_scale(path: Path, cameras: Collection[str]) -> KnownLength:
 
 
 def scale_from_document(document: Any, cameras: Collection[str], subject: str = "scale.json") -> KnownLength:
-    """The length in a decoded ``scale.json``. Raises InputError naming every fault."""
+    """Returns the length in a decoded ``scale.json``. Raises InputError naming every fault."""
     present = [kind for kind in KINDS if isinstance(document, dict) and kind in document]
     if len(present) != 1:
         several = compose("scale-kinds", kinds=KINDS, held=present)

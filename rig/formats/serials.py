@@ -24,7 +24,7 @@ CR3_EXIF = re.compile(rb"CMT2(?=II\*\0|MM\0\*)")
 
 
 def camera_serial(path: Path) -> str | None:
-    """The serial number in a picture file; None where there is none, or none that can be read."""
+    """Returns the serial number in a picture file; None where there is none, or none that can be read."""
     with suppress(Exception):  # damaged EXIF fails in more ways than Pillow's documentation has
         for tags in _tag_sets(path):
             for tag in (BODY_SERIAL, DNG_SERIAL):
@@ -57,7 +57,8 @@ def _exif(data: bytes) -> Image.Exif:
 
 
 def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
-    """The rig with the serial of each camera's picture, unless two of them share it: then one body took both."""
+    """Returns the rig with the serial of each camera's picture, unless two of them share it: then one body took
+    both."""
     serials = {name: camera_serial(path) for name, path in pictures.items()}
     recorded = [serial for serial in serials.values() if serial is not None]
     unique = {name: serial for name, serial in serials.items() if serial is not None and recorded.count(serial) == 1}
@@ -65,7 +66,7 @@ def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
 
 
 def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:
-    """The pictures of ``folder`` that no camera has for a name, each under the camera that took it.
+    """Returns the pictures of ``folder`` that no camera has for a name, each under the camera that took it.
 
     Nothing is looked at where every camera has a picture of its name; appends a fault for each picture that cannot be
     told, and for two of one body."""

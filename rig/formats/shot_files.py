@@ -33,14 +33,15 @@ class ShotFiles:
     faults: tuple[Message, ...]
 
     def of_camera(self, name: str) -> list[tuple[str, Path]]:
-        """Kind (the folder's name) and path of each file of a camera."""
+        """Returns the kind (the folder's name) and path of each file of a camera."""
         found = [("images", self.images.get(name)), ("masks", self.masks.get(name))]
         found += [("background", plate) for plate in self.plates.get(name, ())]
         return [(kind, path) for kind, path in found if path is not None]
 
 
 def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFiles:
-    """The files of one shot. ``left_out``: cameras that take no part, whose files are nobody's and no strays."""
+    """Returns the files of one shot. ``left_out``: cameras that take no part, whose files are nobody's and no
+    strays."""
     names, faults = [*rig.names, *left_out], list[Message]()
     places = {"images": picture_folder(folder), **{kind: folder / kind for kind in BESIDE_PICTURES}}
     owned = {kind: _owned(place, names, kind, rig, faults) for kind, place in places.items()}
@@ -67,14 +68,14 @@ def picture_folder(folder: Path) -> Path:
 
 
 def listed_pictures(folder: Path) -> list[Path]:
-    """The pictures in a folder; none where there is no such folder."""
+    """Returns the pictures in a folder; none where there is no such folder."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if is_picture(path))
 
 
 def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
-    """What is said of pictures that belong to no camera."""
+    """Describes the pictures that belong to no camera."""
     return compose("pictures-strange", count=len(strays), pictures=some_of(strays), cameras=rig.names)
 
 

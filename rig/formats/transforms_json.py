@@ -30,7 +30,7 @@ PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # what may stand at the top
 
 
 def read_transforms(path: Path) -> CamerasRead:
-    """The rig in a ``transforms.json``: a camera a frame. Raises InputError naming every fault."""
+    """Returns the rig in a ``transforms.json``: a camera a frame. Raises InputError naming every fault."""
     document = parsed(path, json.loads)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):

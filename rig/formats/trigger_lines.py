@@ -13,7 +13,7 @@ CLOCK_PERIOD_US = 2**32  # the box counts microseconds in 32 bits: it wraps ever
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF): crc16(b"123456789") == 0x29B1."""
+    """Computes CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF): crc16(b"123456789") == 0x29B1."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte << 8
@@ -24,13 +24,14 @@ def crc16(data: bytes) -> int:
 
 
 def encode_line(start: bytes, sequence: int, body: str) -> bytes:
-    """One line of the protocol. ``body`` is printable ASCII without @ # and *."""
+    """Returns one line of the protocol. ``body`` is printable ASCII without @ # and *."""
     payload = f"{sequence:02X} {body}".encode("ascii")
     return start + payload + f"*{crc16(payload):04X}\n".encode("ascii")
 
 
 def decode_payload(line: bytes) -> tuple[int, str] | None:
-    """Sequence and body of what stands between the start character and the newline, None where it is damaged."""
+    """Returns sequence and body of what stands between the start character and the newline, None where it is
+    damaged."""
     payload, star, digits = line.rpartition(b"*")
     if not star or len(payload) < 4 or payload[2:3] != b" " or not _is_hex(digits, 4) or not _is_hex(payload[:2], 2):
         return None

@@ -37,7 +37,8 @@ def unread_keys(path: Path) -> tuple[Message, ...]:
 
 
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
-    """The same of a decoded file of this format. What many cameras have alike is said once, with their number."""
+    """Returns the same of a decoded file of this format. What many cameras have alike is said once, with their
+    number."""
     counts = Counter(_unread(document))
     faults = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:

@@ -22,7 +22,7 @@ PADDING = 4  # bytes of a header of padding
 
 
 class NoUsd(EigenheadError):
-    """The extra is not installed."""
+    """Reports that the extra is not installed."""
 
     def __init__(self) -> None:
         super().__init__(compose("usd-not-installed", remedy=how_to_install("usd")))
@@ -45,7 +45,7 @@ def usdz_bytes(
     image: bytes,
     suffix: str,
 ) -> bytes:
-    """One mesh, y up, metres, in a UsdPreviewSurface. The same input is the same bytes. Raises NoUsd.
+    """Returns one mesh, y up, metres, in a UsdPreviewSurface. The same input is the same bytes. Raises NoUsd.
 
     Args:
         mesh: head frame, mm.

@@ -30,7 +30,7 @@ def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
 
 
 def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
-    """The cameras of pictures that were read smaller."""
+    """Returns the cameras of pictures that were read smaller."""
     shares = {camera.name: work_share(camera.intrinsics, pixels_most) for camera in rig}
     return Rig(
         tuple(
@@ -41,7 +41,7 @@ def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
 
 
 def work_features(features: Features, rig: Rig, work: Rig) -> Features:
-    """Points of the files, in the pictures as they were read."""
+    """Returns points of the files, in the pictures as they were read."""
 
     def moved(name: str, pixel: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
         full, scaled = rig[name].intrinsics, work[name].intrinsics
@@ -62,7 +62,8 @@ def halvings(share: float, size: tuple[int, int]) -> int:
 def at_share(
     pixels: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int], share: float
 ) -> UInt8[np.ndarray, "r c *channels"]:
-    """The picture of a file of ``size`` (width, height) at ``share`` of it; decoders may have done some of it."""
+    """Returns the picture of a file of ``size`` (width, height) at ``share`` of it; decoders may have done some of
+    it."""
     wanted = (round(size[0] * share), round(size[1] * share))
     if wanted == (pixels.shape[1], pixels.shape[0]):
         return pixels

@@ -16,18 +16,19 @@ VERBATIM = "verbatim"  # the code of text that another program or an earlier ver
 
 @runtime_checkable
 class Scalar(Protocol):
-    """A number of NumPy, which this room does not load: a command line that only refuses something starts at once."""
+    """Stands for a number of NumPy, which this room does not load: a command line that only refuses something starts at
+    once."""
 
     @property
     def dtype(self) -> Any: ...
 
     def item(self) -> Any:
-        """The plain number."""
+        """Returns the plain number."""
         ...
 
 
 class MessageDocument(TypedDict):
-    """A message in JSON. Those of earlier versions have no parameters."""
+    """Holds a message in JSON. Those of earlier versions have no parameters."""
 
     code: str
     message: str

@@ -59,7 +59,7 @@ def draw_colour(
 def draw_antialiased(
     context: GlContext, draw: moderngl.VertexArray, page: Page, samples: int
 ) -> UInt8[np.ndarray, "h w 4"]:
-    """Mean of ``samples`` coverage samples a pixel; the colour is multiplied by the coverage (alpha)."""
+    """Returns the mean of ``samples`` coverage samples a pixel; the colour is multiplied by the coverage (alpha)."""
     gl, size = context.gl, (page.width, page.height)
     with Owned() as owned:
         image = owned(gl.renderbuffer(size, 4, samples=samples))

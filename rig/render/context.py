@@ -101,7 +101,7 @@ class GlContext:
             self._rest.use()  # moderngl keeps binding the last target, and fails once that is released
 
     def program(self, vertex: str, fragment: str, geometry: str | None = None) -> moderngl.Program:
-        """The program of these files of ``shaders/``, compiled once."""
+        """Returns the program of these files of ``shaders/``, compiled once."""
         key = (vertex, fragment, geometry or "")
         if key not in self._programs:
             self._programs[key] = self.gl.program(
@@ -121,7 +121,8 @@ class GlContext:
 
     @property
     def description(self) -> str:
-        """Renderer and version, for reports: ``llvmpipe (LLVM 15.0.6, 256 bits), 4.5 (Core Profile) Mesa 22.3.6``."""
+        """Returns renderer and version, for reports: ``llvmpipe (LLVM 15.0.6, 256 bits), 4.5 (Core Profile) Mesa
+        22.3.6``."""
         return f"{self._info['GL_RENDERER']}, {self._info['GL_VERSION']}"
 
     def close(self) -> None:
@@ -134,6 +135,6 @@ class GlContext:
 
 
 def shader_source(name: str) -> str:
-    """The text of ``shaders/<name>``; a line ``#include <file>`` stands for that file."""
+    """Returns the text of ``shaders/<name>``; a line ``#include <file>`` stands for that file."""
     lines = (SHADERS / name).read_text(encoding="utf-8").splitlines()
     return "\n".join(shader_source(line.split()[1]) if line.startswith("#include") else line for line in lines)

@@ -65,7 +65,8 @@ class Gallery:
 def draw_photographs(
     context: GlContext, rig: Rig, parts: Sequence[Part], gallery: Gallery, samples: int
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
-    """Linear RGB multiplied by coverage, and coverage, per camera (float32). One camera at a time: 25 MB of samples."""
+    """Returns linear RGB multiplied by coverage, and coverage, per camera (float32). One camera at a time: 25 MB of
+    samples."""
     origin = rig.centre_world()
     box = np.concatenate([box_points(part.vertices) for part in parts])
     found = {}
@@ -79,7 +80,7 @@ def draw_photographs(
 
 
 def draw_vertex_radiance(context: GlContext, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:
-    """What ``draw_photographs`` shows of each vertex, without highlights: linear RGB (float32)."""
+    """Returns what ``draw_photographs`` shows of each vertex, without highlights: linear RGB (float32)."""
     count = len(part.vertices)
     size = (VERTEX_ROW, -(-count // VERTEX_ROW))
     with context.current() as gl, Owned() as owned:

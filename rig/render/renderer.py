@@ -39,27 +39,29 @@ class Renderer:
         self.context.close()
 
     def silhouette_set(self, rig: Rig, faces: Int[np.ndarray, "f 3"], scale: float = 1.0) -> SilhouetteSet:
-        """Masks and weighted XOR of one mesh topology in all cameras, made ready for many evaluations."""
+        """Returns masks and weighted XOR of one mesh topology in all cameras, made ready for many evaluations."""
         return SilhouetteSet(self.context, rig.scaled(scale) if scale != 1.0 else rig, faces)
 
     def depth(
         self, rig: Rig, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], scale: float = 1.0
     ) -> dict[str, Float[np.ndarray, "_ _"]]:
-        """Depth along the optical axis (z in the camera frame, mm, float32) of the nearest surface; inf where none."""
+        """Returns the depth along the optical axis (z in the camera frame, mm, float32) of the nearest surface; inf
+        where none."""
         return draw_depth(self.context, rig.scaled(scale) if scale != 1.0 else rig, vertices_world, faces)
 
     def colour(
         self, rig: Rig, mesh: Mesh, scale: float = 1.0, *, samples: int = 4, light: Light = UNLIT
     ) -> dict[str, UInt8[np.ndarray, "_ _ 4"]]:
-        """The mesh with its vertex colours (grey where it has none), antialiased: RGB, and coverage as alpha."""
+        """Returns the mesh with its vertex colours (grey where it has none), antialiased: RGB, and coverage as
+        alpha."""
         return draw_colour(self.context, rig.scaled(scale) if scale != 1.0 else rig, mesh, samples, light)
 
     def photograph(
         self, rig: Rig, parts: Sequence[Part], gallery: Gallery, *, samples: int = 4
     ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
-        """Linear radiance of a painted, lit subject: RGB multiplied by coverage, and coverage (float32)."""
+        """Returns linear radiance of a painted, lit subject: RGB multiplied by coverage, and coverage (float32)."""
         return draw_photographs(self.context, rig, parts, gallery, samples)
 
     def vertex_radiance(self, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:
-        """Linear RGB of each vertex of a part, as photographed but without highlights (float32)."""
+        """Returns linear RGB of each vertex of a part, as photographed but without highlights (float32)."""
         return draw_vertex_radiance(self.context, part, gallery)

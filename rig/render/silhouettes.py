@@ -81,7 +81,7 @@ class SilhouetteSet:
         self._surfaces = []
 
     def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
-        """True where the mesh covers a pixel's centre, per camera (H, W)."""
+        """Marks where the mesh covers a pixel's centre, per camera (H, W)."""
         found = {}
         with self._context.current():
             self._draw(vertices_world)
@@ -203,7 +203,7 @@ class SilhouetteSet:
 
 
 def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
-    """True where every edge has its counterpart: then front faces alone make the whole silhouette.
+    """Marks where every edge has its counterpart: then front faces alone make the whole silhouette.
 
     Along any line the surface is entered as often as it is left, so where a back face covers a pixel a front face does.
     """

@@ -34,7 +34,7 @@ class Page:
     tiles: Int[np.ndarray, "k 4"]
 
     def cut(self, image: np.ndarray, position: int) -> np.ndarray:
-        """The part of a page's image that is the tile at ``position``."""
+        """Returns the part of a page's image that is the tile at ``position``."""
         left, top, width, height = self.tiles[position]
         return image[top : top + height, left : left + width]
 
@@ -110,7 +110,8 @@ def instances(
 
 
 def box_points(vertices: Float[np.ndarray, "v 3"], per_edge: int = 9) -> Float[np.ndarray, "p 3"]:
-    """Points on the twelve edges of the vertices' bounding box: seen from outside, their outline holds the mesh's."""
+    """Returns points on the twelve edges of the vertices' bounding box: seen from outside, their outline holds the
+    mesh's."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     steps = np.linspace(0.0, 1.0, per_edge)
     corners = np.array([(a, b) for a in (0.0, 1.0) for b in (0.0, 1.0)])
@@ -119,7 +120,7 @@ def box_points(vertices: Float[np.ndarray, "v 3"], per_edge: int = 9) -> Float[n
 
 
 def depth_range(camera: Camera, box: Float[np.ndarray, "p 3"]) -> tuple[float, float]:
-    """Nearest and farthest depth (mm) that the points of a bounding box allow, a little widened."""
+    """Returns the nearest and farthest depth (mm) that the points of a bounding box allow, a little widened."""
     depth = camera.camera_from_world.apply(box)[:, 2]
     near = max(0.99 * float(depth.min()), NEAR_MM)
     return near, max(1.01 * float(depth.max()), near + 1.0)

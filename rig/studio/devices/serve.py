@@ -61,7 +61,7 @@ class DeviceFault:
 
     @property
     def strength(self) -> float:
-        """The amount, or the kind's usual one."""
+        """Returns the amount, or the kind's usual one."""
         return self.amount if self.amount is not None else DEFAULT_AMOUNT.get(self.kind, 0.0)
 
 
@@ -307,7 +307,7 @@ class StudioDevices:
 def serve_scene(
     folder: Path, scene: Scene, *, fps: float = 4.0, host: str = "127.0.0.1", port: int = 0
 ) -> StudioDevices:
-    """The devices of a drawn scene, the chair still empty; ``folder`` receives rig.toml and cameras.json."""
+    """Returns the devices of a drawn scene, the chair still empty; ``folder`` receives rig.toml and cameras.json."""
     folder.mkdir(parents=True, exist_ok=True)
     write_rig(scene.rig, folder / "cameras.json")
     empty, seated = SceneImages(scene, seated=False, seed=1), SceneImages(scene, seated=True, seed=2)

@@ -61,7 +61,7 @@ _building = threading.Lock()
 
 
 def scene_of_file(mesh_file: Path) -> Scene:
-    """The default studio with the head of a mesh file in it (head frame, mm); the last one is kept.
+    """Returns the default studio with the head of a mesh file in it (head frame, mm); the last one is kept.
 
     Raises InputError for a file that is no mesh.
     """

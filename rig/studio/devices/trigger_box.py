@@ -55,7 +55,8 @@ class BoxLogic:
     _last_reply: str = ""
 
     def handle(self, sequence: int, body: str, now_s: float) -> str:
-        """The reply to a request. The same request under the same sequence number is answered without acting again."""
+        """Returns the reply to a request. The same request under the same sequence number is answered without acting
+        again."""
         if self._last == (sequence, body):
             return self._last_reply
         self.expire(now_s)

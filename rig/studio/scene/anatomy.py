@@ -26,7 +26,8 @@ class Anatomy:
 
 
 def anatomy(vertices: Float[np.ndarray, "v 3"], landmarks: Landmarks) -> Anatomy:
-    """From landmarks, or from the mesh's extent where they are unknown (a head of 225 mm from chin to crown)."""
+    """Lays the anatomy out from landmarks, or from the mesh's extent where they are unknown (a head of 225 mm from chin
+    to crown)."""
     if {"tragion_right", "tragion_left", "gnathion", "glabella"} <= set(landmarks):
         right, left = landmarks["tragion_right"], landmarks["tragion_left"]
         chin = float(landmarks["gnathion"][1])

@@ -17,7 +17,7 @@ def backdrop(
     unevenness: float,
     colour: tuple[float, float, float] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance (float32). ``colour`` replaces the drawn one."""
+    """Returns linear radiance (float32). ``colour`` replaces the drawn one."""
     height, width = intrinsics.height, intrinsics.width
     base = np.array(COLOURS[rng.integers(len(COLOURS))] if colour is None else colour, np.float32)
     image = np.broadcast_to(base, (height, width, 3)).astype(np.float32)

@@ -14,7 +14,7 @@ SUNK_MM = 2.0  # below the skin where no beard grows
 
 
 def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Beard and moustache (head frame, mm); thickness, curls and strands as in ``style``.
+    """Grows beard and moustache (head frame, mm); thickness, curls and strands as in ``style``.
 
     Raises InputError for a head without landmarks.
     """

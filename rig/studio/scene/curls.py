@@ -16,7 +16,7 @@ def curled(
     amount: Float[np.ndarray, " v"],
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
-    """The surface with curls on it, and its shade: where a random field is near zero a ridge winds along.
+    """Returns the surface with curls on it, and its shade: where a random field is near zero a ridge winds along.
 
     Args:
         vertices: Of the smooth surface (mm), a few to each curl.

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarray, "f 3"]:
-    """Triangles of a grid of vertices, counted row by row; ``closed``: the last column meets the first."""
+    """Returns triangles of a grid of vertices, counted row by row; ``closed``: the last column meets the first."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - (not closed)), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = a + columns, b + columns

@@ -62,7 +62,7 @@ class Hair:
 
 
 def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Hair for a head in the head frame."""
+    """Grows hair for a head in the head frame."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     elevation, azimuth = np.meshgrid(
         np.radians(np.linspace(90.0, LOWEST_DEG, ROWS)), np.arange(COLUMNS) * 2 * np.pi / COLUMNS, indexing="ij"
@@ -96,7 +96,7 @@ def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rn
 
 
 def outer_radius(points: Float[np.ndarray, "v 3"], *, open_ears: bool) -> Float[np.ndarray, "r c"]:
-    """The head's outermost radius along each direction of the grid, smoothed."""
+    """Returns the head's outermost radius along each direction of the grid, smoothed."""
     length = np.linalg.norm(points, axis=1)
     elevation = np.degrees(np.arcsin(points[:, 1] / length))
     row = (90.0 - elevation) / (90.0 - LOWEST_DEG) * (ROWS - 1)

@@ -68,7 +68,7 @@ def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body
 
 
 def glasses(head: Float[np.ndarray, "v 3"], body: Anatomy) -> AnySurface:
-    """Two rims, a bridge and two temples, laid out from landmarks (head frame, mm).
+    """Returns two rims, a bridge and two temples, laid out from landmarks (head frame, mm).
 
     Raises InputError for a head without landmarks.
     """
@@ -134,7 +134,7 @@ def _tube(
 
 
 def joined(surfaces: list[AnySurface]) -> AnySurface:
-    """Several surfaces as one."""
+    """Returns several surfaces as one."""
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces])
     faces = [faces + start for (_, faces), start in zip(surfaces, starts[:-1], strict=True)]
     return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)

@@ -40,12 +40,13 @@ ARRANGEMENTS_DEG = {
 
 
 def default_layout() -> Rig:
-    """Eleven cameras on the front hemisphere, 1.2 m away; cam00 looks at the face from the front."""
+    """Returns eleven cameras on the front hemisphere, 1.2 m away; cam00 looks at the face from the front."""
     return rig_from_directions(DEFAULT_DIRECTIONS_DEG)
 
 
 def arrangement(name: str) -> Rig:
-    """One of the paper's four arrangements of section 5.3: "a" even, "b" informative, "c" vertical, "d" to the side."""
+    """Returns one of the paper's four arrangements of section 5.3: "a" even, "b" informative, "c" vertical, "d" to the
+    side."""
     return rig_from_directions(ARRANGEMENTS_DEG[name])
 
 

@@ -44,7 +44,7 @@ def lamp_directions(lamps: Sequence[Lamp] = LAMPS) -> Float[np.ndarray, "l 3"]:
 
 
 def dome(lamps: Sequence[Lamp] = LAMPS) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
-    """Directions, spread evenly over the sphere above -45 degrees, and the linear RGB that each sends."""
+    """Returns directions, spread evenly over the sphere above -45 degrees, and the linear RGB that each sends."""
     index = np.arange(DIRECTIONS) + 0.5
     y = 1.0 - index / DIRECTIONS * 1.7
     angle = index * np.pi * (3.0 - np.sqrt(5.0))
@@ -63,7 +63,8 @@ def irradiance(
     casters: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]],
     lamps: Sequence[Lamp] = LAMPS,
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Linear RGB at each receiver's (vertices, unit normals), shaded by the ``casters``' triangles; world frame."""
+    """Returns linear RGB at each receiver's (vertices, unit normals), shaded by the ``casters``' triangles; world
+    frame."""
     directions, sent = dome(lamps)
     vertices, faces = casters
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2

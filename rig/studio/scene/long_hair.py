@@ -23,7 +23,7 @@ BUN_ELEVATION_DEG = 58.0  # over the back of the head
 def hang(
     shell: Hair, below: Float[np.ndarray, "n 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator
 ) -> Hair:
-    """The sheet that carries the shell on downwards, by ``style.hanging_mm`` below the ears' openings.
+    """Returns the sheet that carries the shell on downwards, by ``style.hanging_mm`` below the ears' openings.
 
     Args:
         shell: The hair over the scalp.

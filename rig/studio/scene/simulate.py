@@ -80,7 +80,7 @@ class SimulatedCapture:
 
     @property
     def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]:
-        """True silhouettes, hair and clothes included: coverage of at least a half."""
+        """Returns the true silhouettes, hair and clothes included: coverage of at least a half."""
         return {name: view.mask for name, view in self.scene.views.items()}
 
 
@@ -95,7 +95,7 @@ def simulate(
     world_from_head: Similarity | None = None,
     faults: Sequence[Fault] = (),
 ) -> SimulatedCapture:
-    """One capture of ``subject`` by ``rig``. Look and pose are drawn where none is given."""
+    """Returns one capture of ``subject`` by ``rig``. Look and pose are drawn where none is given."""
     scene_rng, shot_rng = rng.spawn(2)
     faults = tuple(_settled(fault, rig, shot_rng) for fault in faults)
     scene = build_scene(
@@ -154,7 +154,7 @@ def build_scene(
 
 
 def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[np.ndarray, "h w 3"]:
-    """The light on one camera's sensor (float32), with the subject or without."""
+    """Returns the light on one camera's sensor (float32), with the subject or without."""
     light = view.backdrop
     if subject:
         light = view.subject[:, :, :3] + (1 - view.subject[:, :, 3:]) * light
@@ -162,7 +162,7 @@ def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[
 
 
 def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) -> Capture:
-    """Clean plates, then the shot. ``faults`` name their cameras (``simulate`` draws those that do not)."""
+    """Photographs clean plates, then the shot. ``faults`` name their cameras (``simulate`` draws those that do not)."""
     names = scene.rig.names
     click_rng, *rngs = rng.spawn(1 + len(names))
 
@@ -187,7 +187,8 @@ def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) 
 
 
 def click(scene: Scene, rng: np.random.Generator) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
-    """Feature points as an operator picks them: in up to four views that see them best, with the preset's noise."""
+    """Returns feature points as an operator picks them: in up to four views that see them best, with the preset's
+    noise."""
     clicked: dict[str, dict[str, np.ndarray]] = {}
     for landmark, views in scene.landmarks_seen.items():
         for name in list(views)[:CLICKED_VIEWS]:

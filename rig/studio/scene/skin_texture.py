@@ -21,7 +21,8 @@ def skin_paint(
     *,
     closed: Mapping[str, float] | None = None,
 ) -> Float[np.ndarray, "v 4"]:
-    """Linear albedo and strength of the grain, head frame. ``closed``: how far the lids are, by side, 0 to 1."""
+    """Returns linear albedo and strength of the grain, head frame. ``closed``: how far the lids are, by side, 0 to
+    1."""
     paint = np.ones((len(vertices), 4))
     paint[:, :3] = np.array(tone) * (1 + _blotches(vertices, rng) * (0.5, 1.0, 1.0))
     if body.landmarks:

@@ -110,7 +110,7 @@ class Dressed:
 
 
 def random_look(rng: np.random.Generator) -> Look:
-    """One of the committed tones each, and one of a few hair styles."""
+    """Draws one of the committed tones each, and one of a few hair styles."""
     tone = HAIR_TONES[rng.integers(len(HAIR_TONES))]
     over_ears = bool(rng.random() < 0.4)
     hair = HairStyle(
@@ -144,7 +144,7 @@ def dress(
     rng: np.random.Generator,
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Dressed:
-    """Hair, clothes, paint and light for a head, in the world frame."""
+    """Returns hair, clothes, paint and light for a head, in the world frame."""
     hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng = rng.spawn(5)
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None

@@ -32,7 +32,7 @@ class VisiblePoints:
     views: UInt8[np.ndarray, " n"]  # cameras that see the point
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of ``visible.npz``; ``area`` is the surface (mm2) that a point stands for."""
+        """Returns the arrays of ``visible.npz``; ``area`` is the surface (mm2) that a point stands for."""
         counted = {"points": self.points, "normals": self.normals, "part": self.part, "views": self.views}
         return counted | {"area": np.asarray(AREA_MM2, np.float32)}
 
@@ -40,7 +40,7 @@ class VisiblePoints:
 def visible_points(
     rig: Rig, surfaces: Mapping[str, Mesh], *, renderer: Renderer, rng: np.random.Generator
 ) -> VisiblePoints:
-    """Points of surfaces (by part, world frame), evenly over their area, that ``VIEWS_LEAST`` cameras see."""
+    """Returns points of surfaces (by part, world frame), evenly over their area, that ``VIEWS_LEAST`` cameras see."""
     drawn = [sample_surface(mesh, AREA_MM2, rng) for mesh in surfaces.values()]
     points, normals = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
     codes = np.array([PARTS.index(name) for name in surfaces], np.uint8)
@@ -62,7 +62,7 @@ def part_masks(
     *,
     renderer: Renderer,
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
-    """What every pixel shows, counted as in bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the ``masks``.
+    """Returns what every pixel shows, counted as in bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the ``masks``.
 
     What no surface covers within a mask are strands: hair.
     """
@@ -80,7 +80,8 @@ def part_masks(
 def sample_surface(
     mesh: Mesh, area_mm2: float, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """One point for each ``area_mm2`` at random places of the surface, and the unit normals of their triangles."""
+    """Returns one point for each ``area_mm2`` at random places of the surface, and the unit normals of their
+    triangles."""
     normals = face_normals(mesh.vertices, mesh.faces)
     double = np.linalg.norm(normals, axis=1)
     ends = np.cumsum(double / 2)
@@ -99,7 +100,7 @@ def sees(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
 ) -> np.ndarray:
-    """Which points a camera sees, of a surface that has ``depth`` (camera z, mm, inf where nothing) in it.
+    """Returns which points a camera sees, of a surface that has ``depth`` (camera z, mm, inf where nothing) in it.
 
     The map is read at the nearest pixel's centre, where the point's own tangent plane is a little nearer or farther.
     """

@@ -44,7 +44,7 @@ def fault_from_text(text: str) -> Fault:
 
 
 def fault_parts(text: str) -> tuple[str, str | None, float | None]:
-    """Kind, camera and amount of ``kind[:camera][=amount]``. Raises InputError."""
+    """Returns the kind, camera and amount of ``kind[:camera][=amount]``. Raises InputError."""
     head, _, amount = text.partition("=")
     kind, _, camera = head.partition(":")
     try:

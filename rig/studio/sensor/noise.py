@@ -6,7 +6,7 @@ from jaxtyping import Float, UInt8
 
 
 def volume(rng: np.random.Generator, cells: int) -> UInt8[np.ndarray, "n n n 4"]:
-    """Independent bytes for a repeated 3D texture."""
+    """Returns independent bytes for a repeated 3D texture."""
     return rng.integers(0, 256, (cells, cells, cells, 4), np.uint8)
 
 
@@ -25,7 +25,7 @@ def smooth(
 def around(
     rng: np.random.Generator, rows: int, columns: int, cells_high: int, cells_wide: int
 ) -> Float[np.ndarray, "h w"]:
-    """Like ``smooth``, one channel, but closed on itself from the last column to the first (float64)."""
+    """Draws noise like ``smooth``, one channel, but closed on itself from the last column to the first (float64)."""
     grid = rng.standard_normal((cells_high + 2, cells_wide)).astype(np.float32)
     grid = np.concatenate([grid[:, -3:], grid, grid[:, :3]], axis=1)
     step = columns / cells_wide

@@ -36,7 +36,8 @@ _CURVE = _curve()
 
 
 def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarray, "h w 3"]:
-    """The light on the sensor: blurred by the lens, darker in the corners, times the camera's gains (float32)."""
+    """Returns the light on the sensor: blurred by the lens, darker in the corners, times the camera's gains
+    (float32)."""
     light = cv2.GaussianBlur(linear, (0, 0), sensor.defocus_px) if sensor.defocus_px > 0 else linear
     height, width = light.shape[:2]
     y, x = np.ogrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
@@ -45,8 +46,8 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
 
 
 def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
-    """What a rolling shutter makes of a subject that moves by ``shift_px`` from the first row's readout to the last's:
-    each row shows it where it was then, the middle row where it is."""
+    """Returns what a rolling shutter makes of a subject that moves by ``shift_px`` from the first row's readout to the
+    last's: each row shows it where it was then, the middle row where it is."""
     height, width = subject.shape[:2]
     across, down = shift_px / (height - 1)
     source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
@@ -55,7 +56,7 @@ def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"
 
 
 def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-    """One picture of the light on the sensor, with fresh noise."""
+    """Returns one picture of the light on the sensor, with fresh noise."""
     if sensor.noise > 0:
         # The curve's slope at mid grey is 1.07, so that the noise there is ``noise`` of full scale in the picture.
         variance = (sensor.noise / 1.07) ** 2 * (READ_SHARE + (1 - READ_SHARE) / MID_GREY * np.maximum(light, 0))
@@ -89,7 +90,8 @@ def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.nd
 
 
 def drift(shape: tuple[int, int], amount: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 1"]:
-    """Gain of the light between clean plate and shot: one factor and a slope over the image, each of this size."""
+    """Returns the gain of the light between clean plate and shot: one factor and a slope over the image, each of this
+    size."""
     level, across, down = amount * rng.standard_normal(3)
     y, x = np.ogrid[-1.0 : 1.0 : shape[0] * 1j, -1.0 : 1.0 : shape[1] * 1j]
     return (1.0 + level + 0.5 * (across * x + down * y)).astype(np.float32)[:, :, None]
