@@ -30,7 +30,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is this machine's own."""
+    """Tells whether a host name or address is this machine's own."""
     if host == "localhost":
         return True
     try:

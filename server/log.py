@@ -82,7 +82,7 @@ def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None
 
 
 def is_no_known_failure(record: logging.LogRecord) -> bool:
-    """False for the traceback of a job that failed for a known reason, or was cancelled."""
+    """Returns False for the traceback of a job that failed for a known reason, or was cancelled."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return True

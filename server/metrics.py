@@ -41,7 +41,7 @@ class Metrics:
         self.seconds.labels(route).observe(time.monotonic() - began)
 
     def exposition(self, jobs: Mapping[str, int], *, captures: int, free: int, damaged: int) -> bytes:
-        """Prometheus' text format. ``jobs`` by state, ``free`` in bytes."""
+        """Returns Prometheus' text format. ``jobs`` by state, ``free`` in bytes."""
         for state, count in jobs.items():
             self.jobs.labels(state).set(count)
         self.captures.set(captures)

@@ -76,7 +76,7 @@ def origin_of(url: httpx.URL) -> str:
 
 
 def is_public(address: Address) -> bool:
-    """Whether a machine of the open internet has this address, also where it is an IPv4 one in IPv6's clothes."""
+    """Tells whether a machine of the open internet has this address, also where it is an IPv4 one in IPv6's clothes."""
     if isinstance(address, ipaddress.IPv6Address):
         inner = [address.ipv4_mapped, address.sixtofour, *(address.teredo or ())]
         inner.append(ipaddress.IPv4Address(int(address) & 0xFFFFFFFF) if address in NAT64 else None)

@@ -19,7 +19,8 @@ SERVER = __package__ or "server"  # "eigenhead.server" in the wheel
 
 
 def python_command(module: str, *arguments: str) -> list[str]:
-    """The command that runs ``module`` (relative to this package: "cli") with the working directory off the path."""
+    """Returns the command that runs ``module`` (relative to this package: "cli") with the working directory off the
+    path."""
     return [sys.executable, "-P", "-m", f"{SERVER}.{module}", *arguments]
 
 

@@ -121,18 +121,18 @@ class ServiceSettings(BaseSettings):
 
     @property
     def public_host(self) -> str | None:
-        """Host, and port where there is one, of ``public_url``."""
+        """Returns the host, and the port where there is one, of ``public_url``."""
         return None if self.public_url is None else self.public_url.partition("://")[2]
 
     @property
     def is_private(self) -> bool:
-        """Whether nobody but this machine's own people can reach the service, so that it may go without keys."""
+        """Tells whether nobody but this machine's own people can reach the service, so that it may go without keys."""
         return self.public_url is None and is_loopback(self.host)
 
     @property
     def url(self) -> str:
-        """The database's URL in SQLAlchemy's form. PostgreSQL is told to end a session that idles inside a transaction:
-        a worker that vanished there would keep its row locks, and nobody could take over its job."""
+        """Returns the database's URL in SQLAlchemy's form. PostgreSQL is told to end a session that idles inside a
+        transaction: a worker that vanished there would keep its row locks, and nobody could take over its job."""
         if self.database_url is None:
             return f"sqlite:///{self.data.resolve() / 'eigenhead.sqlite'}"
         scheme, _, rest = self.database_url.partition("://")
@@ -153,7 +153,7 @@ class ServiceSettings(BaseSettings):
         return sa.make_url(self.url).render_as_string(hide_password=True).partition("?")[0]
 
     def environment(self) -> dict[str, str]:
-        """The variables with which another process reads the same settings."""
+        """Returns the variables with which another process reads the same settings."""
         values = self.model_dump(mode="json", exclude_defaults=True) | {"data": str(self.data.resolve())}
         return {
             PREFIX + k.upper(): v if isinstance(v, str) else json.dumps(v) for k, v in values.items() if v is not None
@@ -161,5 +161,5 @@ class ServiceSettings(BaseSettings):
 
 
 def variable_in(error: SettingsError) -> str:
-    """The variable whose value cannot be decoded: pydantic names its field in the text alone."""
+    """Returns the variable whose value cannot be decoded: pydantic names its field in the text alone."""
     return next((PREFIX + name.upper() for name in ServiceSettings.model_fields if f'"{name}"' in str(error)), PREFIX)

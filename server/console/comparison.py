@@ -19,7 +19,7 @@ TRIMMED = 0.8  # share of the nearest pairs that a round uses: necks end at diff
 
 
 def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
-    """One number a vertex from a binary little-endian PLY whose first element are the vertices. Raises NotFound
+    """Returns one number a vertex from a binary little-endian PLY whose first element are the vertices. Raises NotFound
     where the file has no such property."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
@@ -37,7 +37,7 @@ def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
 
 
 def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.ndarray, " v"]:
-    """Distance (mm) of every vertex of a result's head to the surface of ``other``.
+    """Computes the distance (mm) of every vertex of a result's head to the surface of ``other``.
 
     Heads of different captures stand in different places: ``align`` moves ours rigidly onto theirs first.
     """
@@ -47,8 +47,8 @@ def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.nd
 
 
 def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Our vertices after the rigid motion with the least squares to theirs: to the same vertices where both heads come
-    from one model, else to the nearest ones, the farthest fifth left out."""
+    """Returns our vertices after the rigid motion with the least squares to theirs: to the same vertices where both
+    heads come from one model, else to the nearest ones, the farthest fifth left out."""
     if len(mine.vertices) == len(theirs.vertices):
         return _rigid(mine.vertices, theirs.vertices, mine.vertices)
     points = mine.vertices - mine.vertices.mean(0) + theirs.vertices.mean(0)

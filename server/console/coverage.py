@@ -50,7 +50,7 @@ def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: 
 
 
 def covered(corners: Float[np.ndarray, "n 2"]) -> float:
-    """Share of an image's cells that hold a corner."""
+    """Returns the share of an image's cells that hold a corner."""
     if len(corners) == 0:
         return 0.0
     cells = np.clip((corners * CELLS).astype(int), 0, np.array(CELLS) - 1)
@@ -58,7 +58,8 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
 
 
 def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
-    """One line a camera: views with the board, share of the image covered, its corners, and whether that is enough."""
+    """Returns one line a camera: views with the board, share of the image covered, its corners, and whether that is
+    enough."""
     lines: list[Coverage] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]
@@ -81,7 +82,7 @@ def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
 
 
 def advice(lines: list[Coverage]) -> Message:
-    """The next thing to do."""
+    """Returns the next thing to do."""
     if not lines or not any(line["views"] for line in lines):
         return compose("board-hold")
     blind = [line["name"] for line in lines if line["views"] == 0]

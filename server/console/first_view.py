@@ -48,7 +48,8 @@ def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
 
 
 def lit(mesh: Mesh) -> UInt8[np.ndarray, "v 3"]:
-    """Colours as the view's lights show a rough surface: three.js multiplies linear colour by light over pi."""
+    """Computes colours as the view's lights show a rough surface: three.js multiplies linear colour by light over
+    pi."""
     normals = vertex_normals(mesh.vertices, mesh.faces)
     light: Float[np.ndarray, " v"] = np.full(len(normals), AMBIENT)
     for *place, power in LIGHTS:

@@ -146,7 +146,7 @@ def _picks(points: Pixels, shown: Collection[str]) -> set[tuple[str, tuple[float
 def predicted(
     rig: Rig, located: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, list[float]]]:
-    """The model's landmarks in every view, once three points that are not on a line place its mean head."""
+    """Returns the model's landmarks in every view, once three points that are not on a line place its mean head."""
     names = [name for name in located if name in landmarks]
     if len(names) < POINTS_LEAST:
         return {}

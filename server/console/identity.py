@@ -25,17 +25,17 @@ KEY_ID = "key_id"
 
 
 def service_of_pages() -> Service:
-    """The running service: pages live as long as it."""
+    """Returns the running service: pages live as long as it."""
     return pages.state.eigenhead.state.service
 
 
 def sign_in(service: Service, token: str) -> Caller | None:
-    """The caller whose key ``token`` is. Blocks."""
+    """Returns the caller whose key ``token`` is. Blocks."""
     return service.keys.caller(token.strip())
 
 
 def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
-    """Who the browser with this user storage is; None where a key is still to be given. Blocks."""
+    """Returns who the browser with this user storage is; None where a key is still to be given. Blocks."""
     keys = {key.id: key for key in service.keys.all()}
     if not keys and service.settings.is_private:
         return Caller(LOCAL, frozenset(SCOPES))
@@ -62,16 +62,16 @@ def cookie_secret(data: Path) -> str:
 
 
 def is_foreign(scope: Scope, settings: ServiceSettings) -> bool:
-    """Whether a page elsewhere made a browser send this: its Origin is another host than the one that it asks, and not
-    the public one."""
+    """Tells whether a page elsewhere made a browser send this: its Origin is another host than the one that it asks,
+    and not the public one."""
     headers = Headers(scope=scope)
     origin, host = headers.get("origin"), headers.get("host", "")
     return origin is not None and origin not in (settings.public_url, f"http://{host}", f"https://{host}")
 
 
 def is_rebound(scope: Scope, settings: ServiceSettings) -> bool:
-    """Whether a request to a service that listens on loopback alone names another host than that and the public one
-    (DNS rebinding)."""
+    """Tells whether a request to a service that listens on loopback alone names another host than that and the public
+    one (DNS rebinding)."""
     host = Headers(scope=scope).get("host", "")
     name = host.rpartition(":")
     return is_loopback(settings.host) and host != settings.public_host and not is_loopback(name[0] or name[2])

@@ -33,7 +33,7 @@ class Source(Protocol):
     """Where pictures come from. Blocks."""
 
     def frames(self) -> list[LiveFrame]:
-        """One a camera: name, jpeg (None without a picture), mean, clipped, perhaps blur_px and fault."""
+        """Returns one row a camera: name, jpeg (None without a picture), mean, clipped, perhaps blur_px and fault."""
         ...
 
     def close(self) -> None: ...

@@ -42,7 +42,7 @@ def camera_views(rig: Rig, report: Report) -> list[CameraView]:
 
 
 def rig_of(capture: Path) -> Rig:
-    """The rig of a capture's files. Raises InputError."""
+    """Returns the rig of a capture's files. Raises InputError."""
     found = find_rig_file(capture)
     if found is None:
         raise InputError("capture", [compose("no-cameras-json")])
@@ -50,7 +50,7 @@ def rig_of(capture: Path) -> Rig:
 
 
 def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
-    """The photograph without the lens's distortion, at most ``WIDTH_MOST`` wide."""
+    """Returns the photograph without the lens's distortion, at most ``WIDTH_MOST`` wide."""
     lens = camera.intrinsics
     if camera.recorded is not None:
         image = camera.recorded.undistort(image, lens.matrix(), smooth=True)

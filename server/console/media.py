@@ -82,19 +82,19 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/front")
 def front(who: Reader, capture_id: str) -> Response:
-    """The same of the front camera."""
+    """Returns the picture of the front camera."""
     return thumbnail(who, capture_id, who[0].store.capture(capture_id).front)
 
 
 @pages.get("/console/captures/{capture_id}/checks")
 def checks(who: Reader, capture_id: str) -> Response:
-    """What was measured of a capture's pictures, by camera."""
+    """Returns what was measured of a capture's pictures, by camera."""
     return JSONResponse(who[0].store.checks(capture_id), headers=FOREVER)
 
 
 @pages.get("/console/captures/{capture_id}/holdings")
 def holdings(who: Reader, capture_id: str) -> Response:
-    """What a removal of the capture takes, and what stays."""
+    """Returns what a removal of the capture takes, and what stays."""
     return JSONResponse(asdict(who[0].captures.holdings(capture_id)), headers={"Cache-Control": "no-store"})
 
 
@@ -105,7 +105,7 @@ def image(who: Reader, request: Request, capture_id: str, camera: str) -> Respon
 
 @pages.get("/console/captures/{capture_id}/{camera}.silhouette.png")
 def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
-    """The outline of the subject, drawn for all cameras at the first look."""
+    """Returns the outline of the subject, drawn for all cameras at the first look."""
     service = who[0]
     name = Path(_image_name(service.store.capture(capture_id), camera)).stem
     folder = service.store.cache_of(capture_id) / "outlines"
@@ -157,7 +157,8 @@ def portrait(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/first-view.jpg")
 def first_view(who: Reader, job_id: str) -> Response:
-    """The head as the page Result shows it first; nothing of a head.ply that is not ours: the page does without."""
+    """Returns the head as the page Result shows it first; nothing of a head.ply that is not ours: the page does
+    without."""
     try:
         return FileResponse(head_picture(who[0], job_id, "first-view.jpg"), headers=FOREVER)
     except InputError:
@@ -166,8 +167,8 @@ def first_view(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/cameras")
 def cameras(who: Reader, job_id: str) -> Response:
-    """The cameras that took the pictures, in the head's frame; none where the capture was removed, or the result has no
-    report that places the head."""
+    """Returns the cameras that took the pictures, in the head's frame; none where the capture was removed, or the
+    result has no report that places the head."""
     service, found = who[0], []
     report = result_folder(who[0], job_id) / "report.json"
     with suppress(NotFound, FileNotFoundError, KeyError):
@@ -191,7 +192,8 @@ def photograph(who: Reader, job_id: str, camera: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/distance.f32")
 def distance(who: Reader, job_id: str, other: str) -> Response:
-    """Distance (mm, float32) of every vertex to the surface of another job's head, or of the truth (``truth``)."""
+    """Computes the distance (mm, float32) of every vertex to the surface of another job's head, or of the truth
+    (``truth``)."""
     service = who[0]
     job = service.jobs.get(job_id)
     mine = result_folder(service, job_id)

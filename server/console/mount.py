@@ -75,7 +75,7 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
 
 
 def path_below(scope: Scope) -> str:
-    """The path that is asked for, below where the service is mounted (``root_path``)."""
+    """Returns the requested path, below where the service is mounted (``root_path``)."""
     path, root = scope["path"], scope.get("root_path", "")
     below = path.removeprefix(root)
     return below if below == "" or below.startswith("/") else path

@@ -70,7 +70,8 @@ class Cache:
     _forgets: int = 0
 
     def get(self, key: Any, age_s: float, make: MAKE) -> Any:
-        """The value of ``key``, made anew where it is older than ``age_s``. Blocks; raises what ``make`` does."""
+        """Returns the value of ``key``, made anew where it is older than ``age_s``. Blocks; raises what ``make``
+        does."""
         with self._lock:
             key_lock = self._locks.setdefault(key, Lock())
         with key_lock:
@@ -136,11 +137,12 @@ class Page(Element):
         self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
 
     def look(self) -> Mapping[str, object]:
-        """The state document. Runs in a thread."""
+        """Returns the state document. Runs in a thread."""
         raise NotImplementedError
 
     def preloads(self) -> Iterable[tuple[str, str]]:
-        """What the browser is to fetch while it still reads the page: what as (``image``, ``fetch``) and where."""
+        """Returns what the browser is to fetch while it still reads the page: what as (``image``, ``fetch``) and
+        where."""
         return ()
 
     async def refresh(self) -> None:
@@ -270,7 +272,7 @@ def as_problem(error: Exception) -> Problem:
 
 
 async def signed_in() -> Caller | None:
-    """Who opens the page; None where a key is to be asked for first."""
+    """Returns who opens the page; None where a key is to be asked for first."""
     stored = dict(pages.storage.user)
     return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
 
@@ -324,7 +326,7 @@ class Status(TypedDict):
 
 
 def status_of(service: Service, caller: Caller) -> Status | None:
-    """What the frame shows of the service; None where the caller's key is gone."""
+    """Returns what the frame shows of the service; None where the caller's key is gone."""
     if caller_of(service, {"key_id": caller.key}) is None:
         return None
 

@@ -49,7 +49,7 @@ class Removals:
                 timer.start()
 
     def undo(self, identity: str) -> bool:
-        """Whether it was still there to be taken back."""
+        """Tells whether the thing was still there to be taken back."""
         with self._lock:
             removal = self._waiting.pop(identity, None)
         if removal is not None:

@@ -28,7 +28,7 @@ SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 
 def frames(context: WorkerContext, look: int) -> list[LiveFrame]:
-    """One frame a camera; now and then one of them has blur_px."""
+    """Returns one frame a camera; now and then one of them has blur_px."""
     views = context.keep("live", _draw)
     rng = context.keep("noise", np.random.default_rng)
     names = list(views)

@@ -6,7 +6,7 @@ from server.tasks.child import WorkerContext
 
 
 def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
-    """One frame a camera; now and then one of them has blur_px."""
+    """Returns one frame a camera; now and then one of them has blur_px."""
     from server.console import studio_drawing
 
     return studio_drawing.frames(context, look)

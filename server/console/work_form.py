@@ -39,7 +39,7 @@ def template_lines() -> list[TemplateLine]:
 
 
 def chosen_work(event: WorkForm) -> ReconstructionRequest:
-    """Model, preset and template of the form; what is not chosen is the service's default."""
+    """Returns model, preset and template of the form; what is not chosen is the service's default."""
     settings, template = dict(settings_of(event.get("method"))), event.get("template")
     if template:
         settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}

@@ -112,7 +112,7 @@ class Calibrations:
         )
 
     def find(self) -> list[Calibration]:
-        """Newest first."""
+        """Lists ids, newest first."""
         found = []
         for identity in self._store.ids("calibrations"):
             with suppress(NotFound):  # removed since they were listed, or damaged
@@ -131,7 +131,7 @@ class Calibrations:
         return self._store.folder("calibrations", identity) / "result" / name
 
     def file(self, identity: str, name: str) -> StoredFile:
-        """The same, with its sha256."""
+        """Returns a file of a calibration that succeeded, with its sha256."""
         path = self.result(identity, name)
         return StoredFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
 

@@ -50,7 +50,7 @@ class CaptureMetadata:
 
     @classmethod
     def of(cls, fields: Mapping[str, str | None]) -> "CaptureMetadata":
-        """From a form, in which commas stand between tags. Raises InputError."""
+        """Reads the fields of a form, in which commas stand between tags. Raises InputError."""
         tags = typed_tags(fields.get("tags") or "")
         return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "", tags)
 
@@ -124,7 +124,7 @@ class Captures:
         return self._add(folder / "capture", "upload", content, about)
 
     def archive_limits(self, archive: Path) -> ArchiveLimits:
-        """What an archive may unpack to. Raises DiskFull where there is no room for it."""
+        """Returns what an archive may unpack to. Raises DiskFull where there is no room for it."""
         self._store.reserve(archive.stat().st_size, self._settings.free_bytes)
         s = self._settings
         return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
@@ -135,7 +135,7 @@ class Captures:
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[CaptureRecord]:
-        """The captures with these ids, in their order, those of them that there are."""
+        """Returns the captures with these ids, in their order, those of them that there are."""
         found = []
         for identity in ids:
             with suppress(NotFound):  # removed since the index was asked, or damaged
@@ -148,8 +148,8 @@ class Captures:
     def edit(
         self, identity: str, changes: Mapping[str, str | None], *, tags: Sequence[str] | None = None
     ) -> CaptureRecord:
-        """Another label, expression or session, or other ``tags``; what is not given stays. Raises NotFound, and
-        InputError for texts and tags that cannot be."""
+        """Changes label, expression, session or ``tags``; what is left out stays. Raises NotFound, and InputError for
+        texts and tags that cannot be."""
         check_texts({name: changes.get(name) for name in ("label", "expression")})
         checked = None if tags is None else checked_tags(tags)
         if changes.get("session") is not None:
@@ -180,7 +180,7 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def tags(self, limit: int = 200) -> list[str]:
-        """The tags that captures bear, the most frequent first."""
+        """Returns the tags that captures bear, the most frequent first."""
         return self._library.tags(limit)
 
     def image(self, identity: str, kind: str, camera: str) -> StoredFile:
@@ -195,7 +195,8 @@ class Captures:
         raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))
 
     def features(self, identity: str) -> Points:
-        """The stored feature points, by point and camera. Raises NotFound, also where their file is gone or damaged."""
+        """Returns the stored feature points, by point and camera. Raises NotFound, also where their file is gone or
+        damaged."""
         if not self._store.capture(identity).features:
             return {}
         path = self._store.folder("captures", identity) / "files" / "features.json"
@@ -223,7 +224,7 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def check_unused(self, identity: str) -> CaptureRecord:
-        """The record of a capture that no job needs. Raises Conflict."""
+        """Returns the record of a capture that no job needs. Raises Conflict."""
         record = self._store.capture(identity)
         if active := self._jobs.active(capture=identity):
             detail = compose("capture-in-use")
@@ -236,7 +237,7 @@ class Captures:
         self._store.remove_capture(identity)
 
     def holdings(self, identity: str) -> Holdings:
-        """What a removal would take and what would stay. Raises NotFound."""
+        """Returns what a removal would take and what would stay. Raises NotFound."""
         return holdings(self._store, self._jobs, identity)
 
     def erase(self, identity: str) -> None:
@@ -297,13 +298,13 @@ class Captures:
 
 
 def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
-    """The faults in a real rig's certificate; the simulated studio's pictures are judged as uploads are."""
+    """Returns the faults in a real rig's certificate; the simulated studio's pictures are judged as uploads are."""
     if shot is None or "checks" not in shot:
         return ()
     return tuple(read_fault(document) for document in cast(ShotDocument, shot)["faults"])
 
 
 def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
-    """What the shot and the check of its files measured of each camera."""
+    """Returns what the shot and the check of its files measured of each camera."""
     taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
     return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

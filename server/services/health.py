@@ -86,7 +86,7 @@ def _records(service: Service) -> Check:
 
 
 def exposition(service: Service) -> bytes:
-    """The metrics of this moment, in Prometheus' text format."""
+    """Returns the metrics of this moment, in Prometheus' text format."""
     jobs = service.jobs.counts()
     captures, damaged = len(service.store.ids("captures")), len(service.store.list_quarantined())
     return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)

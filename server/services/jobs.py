@@ -156,7 +156,7 @@ class Jobs:
         return self._jobs([self._known(job_id)])[0]
 
     def webhook(self, job_id: str) -> JobWebhook | None:
-        """The job's own, if it was given one. Raises NotFound."""
+        """Returns the job's own, if it was given one. Raises NotFound."""
         return (_request(self._known(job_id)) or {}).get("webhook")
 
     def state(self, job_id: str) -> str:
@@ -171,7 +171,7 @@ class Jobs:
         limit: int = 100,
         offset: int = 0,
     ) -> list[Job]:
-        """Newest first."""
+        """Lists ids, newest first."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
@@ -187,26 +187,26 @@ class Jobs:
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[Job]:
-        """The jobs with these ids, in their order, those of them that there are."""
+        """Returns the jobs with these ids, in their order, those of them that there are."""
         if not ids:
             return []
         known = {row.workflow_id: row for row in self.client.list_workflows(name=WORKFLOW, workflow_ids=list(ids))}
         return self._jobs([known[job_id] for job_id in ids if job_id in known])
 
     def counts(self) -> dict[str, int]:
-        """Jobs by state."""
+        """Counts jobs by state."""
         counts = dict.fromkeys(dict.fromkeys(STATES.values()), 0)
         for status, count in self.index.counts().items():
             counts[STATES[status]] += count
         return counts
 
     def of_captures(self, captures: Collection[str]) -> dict[str, list[tuple[str, str]]]:
-        """Id and state of every job of some captures, newest first."""
+        """Returns the id and state of every job of some captures, newest first."""
         found = self.index.of_captures(captures)
         return {capture: [(job.id, STATES[job.status]) for job in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
-        """Ids of queued and running jobs."""
+        """Lists the ids of queued and running jobs."""
         wanted = {k: v for k, v in {"capture": capture, "session": session, "key": key}.items() if v is not None}
         rows = self.client.list_workflows(
             name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False
@@ -224,7 +224,8 @@ class Jobs:
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
-        """Size and sha256 of the files of a result, by name. Raises NotFound, and Conflict without a result."""
+        """Returns the size and sha256 of the files of a result, by name. Raises NotFound, and Conflict without a
+        result."""
         job = self.get(job_id)
         if job.state != "succeeded":
             raise Conflict("no-result", compose("job-without-result", state=job.state))
@@ -233,7 +234,7 @@ class Jobs:
         return job.files
 
     def log(self, job_id: str) -> str:
-        """What its workers said of the job. Raises NotFound."""
+        """Returns what its workers said of the job. Raises NotFound."""
         self.state(job_id)
         try:
             return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
@@ -241,7 +242,7 @@ class Jobs:
             raise NotFound(compose("thing-job-log"), job_id, compose("hint-not-begun")) from error
 
     def without_result(self) -> list[str]:
-        """Ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
+        """Lists the ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
         there = set(self._store.ids("jobs"))
         done = self.index.newest_first(STATUSES["succeeded"])
         return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
@@ -311,7 +312,7 @@ class Jobs:
         return compose("no-worker", queue=f"{queue!r}", queue_name=str(queue))
 
     def worker_may_start(self) -> bool:
-        """Whether the service is so young that its worker may still be loading."""
+        """Tells whether the service is so young that its worker may still be loading."""
         return time.monotonic() - self._began < WORKER_START_S
 
     def _status(self, job_id: str, load: bool = True) -> WorkflowStatus | None:

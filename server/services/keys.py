@@ -70,7 +70,7 @@ class Keys:
         return f"eh_{identity}_{secret}"
 
     def all(self) -> list[ApiKey]:
-        """Oldest first."""
+        """Lists keys, oldest first."""
         with self._engine.connect() as connection:
             rows = connection.execute(sa.select(api_keys).order_by(api_keys.c.created))
             return [ApiKey(r.id, r.name, tuple(r.scopes.split()), r.created) for r in rows]
@@ -86,7 +86,7 @@ class Keys:
             return connection.scalar(sa.select(sa.exists(sa.select(api_keys.c.id)))) or False
 
     def caller(self, token: str) -> Caller | None:
-        """Whose key ``token`` is; None if nobody's."""
+        """Returns whose key ``token`` is; None if nobody's."""
         parts = token.split("_", 2)
         if len(parts) != 3 or parts[0] != "eh":
             return None

@@ -45,5 +45,5 @@ PRESETS = (
 
 
 def settings_of(preset: str | None) -> Mapping[str, object]:
-    """The settings of a preset by its id; those of Standard for None and for what is none."""
+    """Returns the settings of a preset by its id; those of Standard for None and for an unknown id."""
     return next((known.settings for known in PRESETS if known.id == (preset or "")), {})

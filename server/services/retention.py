@@ -37,7 +37,7 @@ def clear_caches(service: Service) -> int:
 
 
 def sweep(service: Service) -> dict[str, int]:
-    """One sweep; returns how many of each kind went."""
+    """Makes one sweep. Returns how many of each kind went."""
     gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
@@ -63,7 +63,8 @@ class Upcoming:
 
 
 def upcoming(service: Service, limit: int = 10) -> list[Upcoming]:
-    """What would go next if nothing came and nobody asked for it, jobs first. Captures that a job needs wait for it."""
+    """Returns what would go next if nothing came and nobody asked for it, jobs first. Captures that a job needs wait
+    for it."""
     return [*_jobs_next(service, limit), *_captures_next(service, limit)]
 
 

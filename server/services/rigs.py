@@ -54,7 +54,7 @@ class RigBackend(Protocol):
         ...
 
     def look(self) -> Mapping[str, ImageRgb]:
-        """What all cameras see now; one that shows nothing is absent. Raises Unavailable."""
+        """Returns what all cameras see now; one that shows nothing is absent. Raises Unavailable."""
         ...
 
     def preview(self, camera: str) -> bytes:
@@ -62,27 +62,28 @@ class RigBackend(Protocol):
         ...
 
     def camera_settings(self, camera: str) -> CameraSettings:
-        """Exposure, gain and white balance as asked for. Raises NotFound."""
+        """Returns the requested exposure, gain and white balance. Raises NotFound."""
         ...
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
-        """Other settings from now on; a rig that is open is opened anew. Raises NotFound, InputError, Conflict."""
+        """Applies other settings from now on; a rig that is open is opened anew. Raises NotFound, InputError,
+        Conflict."""
         ...
 
     def lights(self) -> tuple[int, ...]:
-        """The light outputs that are on during a shot."""
+        """Returns the light outputs that are on during a shot."""
         ...
 
     def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
-        """Other lamps from now on. Raises InputError, Conflict."""
+        """Switches to other lamps from now on. Raises InputError, Conflict."""
         ...
 
     def take_background(self) -> CleanPlates:
-        """New clean plates of the empty studio. Raises Unavailable, and Conflict where they show somebody."""
+        """Takes new clean plates of the empty studio. Raises Unavailable, and Conflict where they show somebody."""
         ...
 
     def plates(self) -> list[PlatesVersion]:
-        """The clean plates that are kept, newest first."""
+        """Returns the clean plates that are kept, newest first."""
         ...
 
     def use_plates(self, version: str) -> None:
@@ -111,7 +112,7 @@ class SimulatedRig:
         return _state("simulated", "simulated", cameras, [], calibrated)
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
-        """The studio has no board to show: its pictures are of a person all the same."""
+        """Photographs a person all the same: the studio has no board to show."""
         with self._one_at_a_time:
             try:
                 shot = self._child.remote(simulated)(folder=str(folder), seed=seed)
@@ -147,7 +148,7 @@ class SimulatedRig:
         raise fixed_studio()
 
     def take_background(self) -> CleanPlates:
-        """The studio takes clean plates with every shot; there is nothing to keep."""
+        """Returns nothing: the studio takes clean plates with every shot."""
         return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
 
     def plates(self) -> list[PlatesVersion]:
@@ -364,7 +365,7 @@ def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
 
 
 def reduced(image: ImageRgb, width: int) -> ImageRgb:
-    """The image, made smaller where it is wider than ``width``."""
+    """Returns the image, made smaller where it is wider than ``width``."""
     if image.shape[1] <= width:
         return image
     size = (width, max(1, round(image.shape[0] * width / image.shape[1])))

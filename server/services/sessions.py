@@ -45,7 +45,7 @@ class Sessions:
         *,
         tag: str | None = None,
     ) -> Found[Subject]:
-        """People, by the names of their sessions; ``tag``: those with a capture that bears it. Raises
+        """Returns people, by the names of their sessions; ``tag``: those with a capture that bears it. Raises
         InputError for a cursor of another list."""
         page = self._library.subjects(sought, order, limit, cursor, tag)
         captures = self._library.captures_of([session for sessions in page.subjects for session in sessions])
@@ -61,7 +61,7 @@ class Sessions:
         return Found(tuple(found), page.next, page.total)
 
     def captures_of_subject(self, session: str | None) -> list[str]:
-        """Ids of the captures of all sessions that bear the name of this one; none without a session."""
+        """Lists the ids of the captures of all sessions that bear the name of this one; none without a session."""
         if session is None or (record := self._record(session)) is None:
             return []
         sessions = self._library.sessions_of(subject_of(record))

@@ -87,7 +87,8 @@ class StorageCount:
 
 
 def count(data: Path) -> tuple[KindOfUse, ...]:
-    """Bytes of all files, by kind; "other" is what else lies in the folder, the database and models among it."""
+    """Counts the bytes of all files, by kind; "other" is what else lies in the folder, the database and models among
+    it."""
     known = {folder for folders in KINDS.values() for folder in folders}
     found = []
     for kind, folders in KINDS.items():

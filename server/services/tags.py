@@ -13,8 +13,8 @@ UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # Unicode's classes of cont
 
 
 def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
-    """The tags in one spelling (NFC, single blanks), each once whatever its case, in their order. Raises InputError
-    naming every fault."""
+    """Returns the tags in one spelling (NFC, single blanks), each once whatever its case, in their order. Raises
+    InputError naming every fault."""
     found: dict[str, str] = {}
     faults = []
     for number, tag in enumerate(tags, start=1):
@@ -37,5 +37,5 @@ def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
 
 
 def typed_tags(text: str) -> tuple[str, ...]:
-    """Tags as a person types them, with commas between. Raises InputError."""
+    """Reads tags as a person types them, with commas between. Raises InputError."""
     return checked_tags(tag for tag in text.split(SEPARATOR) if tag.strip())

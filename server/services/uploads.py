@@ -50,7 +50,7 @@ class ResumableUploads:
         raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
-        """Bytes that are here; all of them once the capture was made and the data let go."""
+        """Counts the bytes that are here; all of them once the capture was made and the data let go."""
         if record.capture is not None:
             return record.length
         return self.data(record).stat().st_size

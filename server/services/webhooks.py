@@ -40,7 +40,8 @@ class Webhooks:
         self._engine, self._origins = engine, origins
 
     def add(self, url: str) -> NewWebhook:
-        """The new webhook with its secret, which is shown this once. Raises InvalidInput for what is no web address."""
+        """Adds a webhook. Returns it with its secret, which is shown this once. Raises InvalidInput for what is no web
+        address."""
         parsed(url)
         secret = "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode()
         made = NewWebhook(secrets.token_hex(14), url, secret)

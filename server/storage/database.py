@@ -118,7 +118,7 @@ webhooks = sa.Table(
 
 
 def open_database(settings: ServiceSettings) -> sa.Engine:
-    """An engine on the service's database, with its tables made. Raises DatabaseUnavailable."""
+    """Returns an engine on the service's database, with its tables made. Raises DatabaseUnavailable."""
     url = sa.make_url(settings.url)
     if url.get_backend_name() == "sqlite":
         file = Path(str(url.database))
@@ -175,7 +175,7 @@ def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElemen
 
 
 def now_sql(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:
-    """Seconds since 1970 on the database's clock."""
+    """Returns the seconds since 1970 on the database's clock."""
     if engine.dialect.name == "sqlite":
         return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float)
     return sa.literal_column("extract(epoch from clock_timestamp())", sa.Float)

@@ -44,7 +44,7 @@ class EventLog:
             return [JobEvent(row.seq, row.at, json.loads(row.document)) for row in connection.execute(query)]
 
     def latest(self, job_ids: list[str]) -> dict[str, JobEvent]:
-        """The newest progress event of each job that has one."""
+        """Returns the newest progress event of each job that has one."""
         newest = sa.select(events.c.job_id, sa.func.max(events.c.seq).label("seq")).where(events.c.job_id.in_(job_ids))
         newest = newest.group_by(events.c.job_id).subquery()
         query = sa.select(events).join(

@@ -95,14 +95,14 @@ class JobIndex:
             return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def counts(self) -> dict[str, int]:
-        """Jobs by the engine's status."""
+        """Counts jobs by the engine's status."""
         status = self._status.c
         query = sa.select(status.status, sa.func.count()).where(status.name == self._workflow).group_by(status.status)
         with self._engine.connect() as connection:
             return {row[0]: row[1] for row in connection.execute(query)}
 
     def newest_first(self, statuses: Sequence[str]) -> list[str]:
-        """Ids of all jobs with one of the engine's statuses."""
+        """Lists the ids of all jobs with one of the engine's statuses."""
         status = self._status.c
         query = sa.select(status.workflow_uuid).where(status.name == self._workflow, status.status.in_(statuses))
         with self._engine.connect() as connection:

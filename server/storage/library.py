@@ -99,7 +99,7 @@ class Library:
             return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def captures_of(self, sessions: Collection[str]) -> dict[str, list[str]]:
-        """Ids of the captures of some sessions, newest first."""
+        """Lists the ids of the captures of some sessions, newest first."""
         found: dict[str, list[str]] = {session: [] for session in sessions}
         query = sa.select(capture_index.c.session, capture_index.c.id).order_by(capture_index.c.id.desc())
         with self._engine.connect() as connection:
@@ -109,14 +109,14 @@ class Library:
         return found
 
     def tags(self, limit: int) -> list[str]:
-        """The tags that captures bear, those of most captures first."""
+        """Returns the tags that captures bear, those of most captures first."""
         table = capture_tags.c
         query = sa.select(sa.func.min(table.name, type_=sa.Text())).group_by(table.folded)
         with self._engine.connect() as connection:
             return [*connection.scalars(query.order_by(sa.func.count().desc(), table.folded).limit(limit))]
 
     def tags_of(self, captures: Collection[str]) -> dict[str, list[str]]:
-        """The tags of some captures, by capture."""
+        """Returns the tags of some captures, by capture."""
         found: dict[str, list[str]] = {}
         query = sa.select(capture_tags.c.capture_id, capture_tags.c.name).order_by(capture_tags.c.folded)
         with self._engine.connect() as connection:
@@ -126,19 +126,19 @@ class Library:
         return found
 
     def heads_of(self, session: str) -> list[str]:
-        """Ids of a session's captures that show a head, newest first."""
+        """Lists the ids of a session's captures that show a head, newest first."""
         table = capture_index.c
         query = sa.select(table.id).where(table.session == session, table.board.is_(False)).order_by(table.id.desc())
         with self._engine.connect() as connection:
             return [*connection.scalars(query)]
 
     def sessions_of(self, subject: str) -> list[str]:
-        """Ids of a person's sessions; ``subject`` as of ``subject_of``."""
+        """Lists the ids of a person's sessions; ``subject`` as of ``subject_of``."""
         with self._engine.connect() as connection:
             return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
 
     def sessions(self, sought: str, limit: int, cursor: str | None = None) -> CursorPage:
-        """Newest first. Raises InputError for a cursor of another list."""
+        """Lists ids, newest first. Raises InputError for a cursor of another list."""
         rows = sa.select().select_from(session_index)
         for word in words_of(sought):
             rows = rows.where(sessions_with(word))
@@ -149,8 +149,9 @@ class Library:
     def subjects(
         self, sought: str, order: SubjectOrder, limit: int, cursor: str | None = None, tag: str | None = None
     ) -> SubjectPage:
-        """Sessions of one name are one person's; one without a name is somebody by itself. A subject is as new as its
-        newest session; ``tag``: those with a capture that bears it. Raises InputError for a cursor of another list."""
+        """Lists subjects: sessions of one name are one person's; one without a name is somebody by itself. A subject is
+        as new as its newest session; ``tag``: those with a capture that bears it. Raises InputError for a cursor of
+        another list."""
         table = session_index.c
         newest, name = (
             sa.func.max(table.id).label("newest"),
@@ -242,17 +243,17 @@ def captures_with(word: str) -> sa.ColumnElement[bool]:
 
 
 def tagged(tag: str) -> sa.Select:
-    """Ids of the captures that bear a tag, in whatever case."""
+    """Lists the ids of the captures that bear a tag, in whatever case."""
     return sa.select(capture_tags.c.capture_id).where(capture_tags.c.folded == folded(tag))
 
 
 def sessions_with(word: str) -> sa.ColumnElement[bool]:
-    """Of sessions that a word of a search stands in."""
+    """Returns the condition for sessions that a word of a search stands in."""
     return sa.or_(contains(session_index.c.words, word), is_or_ends(session_index.c.id, word))
 
 
 def subject_of(record: SessionRecord) -> str:
-    """What sessions of one person have alike: their name; one without a name stands by itself."""
+    """Returns what sessions of one person have alike: their name; one without a name stands by itself."""
     return folded(record.label).strip() or record.id
 
 

@@ -44,7 +44,8 @@ class Order:
         return tuple(column.desc() if self.descending else column.asc() for column in columns)
 
     def after(self, cursor: str) -> sa.ColumnElement[bool]:
-        """Of the rows that come after a cursor. Raises InputError for what is no cursor of such a list."""
+        """Returns the condition for rows that come after a cursor. Raises InputError for what is no cursor of such a
+        list."""
         place = place_of(cursor)
         if isinstance(place.value, str) != isinstance(self.column.type, sa.String):
             raise no_cursor()
@@ -71,7 +72,7 @@ def cursor_of(value: Value, identity: str, total: int) -> str:
 
 
 def place_of(cursor: str) -> Place:
-    """What a cursor names. Raises InputError."""
+    """Returns what a cursor names. Raises InputError."""
     try:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         text = f"{value}{identity}".encode()  # half of a surrogate pair is JSON and nothing that a database takes
@@ -95,8 +96,8 @@ def no_cursor() -> InputError:
 def page_of(
     connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
 ) -> CursorPage:
-    """One page of ``rows``, which select nothing yet. ``searched``: finding the rows is what takes long, so that they
-    are counted as they are found. Raises InputError."""
+    """Returns one page of ``rows``, which select nothing yet. ``searched``: finding the rows is what takes long, so
+    that they are counted as they are found. Raises InputError."""
     wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
     if cursor is not None:
         total, wanted = place_of(cursor).total, wanted.where(order.after(cursor))
@@ -113,17 +114,17 @@ def page_of(
 
 
 def words_of(sought: str) -> Sequence[str]:
-    """The words of a search, which must all be found."""
+    """Returns the words of a search, which must all be found."""
     return folded(sought).split()[:WORDS_MOST]
 
 
 def folded(*texts: str | None) -> str:
-    """What searches compare: without case, and without what PostgreSQL keeps in no text."""
+    """Returns what searches compare: without case, and without what PostgreSQL keeps in no text."""
     return storable(" ".join(text for text in texts if text)).casefold()
 
 
 def storable(text: str) -> str:
-    """Without NUL, which PostgreSQL keeps in no text; records of earlier versions may have it."""
+    """Removes NUL, which PostgreSQL keeps in no text; records of earlier versions may have it."""
     return text.replace("\0", "")
 
 
@@ -132,5 +133,6 @@ def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]
 
 
 def is_or_ends(identity: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
-    """Of rows whose id is ``word`` or ends with it, as pages shorten ids; a short word stands in too many ids."""
+    """Returns the condition for rows whose id is ``word`` or ends with it, as pages shorten ids; a short word stands in
+    too many ids."""
     return identity.endswith(word, autoescape=True) if len(word) >= ID_LEAST else sa.false()

@@ -178,7 +178,7 @@ _CHECKS = TypeAdapter(dict[str, _View])
 
 
 def read_checks(document: Any) -> dict[str, ViewDocument]:
-    """What a ``checks.json`` says by camera. Raises ValueError for what is none."""
+    """Returns what a ``checks.json`` says by camera. Raises ValueError for what is none."""
     _CHECKS.validate_python(document)
     return document
 

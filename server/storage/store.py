@@ -103,7 +103,7 @@ class Store:
         return self.data / kind / identity
 
     def ids(self, kind: str) -> list[str]:
-        """Newest first."""
+        """Lists ids, newest first."""
         with suppress(FileNotFoundError):
             names = (entry.name.removesuffix(".json") for entry in os.scandir(self.data / kind))
             return sorted((name for name in names if is_id(name)), reverse=True)
@@ -134,7 +134,7 @@ class Store:
         self._tell(record)
 
     def found(self, kind: str, identity: str) -> CaptureRecord | SessionRecord | None:
-        """The record of a capture or session ("captures", "sessions"), if it is there and whole."""
+        """Returns the record of a capture or session ("captures", "sessions"), if it is there and whole."""
         with suppress(NotFound):
             return self.capture(identity) if kind == "captures" else self.session(identity)
         return None
@@ -161,7 +161,7 @@ class Store:
             self._index.put_session(record, self._record_path("sessions", record.id).stat().st_mtime_ns)
 
     def capture(self, identity: str) -> CaptureRecord:
-        """The record of a capture. Raises NotFound."""
+        """Returns the record of a capture. Raises NotFound."""
         path = self.folder("captures", identity) / "record.json"
         record = self._read(path, CAPTURE, path.parent)
         if record is None:
@@ -169,7 +169,7 @@ class Store:
         return record
 
     def calibration(self, identity: str) -> CalibrationRecord:
-        """The record of a calibration. Raises NotFound."""
+        """Returns the record of a calibration. Raises NotFound."""
         path = self.folder("calibrations", identity) / "record.json"
         record = self._read(path, CALIBRATION, path.parent)
         if record is None:
@@ -181,7 +181,7 @@ class Store:
         write_atomically(folder / "checks.json", _encoded(checks))
 
     def checks(self, identity: str) -> dict[str, ViewDocument]:
-        """What was measured of a capture's pictures, by camera; nothing of one of an earlier version, or where
+        """Returns what was measured of a capture's pictures, by camera; nothing of one of an earlier version, or where
         the file is damaged. Raises NotFound."""
         with suppress(FileNotFoundError, ValueError, RecursionError):
             return read_checks(json.loads((self.folder("captures", identity) / "checks.json").read_bytes()))
@@ -189,7 +189,7 @@ class Store:
         return {}
 
     def captures(self) -> Iterator[CaptureRecord]:
-        """The records of all captures, newest first."""
+        """Yields the records of all captures, newest first."""
         for identity in self.ids("captures"):
             folder = self.data / "captures" / identity
             record = self._read(folder / "record.json", CAPTURE, folder)
@@ -252,7 +252,7 @@ class Store:
                 self._index.drop_session(identity)
 
     def session(self, identity: str) -> SessionRecord:
-        """The record of a session. Raises NotFound."""
+        """Returns the record of a session. Raises NotFound."""
         path = self.folder("sessions", identity).with_suffix(".json")
         record = self._read(path, SESSION, path)
         if record is None:

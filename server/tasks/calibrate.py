@@ -25,8 +25,8 @@ of the work corrects. Matching goes by pairs, so that more of them take longer."
 
 
 def expected(folder: Path) -> dict[str, float]:
-    """Seconds of each stage of a calibration, before it has begun: larger pictures take longer, which its own pace soon
-    tells."""
+    """Returns the seconds of each stage of a calibration, before it has begun: larger pictures take longer, which its
+    own pace soon tells."""
     pictures = sum(path.is_file() for path in (folder / "images").rglob("*"))
     if not is_of_board(folder):
         return {stage: took * pictures for stage, took in SCENE_STAGES_S.items()}

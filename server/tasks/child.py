@@ -60,7 +60,7 @@ class WorkerContext:
         self._things: dict[str, object] = {}
 
     def keep(self, name: str, make: Callable[[], Any]) -> Any:
-        """The thing called ``name``; ``make`` may return a context manager, which is entered."""
+        """Returns the thing called ``name``; ``make`` may return a context manager, which is entered."""
         if name not in self._things:
             thing: Any = make()
             self._things[name] = self._stack.enter_context(thing) if hasattr(thing, "__exit__") else thing
@@ -254,8 +254,8 @@ def _reporter(connection: Connection, stop: threading.Event) -> Progress:
 
 
 def function_at(address: str) -> Callable[..., Any]:
-    """The function that "module:name" names. A module that begins with a dot lies in the package ``server``, whatever
-    that is called where the code runs."""
+    """Returns the function that "module:name" names. A module that begins with a dot lies in the package ``server``,
+    whatever that is called where the code runs."""
     module, _, name = address.partition(":")
     return getattr(importlib.import_module(module, SERVER), name)
 

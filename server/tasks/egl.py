@@ -5,7 +5,7 @@ from server.tasks.child import WorkerContext
 
 
 def try_egl(context: WorkerContext, report: Progress) -> str:
-    """The name of the GL device. Raises the renderer's own error."""
+    """Returns the name of the GL device. Raises the renderer's own error."""
     from rig.render.context import GlContext  # without the renderer's NumPy: half the time
 
     gl = GlContext()

@@ -146,7 +146,8 @@ def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportW
 def ingest_folder(
     context: WorkerContext, report: Progress, *, folder: str, image_pixels: int, measured: bool = False
 ) -> CaptureContent:
-    """The same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was taken."""
+    """Returns the same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was
+    taken."""
     return check_capture(Path(folder), image_pixels, report, measured=measured)
 
 
@@ -175,8 +176,8 @@ def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image
 def check_capture(
     root: Path, image_pixels: int, report: Progress, *, measured: bool = False, strays_pass: bool = False
 ) -> CaptureContent:
-    """What a capture folder holds; pictures of no camera are faults unless ``strays_pass``. Raises InputError naming
-    every fault."""
+    """Returns what a capture folder holds; pictures of no camera are faults unless ``strays_pass``. Raises InputError
+    naming every fault."""
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", [NO_RIG])

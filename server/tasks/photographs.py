@@ -56,7 +56,7 @@ class Prepared:
 
 
 def photographs_alone(folder: Path) -> bool:
-    """Whether a capture folder has photographs and no cameras."""
+    """Tells whether a capture folder has photographs and no cameras."""
     root = capture_root(folder)
     if find_rig_file(root) is not None:
         return False
@@ -134,8 +134,8 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
 
 
 def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -> tuple[ReportWarning, ...] | None:
-    """What was said when the cameras beside it were found, as ``calibrate_photographs`` left it; None where they were
-    not found from photographs, or not from those of ``made_of``."""
+    """Returns what was said when the cameras beside it were found, as ``calibrate_photographs`` left it; None where
+    they were not found from photographs, or not from those of ``made_of``."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
         same = made_of is None or document["made_of"] == made_of

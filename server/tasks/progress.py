@@ -50,7 +50,7 @@ class JobProgress:
         self._fraction = min(1.0, max(0.0, fraction))
 
     def finish(self) -> dict[str, float]:
-        """Seconds of every stage."""
+        """Returns the seconds of every stage."""
         self._close()
         self.stage = self._visit = ""
         return self.seconds

@@ -51,14 +51,14 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
 
 
 def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
-    """The certificate of a simulated shot: every picture is of one moment."""
+    """Returns the certificate of a simulated shot: every picture is of one moment."""
     cameras: dict[str, SimulatedSync] = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
     faults = [f.kind if f.camera is None else f"{f.kind} in {f.camera}" for f in taken.faults]
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
 
 
 def look(context: WorkerContext, report: Progress, *, cameras: list[str]) -> dict[str, np.ndarray]:
-    """What cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
+    """Returns what cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
     from pipeline.eigenheads.model import load_model
     from rig.render.renderer import Renderer
     from rig.studio.scene.layout import default_layout

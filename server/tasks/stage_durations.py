@@ -36,12 +36,12 @@ LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
 
 
 def kind_of(settings: Settings) -> str:
-    """What decides which stages a job has and how long they are: "contour photo both", say."""
+    """Returns what decides which stages a job has and how long they are: "contour photo both", say."""
     return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}"
 
 
 def first_guess(settings: Settings) -> dict[str, float]:
-    """Seconds of the stages that a job with these settings has, before one was seen."""
+    """Returns the seconds of the stages that a job with these settings has, before one was seen."""
     photographs = settings.method == "contour" and settings.detail in PHOTO_LEVELS
     fine, bust = photographs and settings.detail in FINE_LEVELS, settings.outputs.surface != "head"
     parts = settings.detail in PHOTO_LEVELS or bust
@@ -61,8 +61,8 @@ def first_guess(settings: Settings) -> dict[str, float]:
 
 
 def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
-    """Seconds that a second of the first guess takes on this machine, by the kinds of jobs that it has done; 1 where
-    there is none."""
+    """Returns the seconds that a second of the first guess takes on this machine, by the kinds of jobs that it has
+    done; 1 where there is none."""
     took = guessed = 0.0
     for kind, stages in learnt.items():
         simplex = kind.startswith("simplex")
@@ -81,8 +81,8 @@ class StageDurations:
         self._learnt: dict[str, dict[str, float]] = {}
 
     def of(self, settings: Settings) -> dict[str, float]:
-        """Seconds by stage, in their order. The first job of a kind goes by the guess, at the pace of the other kinds
-        that this machine has done."""
+        """Returns the seconds by stage, in their order. The first job of a kind goes by the guess, at the pace of the
+        other kinds that this machine has done."""
         learnt, guess = self._read(), first_guess(settings)
         known = learnt.get(kind_of(settings))
         if known is None:

@@ -34,7 +34,7 @@ ARCHIVE = ".zip, .tar or .tar.gz"
 
 
 def described_form(file: str, fields: Iterable[str], **described: str) -> JsonObject:
-    """OpenAPI's word for a multipart body of one file, text ``fields``, and further ones with a description."""
+    """Returns OpenAPI's word for a multipart body of one file, text ``fields``, and further ones with a description."""
     texts: dict[str, dict[str, str]] = {name: {"type": "string"} for name in fields}
     texts |= {name: {"type": "string", "description": text} for name, text in described.items()}
     properties = {"file": {"type": "string", "format": "binary", "description": file}} | texts

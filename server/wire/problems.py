@@ -127,7 +127,7 @@ class Problem(EigenheadError):
 
 
 def problem_from(error: Exception) -> Problem:
-    """The problem that an error is; what nobody foresaw is a 500 that says so without its inside."""
+    """Returns the problem that an error is; what nobody foresaw is a 500 that says so without its inside."""
     if isinstance(error, Problem):
         return error
     if isinstance(error, InputError):
@@ -183,7 +183,7 @@ def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
 
 
 def documented(*statuses: int) -> Responses:
-    """The ``responses`` of a route that may refuse with these statuses."""
+    """Returns the ``responses`` of a route that may refuse with these statuses."""
     body = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     every = {401, 403, 422, 429, 500, 503, *statuses}
     return {status: {"description": HTTPStatus(status).phrase, "content": body} for status in sorted(every)}

@@ -48,7 +48,7 @@ def send_file(request: Request, file: StoredFile) -> Response:
 def send_archive(
     request: Request, folder: Path, files: Mapping[str, FileEntry], name: str | None = "result.zip"
 ) -> Response:
-    """The named files below ``folder`` as a .zip, stored and without times: the same files are the same bytes.
+    """Packs the named files below ``folder`` as a .zip, stored and without times: the same files are the same bytes.
     ``name``: what a browser saves it as; None leaves that to the page's link."""
     digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
     headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}

@@ -7,7 +7,8 @@ from server.storage.database import now_sql, workers
 
 
 def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:
-    """Ids of workers that stopped, whose process is gone from this machine, or that are silent for ``silent_s``."""
+    """Lists the ids of workers that stopped, whose process is gone from this machine, or that are silent for
+    ``silent_s``."""
     machine = process_identity()[0]
     with engine.connect() as connection:
         silent = (workers.c.seen < now_sql(connection) - silent_s).label("silent")

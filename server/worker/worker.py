@@ -202,7 +202,7 @@ class Worker:
         return name
 
     def calibrate(self, identity: str) -> CalibrationOutcome:
-        """One calibration, written under a temporary name and renamed."""
+        """Computes one calibration, written under a temporary name and renamed."""
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
@@ -320,7 +320,7 @@ class Worker:
 
 
 def warnings_of(report: Path) -> list[MessageDocument]:
-    """The warnings of a result's report.json."""
+    """Returns the warnings of a result's report.json."""
     try:
         return json.loads(report.read_bytes())["warnings"]
     except (OSError, ValueError, KeyError, TypeError):  # no result, or another kind of work
@@ -348,7 +348,7 @@ class _StateWatch:
 
 
 def described(folder: Path) -> dict[str, FileEntry]:
-    """Size and sha256 of every file below ``folder``, by relative name."""
+    """Returns the size and sha256 of every file below ``folder``, by relative name."""
     files: dict[str, FileEntry] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as stream:
