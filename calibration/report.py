@@ -73,7 +73,7 @@ def _checks(calibration: Calibration) -> str:
 
 
 def listed(title: str, lines: Iterable[Message | str]) -> str:
-    """A headed list, or nothing."""
+    """Returns a headed list, or nothing."""
     items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
     return f"<h2>{title}</h2><ul>{items}</ul>" if items else ""
 

@@ -49,7 +49,7 @@ class CameraFigures(TypedDict):
 
 
 class Figures(TypedDict):
-    """The numbers of ``calibrate --json``."""
+    """Holds the numbers of ``calibrate --json``."""
 
     rms_px: float
     used_share: float
@@ -102,7 +102,7 @@ class CalibrationDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A calibrated rig with its evidence.
+    """Holds a calibrated rig with its evidence.
 
     ``rig`` has per-camera pose covariances in the gauge of ``calibration.adjustment.gauge``; ``pose_covariance`` is the
     joint one of all cameras' left perturbations (rad, mm) in that gauge, with what the uncertainty of the lenses adds

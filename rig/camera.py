@@ -159,8 +159,8 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraStack:
-    """Several cameras that look at the same point, as arrays: what ``Camera`` does to many points of one camera, this
-    does to one point in many cameras."""
+    """Holds several cameras that look at the same point, as arrays: what ``Camera`` does to many points of one camera,
+    this does to one point in many cameras."""
 
     rotations: Float[np.ndarray, "n 3 3"]
     translations: Float[np.ndarray, "n 3"]  # mm

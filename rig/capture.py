@@ -20,8 +20,8 @@ Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """Images by camera name (RGB), clean plates, ready masks (True = subject), feature points (pixels) by landmark
-    and camera, the sha256 of every file that it was read from, and what its reader noticed and did not mind.
+    """Holds images by camera name (RGB), clean plates, ready masks (True = subject), feature points (pixels) by
+    landmark and camera, the sha256 of every file that it was read from, and what its reader noticed and did not mind.
     ``soft_masks``: of masks with soft edges the share of the subject in every pixel, 0 to 255."""
 
     images: Mapping[str, ImageRgb]

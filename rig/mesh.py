@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Vertices (mm) and counter-clockwise triangles, seen from outside; ``colours`` are sRGB, one a vertex."""
+    """Holds vertices (mm) and counter-clockwise triangles, seen from outside; ``colours`` are sRGB, one a vertex."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]

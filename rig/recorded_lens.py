@@ -32,7 +32,7 @@ class RecordedLens:
     coefficients: tuple[float, ...]
 
     def distorted(self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
-        """Where a pinhole's ``pixels`` lie in the recorded picture, both with the camera matrix ``matrix``."""
+        """Returns where a pinhole's ``pixels`` lie in the recorded picture, both with the camera matrix ``matrix``."""
         import cv2  # here and below: 0.1 s that most starts do without
 
         rays = np.ones((len(pixels), 3))
@@ -47,7 +47,7 @@ class RecordedLens:
     def undistorted(
         self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "n 2"]:
-        """Where a recorded picture's ``pixels`` lie in the pinhole's picture."""
+        """Returns where a recorded picture's ``pixels`` lie in the pinhole's picture."""
         import cv2
 
         lens, places = np.array(self.coefficients), pixels.reshape(1, -1, 2)

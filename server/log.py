@@ -18,7 +18,7 @@ NOT_FOR_CALLERS = ("timestamp", "level", "event", "job", "trace", "exc_info")
 
 
 def log_file(jobs: Path, job_id: str) -> Path:
-    """Where the lines of a job are kept, beside its result."""
+    """Returns where the lines of a job are kept, beside its result."""
     return jobs / job_id / "log.txt"
 
 

@@ -27,7 +27,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A judged address: the URL to connect to, and what says in the request whom it is meant for."""
+    """Holds a judged address: the URL to connect to, and what says in the request whom it is meant for."""
 
     url: httpx.URL
     headers: dict[str, str]
@@ -35,7 +35,8 @@ class Target:
 
 
 def target(url: str, origins: Collection[str]) -> Target:
-    """Where a request for ``url`` goes, if it may. Blocks on the name service. Raises InvalidInput ("url-refused")."""
+    """Returns where a request for ``url`` goes, if it may. Blocks on the name service. Raises InvalidInput
+    ("url-refused")."""
     wanted = parsed(url)
     if wanted.userinfo:
         raise _refused(compose("url-with-user"))
@@ -54,7 +55,7 @@ def target(url: str, origins: Collection[str]) -> Target:
 
 
 def parsed(url: str) -> httpx.URL:
-    """A web address whose host can be looked up; nothing is. Raises InvalidInput ("url-refused")."""
+    """Parses a web address whose host can be looked up, without looking it up. Raises InvalidInput ("url-refused")."""
     try:
         wanted = httpx.URL(url)
         shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked

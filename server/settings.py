@@ -145,7 +145,8 @@ class ServiceSettings(BaseSettings):
 
     @property
     def place(self) -> str:
-        """Where keys and jobs are kept, as a person may read it: the data folder, or the database without password."""
+        """Returns where keys and jobs are kept, as a person may read it: the data folder, or the database without
+        password."""
         if self.database_url is None:
             return str(self.data.resolve())
         import sqlalchemy as sa  # half a second that a service on SQLite, and `eigenhead doctor`, need not wait

@@ -90,7 +90,7 @@ class CornersAt:
 
 
 def places(seen: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
-    """Where each view's parameters stand among all: its camera's, its board's, its camera's time offset."""
+    """Returns where each view's parameters stand among all: its camera's, its board's, its camera's time offset."""
     of_camera = seen.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
     board = cameras * PER_CAMERA + seen.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)
     return np.concatenate([of_camera, board, size - cameras + seen.camera[:, None]], axis=1)

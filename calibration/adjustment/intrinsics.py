@@ -37,7 +37,7 @@ CORNER_SIGMA_LEAST = 0.02  # px: no detector is better, and a perfect fit must n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lens:
-    """One camera by itself. ``covariance`` is that of fx fy cx cy (px) k1 k2 p1 p2 k3."""
+    """Holds one camera's lens by itself. ``covariance`` is that of fx fy cx cy (px) k1 k2 p1 p2 k3."""
 
     camera: str
     intrinsics: Intrinsics
@@ -64,7 +64,7 @@ class Lens:
 
 
 def estimate_lenses(detections: Detections) -> dict[str, Lens]:
-    """A ``Lens`` per camera that sees the board at all."""
+    """Returns a ``Lens`` per camera that sees the board at all."""
     found = {camera: [v for v in detections.views if v.camera == camera] for camera in detections.sizes}
     return {
         camera: estimate_lens(views, detections.sizes[camera], detections.board)

@@ -62,7 +62,7 @@ class AspectTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AspectsAt:
-    """The focal lengths (px) of all cameras."""
+    """Holds the focal lengths (px) of all cameras."""
 
     fx: Float[np.ndarray, " c"]
     fy: Float[np.ndarray, " c"]

@@ -43,7 +43,7 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleState:
-    """What is estimated. ``offsets``: time offset of each camera, in shots, along ``velocities`` of the board."""
+    """Holds what is estimated. ``offsets``: time offset of each camera, in shots, along ``velocities`` of the board."""
 
     intrinsics: Float[np.ndarray, "c 9"]
     camera_rotations: Float[np.ndarray, "c 3 3"]

@@ -26,7 +26,8 @@ SB = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """The board in one picture. ``rise_px``: width of the transition from black to white (10 to 90 %), the blur."""
+    """Holds the board in one picture. ``rise_px``: width of the transition from black to white (10 to 90 %), the
+    blur."""
 
     ids: Int[np.ndarray, " n"]
     corners: Float[np.ndarray, "n 2"]

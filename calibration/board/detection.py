@@ -35,7 +35,7 @@ FEW_FOUND = 0.2  # ... that is in less than this share of them
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one camera saw of the board in one shot."""
+    """Holds what one camera saw of the board in one shot."""
 
     camera: str
     shot: str

@@ -24,7 +24,7 @@ MATCH_RATIO = 3.0  # an explanation must bring a view this much closer than it w
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """What was left out, of which camera (None: all of the shot), and why."""
+    """Holds what was left out, of which camera (None: all of the shot), and why."""
 
     shot: str
     camera: str | None

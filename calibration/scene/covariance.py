@@ -84,7 +84,7 @@ def uncertainty(structure: Structure) -> Uncertainty:
 
 
 def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
-    """Where each camera's f k1 k2 cx cy and its pose stand among all unknowns."""
+    """Returns where each camera's f k1 k2 cx cy and its pose stand among all unknowns."""
     count = len(structure.rig)
     lenses = np.zeros(count, int) if structure.one_lens else np.arange(count)
     lens = LENS * lenses[:, None] + np.arange(LENS)

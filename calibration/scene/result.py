@@ -23,7 +23,7 @@ class SceneCameraFigures(TypedDict):
 
 
 class SceneFigures(TypedDict):
-    """The numbers of ``calibrate --from scene --json``."""
+    """Holds the numbers of ``calibrate --from scene --json``."""
 
     rms_px: float
     used_share: float

@@ -44,7 +44,7 @@ class Structure:
 
     @property
     def estimated(self) -> int:
-        """How many of a lens's f, k1, k2, cx, cy, in this order, were estimated."""
+        """Returns how many of a lens's f, k1, k2, cx, cy, in this order, were estimated."""
         if not self.one_lens:
             return 1
         return 5 if len(self.rig) >= CENTRE_VIEWS else 3

@@ -40,7 +40,8 @@ INSIDE_PX = 4.0  # this far behind a convex extreme the subject is met
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contour:
-    """The longest closed outline of a silhouette, in order: sub-pixel places, rays in the world, and what is whole."""
+    """Holds the longest closed outline of a silhouette, in order: sub-pixel places, rays in the world, and what is
+    whole."""
 
     camera: Camera
     mask: Bool[np.ndarray, "h w"]
@@ -70,7 +71,8 @@ class _Extremes:
 
 
 def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: float = GATE_PX) -> list[Tangency]:
-    """Every pair's frontier points that both contours show, and show unmistakably. ``rig``: usable cameras only."""
+    """Returns every pair's frontier points that both contours show, and show unmistakably. ``rig``: usable cameras
+    only."""
     contours = [Contour.of(camera, silhouettes[camera.name]) for camera in rig]
     found = []
     for one, two in combinations(contours, 2):

@@ -73,10 +73,10 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """What came of it. ``before``: residuals of all captures at the start; ``after``: of each capture where the others
-    alone put the cameras; ``before_px`` and ``after_px`` their robust RMS with the noise ``noise_px``. ``change_px``:
-    RMS motion (2D) per camera of the subject's region, worlds aligned, from the start to ``proposed``, the rig that all
-    captures agree on and that ``rig`` is only where ``kept``."""
+    """Holds the result of a refinement. ``before``: residuals of all captures at the start; ``after``: of each capture
+    where the others alone put the cameras; ``before_px`` and ``after_px`` their robust RMS with the noise ``noise_px``.
+    ``change_px``: RMS motion (2D) per camera of the subject's region, worlds aligned, from the start to ``proposed``,
+    the rig that all captures agree on and that ``rig`` is only where ``kept``."""
 
     rig: Rig
     proposed: Rig

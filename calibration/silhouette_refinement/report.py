@@ -52,7 +52,7 @@ class RefinementDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementRun:
-    """A refinement with the rig it started from, the names of its captures, and what is to be said beside it."""
+    """Holds a refinement with the rig it started from, the names of its captures, and what is to be said beside it."""
 
     refinement: Refinement
     start: Rig

@@ -27,7 +27,7 @@ HELD_PX = 0.01  # as the cameras' prior: a tenth of what is looked for
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heads:
-    """A model for all captures, and where each capture's head is to start from (``world_from_head``)."""
+    """Holds a model for all captures, and where each capture's head is to start from (``world_from_head``)."""
 
     model: HeadModel
     starts: Sequence[Similarity]

@@ -38,7 +38,7 @@ COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "syn
 
 
 class NoCalibration(EigenheadError):
-    """A capture folder needs cameras.json."""
+    """Reports that a capture folder needs cameras.json."""
 
     def __init__(self) -> None:
         super().__init__(compose("rig-without-calibration"))
@@ -46,7 +46,8 @@ class NoCalibration(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class RigCheck:
-    """A table that a person can act on: one row of text per camera under ``COLUMNS``, and what concerns the rig."""
+    """Holds a table that a person can act on: one row of text per camera under ``COLUMNS``, and what concerns the
+    rig."""
 
     rows: tuple[tuple[str, ...], ...]
     faults: tuple[Fault, ...]
@@ -98,7 +99,7 @@ def capture(
 
 
 def capture_with(session: RigSession, out: Path) -> Shot:
-    """``capture`` with a session that is open and warm."""
+    """Calls ``capture`` with a session that is open and warm."""
     if session.rig is None:
         raise NoCalibration
     shot = session.shoot()
@@ -151,7 +152,7 @@ def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plat
 
 
 def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
-    """A capture folder with the plates and shot.json (the certificate); it appears when it is complete."""
+    """Writes a capture folder with the plates and shot.json (the certificate); it appears when it is complete."""
     out.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:

@@ -40,7 +40,7 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """How the background of a picture lies on a clean plate.
+    """States how the background of a picture lies on a clean plate.
 
     ``found`` is the share of the plate's textured patches that are found again, all moved alike; ``moved_px`` the
     largest movement that their common similarity gives to a corner of the image, 0 where nothing was found.

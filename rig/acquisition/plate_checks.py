@@ -18,7 +18,7 @@ SEEN_SHARE = 0.5  # of the cameras: a person in the seat is seen by all; what on
 
 
 class PlatesRefused(ShotFailed):
-    """New plates that show somebody; they are kept as ``version``, and the old ones stay in use."""
+    """Refuses new plates that show somebody; they are kept as ``version``, and the old ones stay in use."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)

@@ -32,7 +32,7 @@ UNFINISHED_S = 3600.0  # no version takes so long to write
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plates:
-    """The files of each camera, the first of them as an image, and the noise (values; None of a single plate)."""
+    """Holds the files of each camera, the first of them as an image, and the noise (values; None of a single plate)."""
 
     files: Mapping[str, tuple[Path, ...]]
     first: Mapping[str, ImageRgb]

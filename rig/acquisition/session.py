@@ -49,7 +49,7 @@ class _Release:
 
 
 class RigSession:
-    """Owner of the rig's devices. A context manager; ``close`` leaves no thread but those that hang in a driver."""
+    """Owns the rig's devices. A context manager; ``close`` leaves no thread but those that hang in a driver."""
 
     def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
         self.config = config
@@ -114,7 +114,7 @@ class RigSession:
         return None if self._box_error is None else self._box_error.message
 
     def warm_up(self) -> None:
-        """Lamps on, and every camera's first frames seen and forgotten: exposure and lamps settle meanwhile."""
+        """Switches the lamps on and drops every camera's first frames: exposure and lamps settle meanwhile."""
         with self._busy:
             self._lights_on()
             deadline_s = time.monotonic() + self.config.shot.timeout_s
@@ -124,8 +124,8 @@ class RigSession:
             self._look(deadline_s + self.config.shot.timeout_s)
 
     def look(self, only: Collection[str] | None = None) -> Mapping[str, ImageRgb]:
-        """A picture of each camera (``only``: of these, which alone are waited for) that has one, of no particular
-        moment."""
+        """Returns a picture of each camera (``only``: of these, which alone are waited for) that has one, of no
+        particular moment."""
         with self._busy:
             self._lights_on()
             frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s, only)

@@ -77,7 +77,7 @@ class FaultDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: a code of ``FAULTS``, the camera (None: the rig), and what was measured."""
+    """Holds one fault: a code of ``FAULTS``, the camera (None: the rig), and what was measured."""
 
     code: str
     camera: str | None
@@ -122,7 +122,7 @@ def read_fault(document: Mapping[str, Any]) -> Fault:
 
 
 class ShotFailed(EigenheadError):
-    """A shot that is no capture; ``faults`` names everything that was found."""
+    """Reports a shot that is no capture; ``faults`` names everything that was found."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
@@ -131,7 +131,8 @@ class ShotFailed(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class CameraSync:
-    """One camera's line of the certificate. ``skew_s``: arrival less trigger, output delay and configured latency."""
+    """Holds one camera's line of the certificate. ``skew_s``: arrival less trigger, output delay and configured
+    latency."""
 
     camera: str
     status: Status
@@ -148,7 +149,7 @@ class CameraSyncDocument(TypedDict):
 
 
 class SyncDocument(TypedDict):
-    """A certificate in JSON; times in milliseconds."""
+    """Holds a certificate in JSON; times in milliseconds."""
 
     trigger_utc: str
     fired: bool
@@ -177,7 +178,8 @@ class ShotDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class SyncCertificate:
-    """How far the pictures of a shot belong to one moment. ``trigger_s`` is time.monotonic; None: nothing fired."""
+    """States how far the pictures of a shot belong to one moment. ``trigger_s`` is time.monotonic; None: nothing
+    fired."""
 
     trigger_s: float | None
     trigger_utc: str
@@ -219,7 +221,7 @@ class SyncCertificate:
 
 @dataclass(frozen=True, slots=True)
 class PictureCheck:
-    """What was measured on one picture; ``registration`` is None without a clean plate, or in a black picture."""
+    """Holds what was measured on one picture; ``registration`` is None without a clean plate, or in a black picture."""
 
     exposure: Exposure
     blur_px: float | None
@@ -239,7 +241,7 @@ class PictureCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """Everything that one release of the rig gave."""
+    """Holds everything that one release of the rig gave."""
 
     images: Mapping[str, ImageRgb]
     certificate: SyncCertificate
@@ -263,7 +265,7 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What the session knows of one camera's timing (s): when its frame was due, and how often it runs by itself.
+    """Holds what the session knows of one camera's timing (s): when its frame was due, and how often it runs by itself.
 
     ``triggered``: the box's output makes the frame; otherwise the next one counts, whenever it comes. A recorded
     picture belongs to no moment of today.

@@ -26,7 +26,7 @@ OUTLINE_PX = 0.8  # how far the stored outline may lie from the found one
 
 @dataclass(frozen=True, slots=True)
 class SubjectPlace:
-    """The subject in a picture.
+    """Holds the subject in a picture.
 
     ``outline``: corners of its contour (pixels of the whole picture); ``share``: of the picture's area; ``cut_off``:
     edges of the picture that cut the head's half of it (the bottom always cuts a bust).

@@ -21,32 +21,32 @@ BUSY_S = 1.5  # the longest delay and the longest pulse, 1 s in all, with room f
 
 
 class TriggerError(EigenheadError):
-    """The trigger box could not do what was asked; the base of everything this module raises."""
+    """Reports that the trigger box could not do a request; the base of everything this module raises."""
 
 
 class TriggerUnplugged(TriggerError):
-    """The serial port is not there, or went away."""
+    """Reports that the serial port is not there, or went away."""
 
     def __init__(self, port: str, why: str) -> None:
         super().__init__(compose("trigger-unplugged", port=port, reason=why))
 
 
 class TriggerSilent(TriggerError):
-    """The port is there, but nothing answers."""
+    """Reports that the port is there, but nothing answers."""
 
     def __init__(self, port: str, body: str, waited_s: float) -> None:
         super().__init__(compose("trigger-silent", port=port, command=body.split()[0], waited_s=waited_s))
 
 
 class WrongDevice(TriggerError):
-    """Something else than a trigger box is on the port."""
+    """Reports that something else than a trigger box is on the port."""
 
     def __init__(self, port: str, said: str) -> None:
         super().__init__(compose("trigger-other-device", port=port, protocol=PROTOCOL, said=f"{said!r}"))
 
 
 class TriggerRefused(TriggerError):
-    """The box understood and refused: ``code`` is one of UNKNOWN, ARGUMENT, NOT-ARMED, BUSY."""
+    """Reports that the box understood and refused: ``code`` is one of UNKNOWN, ARGUMENT, NOT-ARMED, BUSY."""
 
     def __init__(self, body: str, code: Message | str) -> None:
         self.code = code
@@ -89,7 +89,8 @@ class BoxClock:
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """One release: when the box raised its outputs (time.monotonic, s), how well that is known, and the box's count."""
+    """Holds one release: when the box raised its outputs (time.monotonic, s), how well that is known, and the box's
+    count."""
 
     time_s: float
     uncertainty_s: float
@@ -98,7 +99,7 @@ class Fired:
 
 
 class TriggerBox:
-    """Client of one box. Every method raises TriggerError; a method that returns was acknowledged by the box.
+    """Talks to one trigger box. Every method raises TriggerError; a method that returns was acknowledged by the box.
 
     ``port`` is a serial port (a /dev/serial/by-id path survives a reboot) or the pty of a simulated box. Opening waits
     up to ``boot_s``: many boards restart when their port is opened and need two seconds until they listen.
@@ -140,7 +141,7 @@ class TriggerBox:
             return
 
     def set_delay(self, channel: int, delay_us: int) -> None:
-        """Delay of one output behind the release, 0 to 500,000 us."""
+        """Sets the delay of one output behind the release, 0 to 500,000 us."""
         self._command(f"DELAY {channel} {delay_us}")
 
     def set_lights(self, mask: int) -> None:

@@ -34,7 +34,7 @@ class SubjectDocument(TypedDict):
 
 
 class ViewDocument(TypedDict, total=False):
-    """What was measured of one camera's picture; what was not measured is absent."""
+    """Holds what was measured of one camera's picture; what was not measured is absent."""
 
     mean: float
     clipped_share: float
@@ -46,7 +46,7 @@ class ViewDocument(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class ViewCheck:
-    """One camera: its picture's measures (None where the shot has them), the mean value that it should have (None
+    """Holds one camera: its picture's measures (None where the shot has them), the mean value that it should have (None
     without a clean plate), and the subject in it (``looked``: there was a clean plate or a mask to find it by)."""
 
     picture: PictureCheck | None
@@ -91,7 +91,8 @@ def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
 
 
 def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
-    """``good`` without a fault; ``poor`` where the rig itself is at fault, or too few cameras are without one."""
+    """Returns ``good`` without a fault; ``poor`` where the rig itself is at fault, or too few cameras are without
+    one."""
     named = {fault.camera for fault in faults}
     if not named:
         return "good"

@@ -102,7 +102,7 @@ class Aravis:
         self._gobject.g_object_unref(pointer)
 
     def pixels(self, buffer: int) -> UInt8[np.ndarray, " n"]:
-        """A copy of the image bytes of a buffer."""
+        """Returns a copy of the image bytes of a buffer."""
         size = c_size_t()
         data = self._aravis.arv_buffer_get_image_data(buffer, byref(size))
         return np.frombuffer(ctypes.string_at(data, size.value), np.uint8)

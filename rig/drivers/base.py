@@ -19,7 +19,8 @@ from rig.messages.message import Message, compose
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """When a frame came (time.monotonic, s; the earliest moment that the driver can know) and its running number."""
+    """Holds when a frame came (time.monotonic, s; the earliest moment that the driver can know) and its running
+    number."""
 
     time_s: float
     sequence: int
@@ -27,7 +28,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One picture: RGB, upright, with its arrival."""
+    """Holds one picture: RGB, upright, with its arrival."""
 
     image: ImageRgb
     time_s: float
@@ -36,7 +37,8 @@ class Frame:
 
 @runtime_checkable
 class Driver(Protocol):
-    """One camera. Everything but ``close`` may raise DriverError; ``close`` never does and may be called twice."""
+    """Drives one camera. Everything but ``close`` may raise DriverError; ``close`` never does and may be called
+    twice."""
 
     live: bool
     """Its pictures come from a sensor, so that two equal ones mean a frozen stream."""
@@ -70,7 +72,7 @@ class Driver(Protocol):
 
 
 class DriverError(EigenheadError):
-    """A camera does not do what it should; the message starts with its name."""
+    """Reports that a camera does not do what it should; the message starts with its name."""
 
     def __init__(self, camera: str, message: Message) -> None:
         self.camera = camera
@@ -78,28 +80,28 @@ class DriverError(EigenheadError):
 
 
 class CameraNotFound(DriverError):
-    """No camera with this identity."""
+    """Reports that no camera has this identity."""
 
     def __init__(self, camera: CameraConfig, why: Message | str) -> None:
         super().__init__(camera.name, compose("camera-not-found", identity=f"{camera.identity!r}", reason=why))
 
 
 class CameraLost(DriverError):
-    """The camera went away, or sends what is no picture."""
+    """Reports that the camera went away, or sends what is no picture."""
 
     def __init__(self, camera: CameraConfig, why: Message | str) -> None:
         super().__init__(camera.name, compose("camera-lost", reason=why))
 
 
 class GrabTimeout(DriverError):
-    """No frame in time; the camera may still be well."""
+    """Reports that no frame came in time; the camera may still be well."""
 
     def __init__(self, camera: CameraConfig, timeout_s: float) -> None:
         super().__init__(camera.name, compose("no-frame-within", seconds=timeout_s))
 
 
 class DriverMissing(DriverError):
-    """The vendor's library is not installed."""
+    """Reports that the vendor's library is not installed."""
 
     def __init__(self, camera: CameraConfig, needs: Message | str) -> None:
         super().__init__(camera.name, compose("driver-needs", driver=f"{camera.driver!r}", needs=needs))

@@ -24,7 +24,7 @@ _KEPT = 32  # frames that wait to be collected: half a second at 60 a second
 
 @dataclass(frozen=True, slots=True)
 class FeedState:
-    """What is known of a camera at a moment. Times are time.monotonic, s."""
+    """Holds what is known of a camera at a moment. Times are time.monotonic, s."""
 
     opened: bool
     frames: int  # since it was opened
@@ -35,7 +35,7 @@ class FeedState:
 
 
 class CameraFeed:
-    """Owner of one driver. ``start`` returns at once; everything that waits takes a deadline (time.monotonic)."""
+    """Owns one driver. ``start`` returns at once; everything that waits takes a deadline (time.monotonic)."""
 
     def __init__(self, camera: CameraConfig, driver: Driver, open_timeout_s: float) -> None:
         self.camera = camera
@@ -71,7 +71,7 @@ class CameraFeed:
         return not self._thread.is_alive()
 
     def state(self) -> FeedState:
-        """A snapshot."""
+        """Returns a snapshot."""
         with self._changed:
             gaps = [b - a for a, b in zip(list(self._arrivals_s)[:-1], list(self._arrivals_s)[1:], strict=True)]
             return FeedState(
@@ -96,7 +96,7 @@ class CameraFeed:
             return self._count >= count
 
     def want(self, from_s: float) -> None:
-        """Frames that arrive after ``from_s`` are kept, decoded, for ``collect``; earlier ones are forgotten."""
+        """Keeps frames that arrive after ``from_s``, decoded, for ``collect``; earlier ones are dropped."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s, self._due_s = from_s, None
@@ -107,7 +107,7 @@ class CameraFeed:
             self._due_s = earliest_s
 
     def unwant(self) -> None:
-        """Frames are dropped undecoded again."""
+        """Drops frames undecoded again."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s = self._due_s = None

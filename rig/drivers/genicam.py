@@ -52,7 +52,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class GenicamDriver:
-    """One camera of Aravis."""
+    """Drives one camera of Aravis."""
 
     live = True
 

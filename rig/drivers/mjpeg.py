@@ -26,11 +26,11 @@ _STALE_S = 5.0  # a kernel stamp further from now than this is of a clock that w
 
 
 class StreamTimeout(Exception):
-    """Nothing came in time; reading may go on."""
+    """Reports that nothing came in time; reading may go on."""
 
 
 class StreamBroken(Exception):
-    """The stream ended, or is no motion JPEG."""
+    """Reports that the stream ended, or is no motion JPEG."""
 
     def __init__(self, message: Message) -> None:
         self.message = message

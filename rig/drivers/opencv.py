@@ -29,7 +29,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class MjpegDriver:
-    """A motion-JPEG stream over HTTP."""
+    """Reads a motion-JPEG stream over HTTP."""
 
     live = True
 
@@ -77,7 +77,7 @@ class MjpegDriver:
 
 
 class VideoCaptureDriver:
-    """What cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
+    """Reads what cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
 
     live = True
 
@@ -174,7 +174,7 @@ class VideoCaptureDriver:
 
 
 def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
-    """RGB pixels of an encoded picture. Raises DriverError where it is damaged."""
+    """Decodes a picture to RGB pixels. Raises DriverError where it is damaged."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
     if image is None:
         raise DriverError(camera.name, compose("frame-no-picture", bytes=len(data)))

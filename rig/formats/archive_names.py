@@ -21,7 +21,7 @@ WINDOWS_NAMES = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
 
 
 def decoded_name(raw: bytes) -> tuple[str, bool]:
-    """A name, and whether its encoding is a guess."""
+    """Returns a name, and whether its encoding is a guess."""
     try:
         return raw.decode("utf-8"), False
     except UnicodeDecodeError:
@@ -50,7 +50,7 @@ def is_dropped(part: str) -> bool:
 
 
 def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[str, str]]) -> Message | None:
-    """A name that another member has already, or that some file system or reader takes for another's."""
+    """Returns a name that another member has already, or that some file system or reader takes for another's."""
     name = "/".join(parts)
     key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
     other = seen.get(key)

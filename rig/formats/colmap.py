@@ -92,7 +92,8 @@ class _Records:
         return values
 
     def count(self, least_bytes: int) -> int:
-        """A count whose records can still fit in the file; a larger one is damage, found before it costs anything."""
+        """Returns a count whose records can still fit in the file; a larger one is damage, found before it costs
+        anything."""
         (count,) = self.take("Q")
         if count * least_bytes > len(self.data) - self.at:
             raise Malformed(compose("records-promised", records=str(count)))

@@ -141,6 +141,6 @@ def brown_conrady(
 
 
 def corner_radius(size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]) -> float:
-    """How far the corners lie from the axis, of ``X / Z``."""
+    """Returns how far the corners lie from the axis, of ``X / Z``."""
     across, down = (max(c, n - c) / f if f > 0 else np.nan for n, f, c in zip(size, focal, centre, strict=True))
     return float(np.hypot(across, down))

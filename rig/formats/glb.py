@@ -22,8 +22,8 @@ VERTICES, INDICES = 34962, 34963
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skin:
-    """A texture: coordinates a vertex, from the image's upper left corner, v downwards; the encoded image. Where there
-    is a normal map (PNG, linear, +Y up), the tangents that it is given in, with the bitangents' signs."""
+    """Holds a texture: coordinates a vertex, from the image's upper left corner, v downwards; the encoded image. Where
+    there is a normal map (PNG, linear, +Y up), the tangents that it is given in, with the bitangents' signs."""
 
     uv: Float[np.ndarray, "v 2"]
     image: bytes

@@ -217,7 +217,7 @@ def _raw(data: bytes) -> Iterator[Any]:
 
 
 def heif_header(data: bytes) -> Any:
-    """A HEIC file, of which nothing is decoded yet. Raises InputError without the extra."""
+    """Returns a HEIC file, of which nothing is decoded yet. Raises InputError without the extra."""
     try:
         import pi_heif
     except ModuleNotFoundError:

@@ -42,8 +42,9 @@ VALUES_NAMED = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskReading:
-    """A mask as it was read: ``share`` of the subject, 0 to 255, and whether its edges are ``soft``, so that the greys
-    tell where the outline lies. ``fault``: why it is none (then the share is empty). ``remark``: what was noticed."""
+    """Holds a mask as it was read: ``share`` of the subject, 0 to 255, and whether its edges are ``soft``, so that the
+    greys tell where the outline lies. ``fault``: why it is none (then the share is empty). ``remark``: what was
+    noticed."""
 
     share: Share
     soft: bool = False

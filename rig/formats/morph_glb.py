@@ -25,7 +25,7 @@ def with_morphs(
     morphs: Mapping[str, Float[np.ndarray, "v 3"]],
     weights: Mapping[str, float],
 ) -> bytes:
-    """A GLB of this project with morph targets.
+    """Returns a GLB of this project with morph targets.
 
     Args:
         glb: of one mesh with one primitive, whose vertices are the given ones in their order, in metres.

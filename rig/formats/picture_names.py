@@ -50,7 +50,7 @@ def is_junk(name: str) -> bool:
 
 
 def picture_stem(name: str) -> str:
-    """A file's name without a picture's ending; a dot that begins no such ending belongs to the name."""
+    """Returns a file's name without a picture's ending; a dot that begins no such ending belongs to the name."""
     stem, dot, ending = name.rpartition(".")
     return stem if dot and stem and f".{ending.lower()}" in (*IMAGE_SUFFIXES, *UNREAD_PICTURES) else name
 

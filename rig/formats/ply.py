@@ -81,7 +81,8 @@ def write_ply(path: Path, mesh: Mesh, **properties: Any) -> None:
 
 
 def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
-    """A head.ply of ours: the mesh (mm, world frame), and every vertex's standard deviation (mm) along its normal.
+    """Returns a head.ply of ours: the mesh (mm, world frame), and every vertex's standard deviation (mm) along its
+    normal.
 
     Raises InputError for a file that is cut short, or another program's."""
     try:

@@ -35,7 +35,7 @@ class PolygonMesh:
     statements: tuple[tuple[int, str], ...] = ()  # groups and materials: before which polygon, and the line
 
     def triangles(self) -> Int[np.ndarray, "f 3"]:
-        """Every polygon as a fan about its first corner."""
+        """Returns every polygon as a fan about its first corner."""
         return self.corners[fan(self.sizes)]
 
 

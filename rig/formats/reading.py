@@ -108,13 +108,13 @@ def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Mess
 
 
 def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Message:
-    """A few names, and how many more there are, for a message."""
+    """Returns a few names, and how many more there are, for a message."""
     more = len(names) - most
     return compose("names-and-more", names=names[:most], more=more) if more > 0 else names
 
 
 def shown(value: object, most: int = VALUE_MOST) -> str:
-    """A value as Python writes it, cut within its quotation marks and not through them."""
+    """Returns a value as Python writes it, cut within its quotation marks and not through them."""
     if isinstance(value, str):
         return repr(value if len(value) <= most else value[: most - 3] + "...")
     text = repr(value)

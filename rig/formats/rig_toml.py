@@ -123,7 +123,7 @@ class RigConfig:
 
     @property
     def plates_folder(self) -> Path:
-        """Where the clean plates are kept."""
+        """Returns where the clean plates are kept."""
         return self.folder / self.plates
 
     @property
@@ -149,7 +149,7 @@ def read_rig_config(path: Path) -> RigConfig:
 
 
 def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject: str = "rig.toml") -> RigConfig:
-    """A rig from parsed TOML. Raises InputError that names every fault."""
+    """Returns a rig from parsed TOML. Raises InputError that names every fault."""
     faults: list[Message] = []
     config = _read_table(RigConfig, document, "", faults)
     if config is not None:

@@ -63,7 +63,7 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
 
 
 def picture_folder(folder: Path) -> Path:
-    """Where a capture folder's photographs lie."""
+    """Returns where a capture folder's photographs lie."""
     return folder / "images" if (folder / "images").is_dir() else folder
 
 

@@ -25,8 +25,8 @@ TOLD_MOST = 8
 
 
 def unread_keys(path: Path) -> tuple[Message, ...]:
-    """A message for every key of a rig file that is not read; nothing for the files of other programs, which have keys
-    of their own, and for a file that cannot be read at all, which its reader refuses."""
+    """Returns a message for every key of a rig file that is not read; nothing for the files of other programs, which
+    have keys of their own, and for a file that cannot be read at all, which its reader refuses."""
     if path.suffix != ".json" or path.name == "transforms.json":
         return ()
     try:

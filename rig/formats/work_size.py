@@ -21,7 +21,7 @@ HALVINGS_MOST = 3  # that decoders know
 
 
 def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
-    """How much smaller a camera's pictures are read, of 1; None: as they are."""
+    """Returns how much smaller a camera's pictures are read, of 1; None: as they are."""
     pixels = intrinsics.width * intrinsics.height
     if pixels_most is None or pixels <= pixels_most:
         return 1.0
@@ -51,8 +51,8 @@ def work_features(features: Features, rig: Rig, work: Rig) -> Features:
 
 
 def halvings(share: float, size: tuple[int, int]) -> int:
-    """How often a decoder may halve a picture of ``size`` (width, height) that is wanted at ``share`` of it: only where
-    whole blocks of pixels become one, so that none is of half a block."""
+    """Returns how often a decoder may halve a picture of ``size`` (width, height) that is wanted at ``share`` of it:
+    only where whole blocks of pixels become one, so that none is of half a block."""
     count = 0
     while count < HALVINGS_MOST and share <= 0.5 ** (count + 1) and not any(side % 2 ** (count + 1) for side in size):
         count += 1

@@ -16,7 +16,7 @@ GREY = 190
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """One distant light. ``towards``: unit direction to it, world frame; None shines along the line of sight."""
+    """Holds one distant light. ``towards``: unit direction to it, world frame; None shines along the line of sight."""
 
     towards: tuple[float, float, float] | None = None
     ambient: float = 0.0
@@ -29,7 +29,7 @@ HEADLIGHT = Light(ambient=0.15)
 def draw_colour(
     context: GlContext, rig: Rig, mesh: Mesh, samples: int, light: Light
 ) -> dict[str, UInt8[np.ndarray, "_ _ 4"]]:
-    """RGB and coverage (alpha) per camera; RGB is the covered part's own colour, not mixed with a background."""
+    """Draws RGB and coverage (alpha) per camera; RGB is the covered part's own colour, not mixed with a background."""
     if not len(mesh.faces):
         return {c.name: np.zeros((c.intrinsics.height, c.intrinsics.width, 4), np.uint8) for c in rig}
     origin = rig.centre_world()

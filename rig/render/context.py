@@ -35,21 +35,21 @@ Resource = TypeVar("Resource", bound=Releasable)
 
 
 class EglUnavailable(EigenheadError):
-    """No OpenGL context could be made on this machine."""
+    """Reports that no OpenGL context could be made on this machine."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(compose("no-opengl", reason=reason))
 
 
 class WrongThread(EigenheadError):
-    """A renderer was used outside the thread or process that made it, or after it was closed."""
+    """Reports that a renderer was used outside the thread or process that made it, or after it was closed."""
 
     def __init__(self, why: Message) -> None:
         super().__init__(compose("renderer-of-other-thread", why=why))
 
 
 class Owned(contextlib.ExitStack):
-    """What is passed through a call of this is released with it, in reverse order: moderngl frees nothing by itself."""
+    """Releases what is passed through a call of this, in reverse order: moderngl frees nothing by itself."""
 
     def __call__(self, resource: Resource) -> Resource:
         self.callback(resource.release)
@@ -57,7 +57,7 @@ class Owned(contextlib.ExitStack):
 
 
 class GlContext:
-    """A moderngl context of this thread, and its compiled programs by the names of their shader files."""
+    """Holds a moderngl context of this thread, and its compiled programs by the names of their shader files."""
 
     def __init__(self) -> None:
         try:

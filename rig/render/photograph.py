@@ -39,8 +39,8 @@ class Grain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A piece of the subject, in the world frame. ``places`` are what its grain is a function of; ``paint`` is linear
-    albedo and strength of the grain; ``irradiance`` is linear RGB (1: white paper comes out white)."""
+    """Holds a piece of the subject, in the world frame. ``places`` are what its grain is a function of; ``paint`` is
+    linear albedo and strength of the grain; ``irradiance`` is linear RGB (1: white paper comes out white)."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -55,7 +55,8 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gallery:
-    """What all parts share: the noise volume, and the two lamps that make highlights (world frame, linear RGB)."""
+    """Holds what all parts share: the noise volume, and the two lamps that make highlights (world frame, linear
+    RGB)."""
 
     noise: UInt8[np.ndarray, "64 64 64 4"]
     lamps: Float[np.ndarray, "2 3"]

@@ -50,7 +50,7 @@ class _Surface:
 
 
 class SilhouetteSet:
-    """Cameras and triangles made ready for many evaluations; only the vertices change. Close it, or use ``with``."""
+    """Prepares cameras and triangles for many evaluations; only the vertices change. Close it, or use ``with``."""
 
     def __init__(self, context: GlContext, rig: Rig, faces: Int[np.ndarray, "f 3"]) -> None:
         """``rig`` at the resolution to draw in."""

@@ -26,7 +26,8 @@ class ImageTooLarge(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Page:
-    """One texture: which cameras (by index) have a tile on it, and where. ``tiles`` holds left, top, width, height."""
+    """Holds one texture: which cameras (by index) have a tile on it, and where. ``tiles`` holds left, top, width,
+    height."""
 
     width: int
     height: int
@@ -91,7 +92,7 @@ def instances(
     origin_world: Float[np.ndarray, " 3"],
     depth_ranges: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "k 30"]:
-    """A row of shader inputs per tile of ``page``, for points given relative to ``origin_world``.
+    """Returns a row of shader inputs per tile of ``page``, for points given relative to ``origin_world``.
 
     ``depth_ranges``: nearest and farthest depth of the scene per camera (mm); None draws without a depth buffer.
     """

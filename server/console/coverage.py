@@ -23,7 +23,7 @@ Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the im
 
 
 class Coverage(TypedDict):
-    """What was seen of the board by one camera."""
+    """Holds what was seen of the board by one camera."""
 
     name: str
     views: int

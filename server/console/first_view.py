@@ -34,7 +34,7 @@ def first_view(result: Path) -> UInt8[np.ndarray, "s s 3"]:
 
 
 def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
-    """A head with colours (head frame, mm) on the view's ground, twice supersampled."""
+    """Returns a head with colours (head frame, mm) on the view's ground, twice supersampled."""
     vertices = mesh.vertices
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())

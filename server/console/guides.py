@@ -32,7 +32,8 @@ OUTSIDE = 0.25  # of the image: guides go so far beyond its rim
 
 
 def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) -> Float[np.ndarray, "n 2"]:
-    """Where ``target`` sees the ray of a pixel of ``source``: a curve in pixels, empty where it sees none of it."""
+    """Returns where ``target`` sees the ray of a pixel of ``source``: a curve in pixels, empty where it sees none of
+    it."""
     camera = rig[source]
     ray = camera.rays_world(np.asarray(pixel, float)[None])[0]
     middle = float((rig.centre_world() - camera.centre_world) @ ray)
@@ -55,7 +56,7 @@ class Helps(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """What follows from one point's picks; ``position`` (mm) is None where its rays meet nowhere."""
+    """Holds what follows from one point's picks; ``position`` (mm) is None where its rays meet nowhere."""
 
     position: Float[np.ndarray, " 3"] | None
     reprojected: dict[str, list[float]]

@@ -149,7 +149,7 @@ class LiveView:
 
 
 def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:
-    """A look on the wire; ``bytes`` in the header is the length of each camera's JPEG."""
+    """Returns a look on the wire; ``bytes`` in the header is the length of each camera's JPEG."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
     text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document()}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)

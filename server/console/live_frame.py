@@ -6,7 +6,7 @@ from rig.messages.message import MessageDocument
 
 
 class LiveFrame(TypedDict):
-    """A camera's picture (None: it shows nothing) and what was measured on it."""
+    """Holds a camera's picture (None: it shows nothing) and what was measured on it."""
 
     name: str
     jpeg: bytes | None

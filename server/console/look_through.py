@@ -21,7 +21,7 @@ MM = 1000.0
 
 
 class CameraView(TypedDict):
-    """A pinhole camera (pixels); ``camera_from_head``: rows of a 4 x 4 matrix, metres, head frame of head.glb."""
+    """Holds a pinhole camera (pixels); ``camera_from_head``: rows of a 4 x 4 matrix, metres, head frame of head.glb."""
 
     name: str
     width: int
@@ -34,7 +34,7 @@ class CameraView(TypedDict):
 
 
 def camera_views(rig: Rig, report: Report) -> list[CameraView]:
-    """Every camera of the capture. ``report`` places the head: x_world = R x_head + s t, at its true size."""
+    """Returns every camera of the capture. ``report`` places the head: x_world = R x_head + s t, at its true size."""
     place = report["world_from_head"]
     shift = np.array(place["translation"]) * place["scale"]
     world_from_head = RigidTransform(np.array(place["rotation"]), shift)

@@ -41,7 +41,7 @@ _drawing = threading.Lock()
 
 
 def session(scope: str) -> Any:
-    """A dependency: the service and the caller of the browser's session, if it may do ``scope``."""
+    """Makes a dependency: the service and the caller of the browser's session, if it may do ``scope``."""
 
     async def authenticate() -> tuple[Service, Caller]:
         service, stored = service_of_pages(), dict(pages.storage.user)
@@ -71,7 +71,7 @@ async def live(who: Reader) -> StreamingResponse:
 
 @pages.get("/console/captures/{capture_id}/{camera}.jpg")
 def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
-    """A small JPEG of an image; a capture never changes."""
+    """Returns a small JPEG of an image; a capture never changes."""
     service = who[0]
     name = _image_name(service.store.capture(capture_id), camera)
     path = service.store.cache_of(capture_id) / "small" / f"{Path(name).stem}.jpg"
@@ -142,7 +142,7 @@ def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Respo
 
 @pages.get("/console/jobs/{job_id}/{surface}.{name}.f32")
 def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Literal["quality", "part"]) -> Response:
-    """A number a vertex (float32) of head.ply or bust.ply: posterior standard deviation (mm), or part."""
+    """Returns a number a vertex (float32) of head.ply or bust.ply: posterior standard deviation (mm), or part."""
     path = result_folder(who[0], job_id) / f"{surface}.ply"
     if not path.is_file():
         raise NotFound(compose("thing-surface"), surface)
@@ -151,7 +151,7 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
 
 @pages.get("/console/jobs/{job_id}/portrait.jpg")
 def portrait(who: Reader, job_id: str) -> Response:
-    """A small picture of the head."""
+    """Returns a small picture of the head."""
     return FileResponse(head_picture(who[0], job_id, "portrait.jpg"), headers=FOREVER)
 
 
@@ -179,7 +179,7 @@ def cameras(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/photographs/{camera}.jpg")
 def photograph(who: Reader, job_id: str, camera: str) -> Response:
-    """A photograph of the capture as a lens without distortion would have taken it."""
+    """Returns a photograph of the capture as a lens without distortion would have taken it."""
     service = who[0]
     capture, record = _capture_files(service, job_id)
     name = _image_name(record, camera)
@@ -209,7 +209,7 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/all.zip")
 def all_files(who: Reader, request: Request, job_id: str) -> Response:
-    """Every file of the result in one archive."""
+    """Returns every file of the result in one archive."""
     return send_archive(request, result_folder(who[0], job_id), who[0].jobs.files(job_id), name=None)
 
 

@@ -49,8 +49,8 @@ _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a captur
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """What an event of a page does: ``function(page, event)`` in a thread, for callers with ``scope``. Page and event
-    are of the type that the function says: the page's own, and what its component sends.
+    """Holds what an event of a page does: ``function(page, event)`` in a thread, for callers with ``scope``. Page and
+    event are of the type that the function says: the page's own, and what its component sends.
 
     What it returns, if anything, is said in the corner.
     """
@@ -223,7 +223,7 @@ class Page(Element):
 
 
 class Chosen(TypedDict):
-    """The event of an action on one thing."""
+    """Holds the event of an action on one thing."""
 
     id: str
 
@@ -314,8 +314,8 @@ def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
 
 
 class Status(TypedDict):
-    """What the frame shows of the service; ``faults``: what to do, by what is wrong; ``starting``: what is not there
-    yet; ``empty``: nobody took or uploaded a capture."""
+    """Holds what the frame shows of the service; ``faults``: what to do, by what is wrong; ``starting``: what is not
+    there yet; ``empty``: nobody took or uploaded a capture."""
 
     starting: list[str]
     faults: dict[str, MessageDocument]

@@ -28,7 +28,7 @@ class Removal:
 
 @dataclass
 class Removals:
-    """What waits to be removed, by id."""
+    """Holds what waits to be removed, by id."""
 
     wait_s: float = UNDO_S
     _waiting: dict[str, Removal] = field(default_factory=dict)

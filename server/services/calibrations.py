@@ -124,7 +124,7 @@ class Calibrations:
         return self.result(identity, "cameras.json")
 
     def result(self, identity: str, name: str) -> Path:
-        """A file of a calibration that succeeded. Raises NotFound, Conflict."""
+        """Returns a file of a calibration that succeeded. Raises NotFound, Conflict."""
         state = self.get(identity).state
         if state != "succeeded":
             raise Conflict("no-result", compose("calibration-without-result", state=state))

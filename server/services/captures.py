@@ -56,7 +56,7 @@ class CaptureMetadata:
 
 
 class Captures:
-    """The captures of a service. Methods block."""
+    """Manages the captures of a service. Methods block."""
 
     def __init__(
         self,
@@ -85,8 +85,8 @@ class Captures:
             return self._add(capture, "rig", content, about, shot)
 
     def sample(self) -> CaptureRecord:
-        """A shot of the simulated studio, also where the rig is a real one. It shows nobody, so that nobody is asked
-        for consent. Raises Unavailable, and DiskFull."""
+        """Takes a shot of the simulated studio, also where the rig is a real one. It shows nobody, so that nobody is
+        asked for consent. Raises Unavailable, and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         studio = SimulatedRig(self._store.data / "rig" / "none")
         try:
@@ -184,8 +184,8 @@ class Captures:
         return self._library.tags(limit)
 
     def image(self, identity: str, kind: str, camera: str) -> StoredFile:
-        """A camera's file of a kind (images, background), found in the record, never by putting a request's text into a
-        path. Raises NotFound."""
+        """Returns a camera's file of a kind (images, background), found in the record, never by putting a request's
+        text into a path. Raises NotFound."""
         record = self._store.capture(identity)
         for name, digest in record.inputs.items():
             path = Path(name)

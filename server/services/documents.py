@@ -45,7 +45,7 @@ class FileDocument(TypedDict):
 
 
 class JobLine(TypedDict):
-    """A job without its files, as a list shows it."""
+    """Holds a job without its files, as a list shows it."""
 
     id: str
     state: str

@@ -14,8 +14,8 @@ CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
 @dataclass(frozen=True, slots=True)
 class Holdings:
-    """What there is of a capture. A removal takes the pictures (``bytes``: their files and caches); ``heads``, results
-    with photographs in their overlays, and the other ``jobs`` stay until it is erased."""
+    """Holds what there is of a capture. A removal takes the pictures (``bytes``: their files and caches); ``heads``,
+    results with photographs in their overlays, and the other ``jobs`` stay until it is erased."""
 
     pictures: int
     bytes: int

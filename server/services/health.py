@@ -94,7 +94,7 @@ def exposition(service: Service) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Info:
-    """What a client may want to know before it sends anything: limits, how much waits, the settings' defaults."""
+    """Holds what a client may want to know before it sends anything: limits, how much waits, the settings' defaults."""
 
     version: str
     cores: int

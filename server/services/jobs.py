@@ -182,7 +182,8 @@ class Jobs:
         return self._jobs(rows)
 
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
-        """A word that names a state is looked for as that. Raises InputError for a cursor of another list."""
+        """Lists jobs; a word that names a state is looked for as that. Raises InputError for a cursor of another
+        list."""
         page = self.index.page(_by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
@@ -251,15 +252,15 @@ class Jobs:
         return self._store.folder("jobs", job_id) / "result"
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
-        """A file of a result, found in the job's record. Raises NotFound, Conflict."""
+        """Returns a file of a result, found in the job's record. Raises NotFound, Conflict."""
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
         return StoredFile(self._result(job_id) / name, file["sha256"])
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
-        """A new job for the same capture, which names the old one. What is None is as in that. Raises InputError,
-        NotFound, TooMany."""
+        """Submits a new job for the same capture, which names the old one. What is None is as in that. Raises
+        InputError, NotFound, TooMany."""
         wanted.check()
         row = self._known(job_id)
         request = _request(row)

@@ -24,7 +24,7 @@ LOCAL = "local"
 
 
 class KeylessAddress(EigenheadError):
-    """Listening to the network without a key."""
+    """Refuses to listen to the network without a key."""
 
     def __init__(self, where: str, data: Path) -> None:
         super().__init__(
@@ -47,7 +47,7 @@ class Caller:
 
 @dataclass(frozen=True, slots=True)
 class ApiKey:
-    """A key without its secret. ``created`` is in seconds since 1970."""
+    """Holds a key without its secret. ``created`` is in seconds since 1970."""
 
     id: str
     name: str
@@ -56,7 +56,7 @@ class ApiKey:
 
 
 class Keys:
-    """The API keys in the database."""
+    """Manages the API keys in the database."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine

@@ -12,8 +12,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Found(Generic[T]):
-    """One page of a list: ``next`` is the cursor of the page after it, None on the last; ``total`` counts what all
-    pages hold."""
+    """Holds one page of a list: ``next`` is the cursor of the page after it, None on the last; ``total`` counts what
+    all pages hold."""
 
     items: tuple[T, ...]
     next: str | None
@@ -22,7 +22,7 @@ class Found(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Why a job failed: a stable ``type``, what to do, and every fault."""
+    """States why a job failed: a stable ``type``, what to do, and every fault."""
 
     type: str
     detail: Message
@@ -31,8 +31,8 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone;
-    ``ahead`` is how many jobs of its queue go before a queued one; ``files`` are those of a result, by name."""
+    """Holds a job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone; ``ahead`` is
+    how many jobs of its queue go before a queued one; ``files`` are those of a result, by name."""
 
     id: str
     name: str
@@ -58,7 +58,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One subject's session with the ids of its captures."""
+    """Holds one subject's session with the ids of its captures."""
 
     id: str
     created: str
@@ -69,8 +69,8 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """One person: sessions of one name, newest first, with how many captures they have; ``id`` is the newest session's.
-    ``head``: the newest job with a result, ``heads`` how many there are; ``tags``: of their captures."""
+    """Holds one person: sessions of one name, newest first, with how many captures they have; ``id`` is the newest
+    session's. ``head``: the newest job with a result, ``heads`` how many there are; ``tags``: of their captures."""
 
     id: str
     label: str
@@ -87,9 +87,9 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A calibration and, once it succeeded, what it found. ``pictures``: their number by camera; ``kind``: of what they
-    are, board or scene; ``stage``,
-    ``progress`` (0 to 1) and remaining seconds of one that runs; ``missing``: what would make its verdict better."""
+    """Holds a calibration and, once it succeeded, what it found. ``pictures``: their number by camera; ``kind``: of
+    what they are, board or scene; ``stage``, ``progress`` (0 to 1) and remaining seconds of one that runs; ``missing``:
+    what would make its verdict better."""
 
     id: str
     created: str
@@ -120,7 +120,7 @@ class RigCamera:
 
 @dataclass(frozen=True, slots=True)
 class RigState:
-    """The rig at this moment; ``calibration`` is whose it is: "own", "studio", or None where there is none."""
+    """Holds the rig at this moment; ``calibration`` is whose it is: "own", "studio", or None where there is none."""
 
     id: str
     kind: str
@@ -132,7 +132,8 @@ class RigState:
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """What a camera was set to (None: left as the camera has it); ``unmet`` has a line for each it did not take."""
+    """Holds what a camera was set to (None: left as the camera has it); ``unmet`` has a line for each it did not
+    take."""
 
     exposure_ms: float | None
     gain_db: float | None
@@ -142,7 +143,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class CleanPlates:
-    """The cameras of which clean plates were taken, and how many of each."""
+    """Holds the cameras of which clean plates were taken, and how many of each."""
 
     cameras: tuple[str, ...]
     plates: int

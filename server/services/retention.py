@@ -52,8 +52,8 @@ def sweep(service: Service) -> dict[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class Upcoming:
-    """A finished job or a capture that retention takes next. ``goes``: when, None where that hangs on the disk or on
-    what comes; ``why``: the setting."""
+    """Holds a finished job or a capture that retention takes next. ``goes``: when, None where that hangs on the disk or
+    on what comes; ``why``: the setting."""
 
     kind: str
     id: str

@@ -43,7 +43,7 @@ SHOT_BYTES = 64 << 20
 
 
 class RigBackend(Protocol):
-    """What the service asks of a rig. Blocks; call it from a thread."""
+    """Declares what the service needs of a rig. Blocks; call it from a thread."""
 
     def describe(self) -> RigState: ...
 
@@ -58,7 +58,7 @@ class RigBackend(Protocol):
         ...
 
     def preview(self, camera: str) -> bytes:
-        """A JPEG of what the camera sees now. Raises NotFound or Unavailable."""
+        """Returns a JPEG of what the camera sees now. Raises NotFound or Unavailable."""
         ...
 
     def camera_settings(self, camera: str) -> CameraSettings:
@@ -98,7 +98,8 @@ class RigBackend(Protocol):
 
 
 class SimulatedRig:
-    """The embedded studio, drawn in a child process with its own GL context. The truth of a shot is kept beside it."""
+    """Photographs the embedded studio, drawn in a child process with its own GL context. The truth of a shot is kept
+    beside it."""
 
     def __init__(self, calibration: Path) -> None:
         self._calibration = calibration
@@ -173,7 +174,8 @@ class SimulatedRig:
 
 
 class RealRig:
-    """Cameras of a rig.toml: opened at the first need and kept open; a rig that cannot be opened is tried again."""
+    """Photographs with the cameras of a rig.toml: opened at the first need and kept open; a rig that cannot be opened
+    is tried again."""
 
     def __init__(self, path: Path, calibration: Path) -> None:
         self._from_file: RigConfig = read_rig_config(path)
@@ -357,7 +359,7 @@ def open_rig(settings: ServiceSettings) -> RigBackend:
 
 
 def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
-    """RGB pixels as a JPEG of at most ``width``."""
+    """Encodes RGB pixels as a JPEG of at most ``width``."""
     small = reduced(image, width)
     done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
     assert done

@@ -28,8 +28,8 @@ from server.tasks.child import ChildProcessPool
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding about the service: whether it is well, and what to do where it is not; ``starting``: it is not well
-    yet, and nothing is to be done."""
+    """Holds one finding about the service: whether it is well, and what to do where it is not; ``starting``: it is not
+    well yet, and nothing is to be done."""
 
     ok: bool
     detail: Message
@@ -38,7 +38,7 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """The parts of one service process."""
+    """Holds the parts of one service process."""
 
     settings: ServiceSettings
     store: Store
@@ -82,8 +82,8 @@ class Service:
         return self.calibrations.add(target, "upload", label)
 
     def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
-        """Every capture from now on gets this calibration; returns the rig's state. Raises NotFound; Conflict, for a
-        poor one, too, unless ``poor`` says that it is to be used all the same."""
+        """Uses this calibration for every capture from now on. Returns the rig's state. Raises NotFound; Conflict, for
+        a poor one, too, unless ``poor`` says that it is to be used all the same."""
         if not poor:
             self.calibrations.check_usable(identity)
         self.rig.use(self.calibrations.cameras_json(identity))

@@ -16,7 +16,7 @@ from server.storage.store import Store, new_id
 
 
 class Sessions:
-    """The sessions of a service. Methods block."""
+    """Manages the sessions of a service. Methods block."""
 
     def __init__(self, store: Store, jobs: Jobs, library: Library) -> None:
         self._store, self._jobs, self._library = store, jobs, library
@@ -30,7 +30,8 @@ class Sessions:
         return _with_captures(record, [])
 
     def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[Session]:
-        """Newest first, each with the ids of its captures. Raises InputError for a cursor of another list."""
+        """Lists sessions, newest first, each with the ids of its captures. Raises InputError for a cursor of another
+        list."""
         page = self._library.sessions(sought, limit, cursor)
         captures = self._library.captures_of(page.ids)
         records = [record for identity in page.ids if (record := self._record(identity)) is not None]
@@ -79,7 +80,7 @@ class Sessions:
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
-        """Another label or consent note; what is None stays. Raises NotFound, InputError."""
+        """Changes label or consent note; what is None stays. Raises NotFound, InputError."""
         check_texts({"label": label, "consent": consent})
         changes = {name: text for name, text in (("label", label), ("consent", consent)) if text is not None}
         record = self._store.change_session(identity, lambda old: replace(old, **changes))

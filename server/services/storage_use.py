@@ -76,7 +76,7 @@ class StorageCount:
         )
 
     def forget(self) -> None:
-        """The next question makes a new look; until it is through, the old one is told."""
+        """Makes the next question count anew; until that is done, the old count is returned."""
         self._at = None if self._found is None else 0.0
 
     def _look(self, data: Path) -> None:
@@ -87,8 +87,8 @@ class StorageCount:
 
 
 def count(data: Path) -> tuple[KindOfUse, ...]:
-    """Counts the bytes of all files, by kind; "other" is what else lies in the folder, the database and models among
-    it."""
+    """Counts the bytes of all files, by kind; "other" is what else lies in the folder, the database and models
+    among it."""
     known = {folder for folders in KINDS.values() for folder in folders}
     found = []
     for kind, folders in KINDS.items():

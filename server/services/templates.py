@@ -10,7 +10,7 @@ from pipeline.templates.names import list_templates
 
 @dataclass(frozen=True, slots=True)
 class TemplateAtHand:
-    """A template by the name that a job gives it."""
+    """Holds a template by the name that a job gives it."""
 
     id: str
     name: str
@@ -24,7 +24,7 @@ class TemplateAtHand:
 
 
 def templates_at_hand() -> list[TemplateAtHand]:
-    """By name. Raises OSError where a model's file goes as it is read."""
+    """Lists templates by name. Raises OSError where a model's file goes as it is read."""
     found, digests = [], None
     for name, path in list_templates().items():
         try:

@@ -68,7 +68,7 @@ class ResumableUploads:
 
     @contextmanager
     def lock(self, identity: str) -> Iterator[None]:
-        """One at a time writes to an upload or removes it, in this process or another. Raises Conflict, NotFound."""
+        """Lets one at a time write to an upload or remove it, in this process or another. Raises Conflict, NotFound."""
         with ExitStack() as stack:
             try:
                 stream = stack.enter_context((self._store.folder("uploads", identity) / "upload.json").open("rb"))

@@ -33,7 +33,7 @@ TIMEOUT_S = 10.0
 
 
 class Webhooks:
-    """The addresses that are told, and the telling."""
+    """Keeps the addresses of webhooks and delivers to them."""
 
     def __init__(self, engine: sa.Engine, origins: Collection[str] = ()) -> None:
         """``origins``: where a job's own webhook may be."""

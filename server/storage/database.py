@@ -22,7 +22,7 @@ metadata = sa.MetaData()
 
 
 class DatabaseUnavailable(EigenheadError):
-    """The database does not answer, or is damaged."""
+    """Reports that the database does not answer, or is damaged."""
 
     def __init__(self, place: str, error: SQLAlchemyError) -> None:
         why = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
@@ -170,7 +170,7 @@ def scrub(engine: sa.Engine) -> None:
 
 
 def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElement[bool]:
-    """Of a worker that has not stopped and was heard of in the last ``silent_s``."""
+    """Returns the condition for workers that have not stopped and were heard of in the last ``silent_s``."""
     return sa.and_(workers.c.stopped.is_(None), workers.c.seen > now_sql(connection) - silent_s)
 
 

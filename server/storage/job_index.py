@@ -25,8 +25,8 @@ JobOrder = Literal["-created", "created", "-finished", "finished"]
 
 @dataclass(frozen=True, slots=True)
 class JobQuery:
-    """Which jobs, in what order: all words of ``sought`` stand in name, model, method, level or id, or are found in the
-    capture; ``statuses`` are the engine's words."""
+    """States which jobs are listed, in what order: all words of ``sought`` stand in name, model, method, level or id,
+    or are found in the capture; ``statuses`` are the engine's words."""
 
     sought: str = ""
     statuses: Sequence[str] | None = None
@@ -44,7 +44,7 @@ class JobOfCapture:
 
 
 class JobIndex:
-    """The jobs of one workflow of the engine. Methods block."""
+    """Lists the jobs of one workflow of the engine. Methods block."""
 
     def __init__(self, engine: sa.Engine, workflow: str) -> None:
         self._engine, self._workflow = engine, workflow
@@ -56,7 +56,7 @@ class JobIndex:
         self._status = sa.table("workflow_status", *columns, schema=schema)
 
     def add(self, job_id: str, request: JobRequest, session: str | None) -> None:
-        """Nothing happens where the job is known."""
+        """Adds a job; does nothing where it is known."""
         row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
         with suppress(IntegrityError), self._engine.begin() as connection:
             connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
@@ -109,8 +109,8 @@ class JobIndex:
             return [*connection.scalars(query.order_by(status.created_at.desc()))]
 
     def places(self) -> dict[str, int]:
-        """How many jobs of its queue go before each queued one: those that run, then lower priority numbers, then who
-        came first. The engine takes jobs of one millisecond in no order of its own; here the id settles it."""
+        """Returns how many jobs of its queue go before each queued one: those that run, then lower priority numbers,
+        then who came first. The engine takes jobs of one millisecond in no order of its own; here the id settles it."""
         status = self._status.c
         places: dict[str, int] = {}
         running = sa.select(status.queue_name, sa.func.count()).where(status.name == self._workflow)
@@ -126,7 +126,7 @@ class JobIndex:
         return places
 
     def of_captures(self, captures: Collection[str]) -> dict[str, list[JobOfCapture]]:
-        """Every job of some captures, newest first."""
+        """Returns every job of some captures, newest first."""
         found: dict[str, list[JobOfCapture]] = {capture: [] for capture in captures}
         status, listed = self._status.c, list(captures)
         joined = job_index.join(self._status, status.workflow_uuid == job_index.c.job_id)

@@ -31,8 +31,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class CaptureQuery:
-    """Which captures, in what order: all words of ``sought`` stand in label, expression, tags, session, verdict, source
-    or id; ``tag``: those that bear it; ``before``: only those older than this id."""
+    """States which captures are listed, in what order: all words of ``sought`` stand in label, expression, tags,
+    session, verdict, source or id; ``tag``: those that bear it; ``before``: only those older than this id."""
 
     sought: str = ""
     session: str | None = None
@@ -53,7 +53,7 @@ class SubjectPage:
 
 
 class Library:
-    """The two index tables. Methods block."""
+    """Keeps the two index tables. Methods block."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
@@ -236,7 +236,7 @@ class Library:
 
 
 def captures_with(word: str) -> sa.ColumnElement[bool]:
-    """Of captures that a word of a search stands in, or in whose session it does."""
+    """Returns the condition for captures that a word of a search stands in, or in whose session it does."""
     sessions = sa.select(session_index.c.id).where(sessions_with(word))
     matches = sa.or_(contains(capture_index.c.words, word), is_or_ends(capture_index.c.id, word))
     return sa.or_(matches, capture_index.c.session.in_(sessions))

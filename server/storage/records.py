@@ -44,7 +44,7 @@ StoredFault = Annotated[Fault, PlainValidator(_read_fault), PlainSerializer(_wri
 
 @dataclass(frozen=True, slots=True)
 class CameraSize:
-    """A camera of a capture and the size of its pictures."""
+    """Holds a camera of a capture and the size of its pictures."""
 
     name: str
     width: int
@@ -53,9 +53,9 @@ class CameraSize:
 
 @dataclass(frozen=True, slots=True)
 class CaptureContent:
-    """What is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the calibration
-    board, which show no head. ``checks``: what was measured of each camera's picture; ``warnings``: what was said when
-    its cameras were found from the photographs."""
+    """Holds what is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the
+    calibration board, which show no head. ``checks``: what was measured of each camera's picture; ``warnings``: what
+    was said when its cameras were found from the photographs."""
 
     cameras: tuple[CameraSize, ...]
     front: str
@@ -69,9 +69,9 @@ class CaptureContent:
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
-    """A capture: where it came from, what people say of it, what is in it, the certificate of the rig's shot, and the
-    verdict on it with its faults (None of what was not judged: the board, captures of earlier versions). ``warnings``:
-    what every result of it will be warned of."""
+    """Holds a capture: where it came from, what people say of it, what is in it, the certificate of the rig's shot, and
+    the verdict on it with its faults (None of what was not judged: the board, captures of earlier versions).
+    ``warnings``: what every result of it will be warned of."""
 
     id: str
     created: str
@@ -114,7 +114,8 @@ class CalibrationRecord:
 
 @dataclass(frozen=True, slots=True)
 class UploadRecord:
-    """A resumable upload: ``fields`` say of the capture what a form would, ``capture`` is its id once it was made."""
+    """Holds a resumable upload: ``fields`` say of the capture what a form would, ``capture`` is its id once it was
+    made."""
 
     id: str
     length: int
@@ -126,7 +127,7 @@ class UploadRecord:
 
 @dataclass(frozen=True, slots=True)
 class RigAdjustment:
-    """What differs from rig.toml: settings of cameras by name, and the lamps that are on during a shot."""
+    """Holds what differs from rig.toml: settings of cameras by name, and the lamps that are on during a shot."""
 
     cameras: dict[str, dict[str, float | None]]
     lights: tuple[int, ...] | None = None
@@ -184,14 +185,14 @@ def read_checks(document: Any) -> dict[str, ViewDocument]:
 
 
 class JobWebhook(TypedDict):
-    """The address that is told of one job; ``secret`` signs the messages."""
+    """Holds the address that is told of one job; ``secret`` signs the messages."""
 
     url: str
     secret: str | None
 
 
 class JobRequest(TypedDict):
-    """What a job is asked for, as the job engine keeps it."""
+    """Holds what a job shall do, as the job engine keeps it."""
 
     capture_id: str
     model: str | None
@@ -202,14 +203,14 @@ class JobRequest(TypedDict):
 
 
 class FileEntry(TypedDict):
-    """A file of a result, as the job engine keeps it."""
+    """Holds a file of a result, as the job engine keeps it."""
 
     bytes: int
     sha256: str
 
 
 class CalibrationOutcome(TypedDict):
-    """What a calibration found, as the job engine keeps it; ``sha256`` is of its cameras.json. Those of earlier
+    """Holds what a calibration found, as the job engine keeps it; ``sha256`` is of its cameras.json. Those of earlier
     versions were not judged."""
 
     verdict: NotRequired[str]
@@ -224,7 +225,7 @@ class CalibrationOutcome(TypedDict):
 
 
 class WebhookMessage(TypedDict):
-    """One delivery, as the job engine keeps it, to a webhook of the service or to a job's own."""
+    """Holds one delivery, as the job engine keeps it, to a webhook of the service or to a job's own."""
 
     webhook: str
     own: NotRequired[JobWebhook]
@@ -234,7 +235,7 @@ class WebhookMessage(TypedDict):
 
 
 class EventDocument(TypedDict, total=False):
-    """What happened to a job: a stage with its progress (0 to 1) and remaining time, or a new state."""
+    """Holds what happened to a job: a stage with its progress (0 to 1) and remaining time, or a new state."""
 
     state: str
     stage: str

@@ -19,7 +19,7 @@ RESULT_FILE = re.compile(
 
 @contextmanager
 def fresh_folder(out: Path) -> Iterator[Path]:
-    """An empty folder that takes the place of ``out`` when the block ends well, and is gone when it does not.
+    """Makes an empty folder that takes the place of ``out`` when the block ends well, and is gone when it does not.
 
     Raises OSError at once where ``out`` cannot be written."""
     if out.exists() and not out.is_dir():

@@ -52,7 +52,7 @@ T = TypeVar("T")
 
 
 def new_id() -> str:
-    """28 hex digits that sort by time: 12 of milliseconds, 16 at random."""
+    """Returns 28 hex digits that sort by time: 12 of milliseconds, 16 at random."""
     return f"{time.time_ns() // 1_000_000:012x}{secrets.token_hex(8)}"
 
 
@@ -62,14 +62,14 @@ def is_id(text: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class StoredFile:
-    """A file and the sha256 of what is in it."""
+    """Holds a file and the sha256 of what is in it."""
 
     path: Path
     sha256: str
 
 
 class RecordIndex(Protocol):
-    """What is told of every record that is written or removed; ``changed``: its file's time, in ns."""
+    """Hears of every record that is written or removed; ``changed``: its file's time, in ns."""
 
     def put_capture(self, record: CaptureRecord, changed: int) -> None: ...
     def drop_capture(self, identity: str) -> None: ...
@@ -87,7 +87,7 @@ _THINGS = {
 
 
 class Store:
-    """The data folder. Every id that comes from a request passes ``is_id`` before it becomes part of a path."""
+    """Manages the data folder. Every id that comes from a request passes ``is_id`` before it becomes part of a path."""
 
     def __init__(self, data: Path, index: RecordIndex | None = None) -> None:
         self.data, self._index = data, index
@@ -97,7 +97,7 @@ class Store:
         data.chmod(0o700)  # faces are biometric data
 
     def folder(self, kind: str, identity: str) -> Path:
-        """Where a capture, job, ... lies or would lie. Raises NotFound for what is no id."""
+        """Returns where a capture, job, ... lies or would lie. Raises NotFound for what is no id."""
         if not is_id(identity):
             raise NotFound(_THINGS.get(kind) or compose("thing-file"), identity)
         return self.data / kind / identity
@@ -111,7 +111,7 @@ class Store:
 
     @contextmanager
     def incoming(self) -> Iterator[Path]:
-        """A folder to receive things in; it is gone afterwards, with everything that was not moved out of it."""
+        """Makes a folder to receive things in; it is gone afterwards, with everything that was not moved out of it."""
         folder = self.data / "incoming" / new_id()
         folder.mkdir(parents=True)
         try:
@@ -177,7 +177,7 @@ class Store:
         return record
 
     def put_checks(self, folder: Path, checks: Mapping[str, ViewDocument]) -> None:
-        """Into a capture's folder that is not yet in its place."""
+        """Writes the checks into a capture's folder that is not yet in its place."""
         write_atomically(folder / "checks.json", _encoded(checks))
 
     def checks(self, identity: str) -> dict[str, ViewDocument]:
@@ -225,7 +225,7 @@ class Store:
                 self._index.drop_capture(identity)
 
     def cache_of(self, identity: str) -> Path:
-        """Where silhouettes, thumbnails and the like of a capture are kept."""
+        """Returns where silhouettes, thumbnails and the like of a capture are kept."""
         return self.folder("cache/captures", identity)
 
     def add_session(self, record: SessionRecord) -> None:

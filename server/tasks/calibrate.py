@@ -108,7 +108,7 @@ def calibrate_folder(
     cache: str,
     front: str | None,
 ) -> CalibrationOutcome:
-    """``calibrate()``, or ``calibrate_scene()``, and its files; returns what the record shows."""
+    """Runs ``calibrate()``, or ``calibrate_scene()``, and writes its files. Returns what the record shows."""
     if not is_of_board(Path(folder)):
         return _calibrate_scene(report, Path(folder), Path(result), front)
     from calibration.board.board import read_board

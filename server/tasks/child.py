@@ -41,8 +41,8 @@ Report = Progress  # as the task of a reconstruction calls it
 
 
 class WorkFailed(EigenheadError):
-    """The work raised. ``kind`` tells a known failure (an error of this project, a full disk, no memory) from a bug,
-    whose ``trace`` is for the log."""
+    """Reports that the work raised. ``kind`` tells a known failure (an error of this project, a full disk, no memory)
+    from a bug, whose ``trace`` is for the log."""
 
     def __init__(
         self, kind: str, message: Message | str, faults: Iterable[Message | str] = (), trace: str = ""
@@ -73,7 +73,7 @@ class WorkerContext:
 
 
 class Child:
-    """One child process; a call starts it when there is none. Not for two threads at once.
+    """Runs work in one child process; a call starts it when there is none. Not for two threads at once.
 
     ``variables``: of its environment, over those of this process."""
 
@@ -89,7 +89,7 @@ class Child:
         report: Progress = lambda stage, fraction: None,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Callable[P, T]:
-        """``work``, a function of a module, as it runs in the child: ``child.remote(work)(name=value)`` calls
+        """Returns ``work``, a function of a module, as it runs in the child: ``child.remote(work)(name=value)`` calls
         ``work(context, report, name=value)`` there. What travels is the function's module and name.
 
         The call raises Cancelled within ``PATIENCE_S`` and one poll after ``cancelled()`` becomes true, InputError and
@@ -211,7 +211,7 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
 
 
 def serve(connection: Connection) -> None:
-    """The child's main loop: the first thread works (a GL context wants that), a second one listens."""
+    """Runs the child's main loop: the first thread works (a GL context wants that), a second one listens."""
     requests: queue.Queue[bytes] = queue.Queue()
     stop = threading.Event()
 

@@ -152,7 +152,7 @@ def ingest_folder(
 
 
 def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
-    """A shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
+    """Checks a shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
     root = Path(folder)
     for entry in root.iterdir():
         if entry.name != "images":

@@ -48,7 +48,7 @@ CAMERAS, FIGURES, PAGE = "cameras.json", "calibration.json", "calibration.html"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """What ``reconstruct`` needs, and what was said while it was found."""
+    """Holds what ``reconstruct`` needs, and what was said while it was found."""
 
     capture: Capture
     rig: Rig
@@ -66,7 +66,7 @@ def photographs_alone(folder: Path) -> bool:
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:
-    """A capture folder as it is, or, where it has no cameras, with those that its photographs give.
+    """Reads a capture folder as it is, or, where it has no cameras, with those that its photographs give.
 
     Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
     if not photographs_alone(folder):
@@ -145,7 +145,8 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
 
 
 def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
-    """Sizes as the headers say, before anything is decoded. Raises InputError naming every one that is too large."""
+    """Checks sizes as the headers say, before anything is decoded. Raises InputError naming every one that is too
+    large."""
     sizes = {path: picture_size(path) for path in files}
     huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
     if huge:

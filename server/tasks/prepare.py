@@ -26,7 +26,7 @@ PROCESSES_MOST = 8  # each takes 250 MB and half a second to load what it compil
 
 
 class Prepared(NamedTuple):
-    """Numbers of loops."""
+    """Holds numbers of loops."""
 
     compiled: int  # now
     missing: int  # still: nothing can be kept
@@ -34,7 +34,7 @@ class Prepared(NamedTuple):
 
 
 def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bool:
-    """In a child: compiles a line of the list. False where it could not be kept, which the log has said."""
+    """Compiles a line of the list, in a child. Returns False where it could not be kept, which the log has said."""
     from pipeline.kernel_list import Kernel
 
     kernel = Kernel.from_line(line)

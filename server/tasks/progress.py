@@ -56,11 +56,11 @@ class JobProgress:
         return self.seconds
 
     def remaining_s(self) -> float:
-        """Of this stage and all that come, at the pace of those that are done."""
+        """Estimates the seconds of this stage and all that come, at the pace of those that are done."""
         return (self._rest_of_stage() + self._to_come()) * self._pace()
 
     def progress(self) -> float:
-        """0 to 1, never falling: each stage counts by its expected time."""
+        """Returns 0 to 1, never falling: each stage counts by its expected time."""
         done = sum(took for stage, took in self._expected.items() if stage in self.seconds and stage != self._visit)
         expected_s, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
         now = done + expected_s * spent / max(spent + self._rest_of_stage(), 1e-9)

@@ -13,7 +13,8 @@ DONE = "done"  # the pipeline's last word, when nothing is written yet
 
 
 class CaptureWork(Protocol):
-    """What a worker runs for a job: ``reconstruct_capture``, or what the setting ``work`` names in its place."""
+    """Declares what a worker runs for a job: ``reconstruct_capture``, or what the setting ``work`` names in its
+    place."""
 
     def __call__(
         self,

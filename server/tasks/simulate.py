@@ -28,7 +28,7 @@ class SimulatedCertificate(TypedDict):
 
 
 def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: int | None) -> SimulatedCertificate:
-    """A capture in ``folder/files``, its truth in ``folder/truth``; returns the shot's certificate.
+    """Writes a capture in ``folder/files`` and its truth in ``folder/truth``. Returns the shot's certificate.
 
     Without a seed the subject is another one each time. The operator's clicks are left out: they are made later.
     """

@@ -73,8 +73,8 @@ def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
 
 
 class StageDurations:
-    """Seconds that each stage is expected to take. ``file`` need not exist; where it cannot be written, only this
-    process learns."""
+    """Keeps the seconds that each stage is expected to take. ``file`` need not exist; where it cannot be written, only
+    this process learns."""
 
     def __init__(self, file: Path | None = None) -> None:
         self._file = file or cache_folder() / "durations.json"

@@ -25,14 +25,14 @@ NEUTRAL: Mapping[str, float] = MappingProxyType({})
 
 
 def drawn_subject(model: HeadModel, rng: np.random.Generator, weights: Mapping[str, float] = NEUTRAL) -> Subject:
-    """A head drawn from the model's population, all modes."""
+    """Draws a head from the model's population, all modes."""
     return model_subject(model, rng.standard_normal(len(model.modes)), f"drawn from {model.name}", weights)
 
 
 def model_subject(
     model: HeadModel, coefficients: np.ndarray, name: str, weights: Mapping[str, float] = NEUTRAL
 ) -> Subject:
-    """A head of the model, with the expression that ``weights`` name."""
+    """Makes a head of the model, with the expression that ``weights`` name."""
     full = model.levels["full"]
     vertices = model.posed_vertices(coefficients, weights)
     landmarks = {name: vertices[index] for name, index in model.landmarks.items()}
@@ -60,7 +60,7 @@ def simulate_folder(
     out: Path, *, subject: str, seed: int, preset: Preset, faults: list[str], renderer: Renderer,
     expression: Sequence[str] = (),
 ) -> Path:  # fmt: skip
-    """``eigenhead simulate``: a capture folder at ``out``; returns where the truth is."""
+    """Writes a capture folder at ``out`` (``eigenhead simulate``). Returns where the truth is."""
     rng = np.random.default_rng(seed)
     chosen = subject_of(subject, load_model(), rng, expression)
     planted = tuple(fault_from_text(text) for text in faults)

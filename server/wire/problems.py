@@ -97,7 +97,7 @@ def status_of(refusal: type[Refused]) -> int:
 
 
 class Problem(EigenheadError):
-    """What HTTP itself refuses, or a refusal of the service with its status."""
+    """Reports what HTTP itself refuses, or a refusal of the service with its status."""
 
     def __init__(
         self,

@@ -60,7 +60,7 @@ log = structlog.get_logger()
 
 
 class Worker:
-    """One worker of one process (the job engine is a singleton)."""
+    """Runs one worker of one process (the job engine is a singleton)."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
@@ -358,7 +358,7 @@ def described(folder: Path) -> dict[str, FileEntry]:
 
 
 def run_worker(settings: ServiceSettings, *, until_eof: bool = False) -> None:
-    """The worker process. With ``until_eof`` it stops when its standard input ends: when its parent does."""
+    """Runs the worker process. With ``until_eof`` it stops when its standard input ends: when its parent does."""
     worker = Worker(settings)
     worker.start()
     if until_eof:

@@ -53,7 +53,7 @@ _JPEG = [
 
 @dataclass(frozen=True, slots=True)
 class DeviceFault:
-    """A fault of ``KINDS``. ``camera`` None: the whole rig."""
+    """Holds a fault of ``KINDS``. ``camera`` None: the whole rig."""
 
     kind: str
     camera: str | None = None
@@ -138,7 +138,7 @@ class StudioDevices:
 
     @property
     def port_link(self) -> Path:
-        """Where rig.toml finds the trigger box."""
+        """Returns where rig.toml finds the trigger box."""
         return self.folder.resolve() / "trigger-box"
 
     def seat(self, present: bool) -> None:

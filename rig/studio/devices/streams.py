@@ -80,7 +80,7 @@ class StreamServer:
 
     @property
     def address(self) -> str:
-        """Where everything is served."""
+        """Returns where everything is served."""
         return f"http://{self._host}:{self.port}"
 
     def url(self, name: str) -> str:

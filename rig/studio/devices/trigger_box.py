@@ -31,7 +31,7 @@ LIGHTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """The outputs of one FIRE: channel to delay (s) behind ``time_s`` (time.monotonic)."""
+    """Holds the outputs of one FIRE: channel to delay (s) behind ``time_s`` (time.monotonic)."""
 
     time_s: float
     delays_s: dict[int, float]

@@ -43,7 +43,7 @@ def _panel(image: Float[np.ndarray, "h w 3"], rng: np.random.Generator, tint: np
 
 
 def chair(width: int, height: int, rng: np.random.Generator) -> Float[np.ndarray, "h w 4"]:
-    """A chair's back at the image's side: linear RGB times alpha, and alpha."""
+    """Returns a chair's back at the image's side: linear RGB times alpha, and alpha."""
     image = np.zeros((height, width, 4), np.float32)
     colour = (*(rng.uniform(0.02, 0.08, 3)).tolist(), 1.0)
     left = int(width * (rng.uniform(0.03, 0.08) if rng.random() < 0.5 else rng.uniform(0.76, 0.8)))

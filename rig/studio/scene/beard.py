@@ -35,7 +35,7 @@ def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Gener
 
 
 def beard_share(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
-    """How much beard grows at each vertex, 0 to 1: jaw, chin and upper lip, up to the ears, not the lips."""
+    """Returns how much beard grows at each vertex, 0 to 1: jaw, chin and upper lip, up to the ears, not the lips."""
     marks, (x, y, z) = body.landmarks, vertices.T
     mouth, ears = marks["stomion"], body.ears
     across = (x - mouth[0]) / body.half_breadth

@@ -13,7 +13,7 @@ def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarra
 
 
 def finer_grid(field: Float[np.ndarray, "r c *_"], times: int) -> Float[np.ndarray, "_ _ *_"]:
-    """A grid that is closed from its last column to its first, interpolated linearly in both directions."""
+    """Returns a grid that is closed from its last column to its first, interpolated linearly in both directions."""
     if times == 1:
         return field
     rows, columns = field.shape[:2]

@@ -47,8 +47,8 @@ class HairStyle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hair:
-    """One surface of hair, head frame. ``shade`` is its tone against the style's; ``roots`` names the shell vertex that
-    each strand vertex is lit like; nobody sees the inside of a ``one_sided`` shell."""
+    """Holds one surface of hair, head frame. ``shade`` is its tone against the style's; ``roots`` names the shell
+    vertex that each strand vertex is lit like; nobody sees the inside of a ``one_sided`` shell."""
 
     shell: Float[np.ndarray, "v 3"]
     shell_faces: Int[np.ndarray, "f 3"]

@@ -23,7 +23,7 @@ SIDES = 10  # of a tube
 
 
 def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
-    """A cap over a head and its hair, if any (head frame, mm)."""
+    """Returns a cap over a head and its hair, if any (head frame, mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     radius = outer_radius(head - centre, open_ears=True)
     if hair is not None:

@@ -23,7 +23,7 @@ BIAS_MM = 3.0  # a surface does not shade itself for the coarseness of the map, 
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """A soft box. ``towards``: from the subject, world axes of a rig with y up and z to the front. Linear RGB."""
+    """Holds a soft box. ``towards``: from the subject, world axes of a rig with y up and z to the front. Linear RGB."""
 
     towards: tuple[float, float, float]
     colour: tuple[float, float, float]

@@ -96,7 +96,7 @@ def _envelope(points: Float[np.ndarray, "n 3"], unit: float, length_mm: float) -
 
 
 def knot(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """A bun of twisted hair on the crown, ``style.bun_mm`` in radius."""
+    """Returns a bun of twisted hair on the crown, ``style.bun_mm`` in radius."""
     elevation = np.radians(BUN_ELEVATION_DEG)
     outward = np.array([0.0, np.sin(elevation), -np.cos(elevation)])
     arms = shell.shell - body.ears

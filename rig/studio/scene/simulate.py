@@ -38,7 +38,7 @@ THREADS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one camera looks at: the subject's linear light times coverage, and coverage; the backdrop's light."""
+    """Holds what one camera looks at: the subject's linear light times coverage, and coverage; the backdrop's light."""
 
     subject: Float[np.ndarray, "h w 4"]
     backdrop: Float[np.ndarray, "h w 3"]
@@ -51,7 +51,7 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A lit studio with a subject in it. ``rig`` is what calibration says, ``true_rig`` where the cameras are."""
+    """Holds a lit studio with a subject in it. ``rig`` is what calibration says, ``true_rig`` where the cameras are."""
 
     rig: Rig
     true_rig: Rig
@@ -71,7 +71,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedCapture:
-    """The pictures, the rig as calibrated, and the scene, which holds the truth."""
+    """Holds the pictures, the rig as calibrated, and the scene, which holds the truth."""
 
     capture: Capture
     rig: Rig
@@ -162,7 +162,8 @@ def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[
 
 
 def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) -> Capture:
-    """Photographs clean plates, then the shot. ``faults`` name their cameras (``simulate`` draws those that do not)."""
+    """Photographs clean plates, then the shot. ``faults`` name their cameras (``simulate`` draws those that do
+    not)."""
     names = scene.rig.names
     click_rng, *rngs = rng.spawn(1 + len(names))
 

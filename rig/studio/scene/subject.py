@@ -55,7 +55,7 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """A head in the head frame (mm). Landmarks may be missing, which leaves the skin without brows and lips."""
+    """Holds a head in the head frame (mm). Landmarks may be missing, which leaves the skin without brows and lips."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
@@ -84,7 +84,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """A part before it is placed and lit, head frame. ``shows``: head, hair or clothes."""
+    """Holds a part before it is placed and lit, head frame. ``shows``: head, hair or clothes."""
 
     shows: str
     vertices: Float[np.ndarray, "v 3"]
@@ -98,9 +98,9 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dressed:
-    """The lit subject in the world frame: the bare head, and what it wears (hair first, which hides most of the rest).
-    ``solid`` are vertices and faces of all but the strands of hair, for occlusion; ``surfaces`` are the same by what
-    they are: head, hair, clothes."""
+    """Holds the lit subject in the world frame: the bare head, and what it wears (hair first, which hides most of the
+    rest). ``solid`` are vertices and faces of all but the strands of hair, for occlusion; ``surfaces`` are the same by
+    what they are: head, hair, clothes."""
 
     head: Part
     worn: tuple[Part, ...]

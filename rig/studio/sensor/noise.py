@@ -37,7 +37,7 @@ def around(
 def waves(
     rng: np.random.Generator, points: Float[np.ndarray, "n 3"], shortest_mm: float, longest_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """A random field in space, standard deviation 1: a sum of waves of random directions and lengths."""
+    """Returns a random field in space, standard deviation 1: a sum of waves of random directions and lengths."""
     count = 32
     directions = rng.normal(0, 1, (count, 3))
     lengths = rng.uniform(shortest_mm, longest_mm, (count, 1))

@@ -15,7 +15,7 @@ READ_SHARE = 0.1  # of mid grey's noise variance: what is there without light
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """One camera's own imperfections, the same in every picture it takes."""
+    """Holds one camera's own imperfections, the same in every picture it takes."""
 
     gains: tuple[float, float, float]  # exposure times white balance, per channel
     vignetting: float
