@@ -22,7 +22,7 @@ from server.batch.claims import Claims
 from server.batch.digests import capture_sha256
 from server.batch.failures import failure_of
 from server.batch.folder import BatchFolder, FailureRecord, Origin, file_name
-from server.tasks.child import Bench, Child
+from server.tasks.child import Child, WorkerContext
 from server.tasks.progress import JobProgress
 from server.tasks.reconstruct_folder import reconstruct_beside
 
@@ -39,7 +39,7 @@ class FolderWork(Protocol):
 
     def __call__(
         self,
-        bench: Bench,
+        context: WorkerContext,
         report: Progress,
         /,
         *,

@@ -55,13 +55,13 @@ ul { margin: 4px 0 0; padding-left: 1.1em; font-size: 13px; } code { font-size: 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """A capture on the sheet. ``told``: warnings, or why it failed; ``link``: of its folder, from the sheet."""
+    """A capture on the sheet. ``messages``: warnings, or why it failed; ``link``: of its folder, from the sheet."""
 
     name: str
     of: str
     state: str
     figures: str
-    told: tuple[MessageDocument, ...]
+    messages: tuple[MessageDocument, ...]
     picture: bytes | None
     link: str
 
@@ -75,7 +75,7 @@ def card_class(card: Card) -> str:
     """Returns what colours a card: the worst that is told of it."""
     if card.state != "done":
         return card.state
-    found = {severity(message["code"]) for message in card.told}
+    found = {severity(message["code"]) for message in card.messages}
     return next((kind for kind in ("severe", "warning") if kind in found), "good")
 
 
@@ -102,8 +102,8 @@ def summary(cards: Iterable[Card]) -> str:
         "failed": "failed", "missing": "not made yet",
     }  # fmt: skip
     counts = Counter(card_class(card) for card in cards)
-    told = [f"{counts[kind]} {word}" for kind, word in words.items() if counts[kind]]
-    return f"{sum(counts.values())} captures: {', '.join(told)}"
+    counted = [f"{counts[kind]} {word}" for kind, word in words.items() if counts[kind]]
+    return f"{sum(counts.values())} captures: {', '.join(counted)}"
 
 
 def views_of(turntable: Path) -> bytes | None:
@@ -143,10 +143,10 @@ def _content(card: Card) -> Iterator[str]:
     line = ", ".join(text for text in (card.of, state, card.figures) if text)
     if line:
         yield f'<div class="of">{html.escape(line)}</div>'
-    if card.told:
+    if card.messages:
         yield "<ul>"
         ranks = ("severe", "warning", "remark")
-        for message in sorted(card.told, key=lambda message: ranks.index(severity(message["code"]))):
+        for message in sorted(card.messages, key=lambda message: ranks.index(severity(message["code"]))):
             kind = "failed" if card.state == "failed" else severity(message["code"])
             code, text = html.escape(message["code"]), html.escape(message["message"])
             yield f'<li class="{kind}"><code>{code}</code> {text}</li>'

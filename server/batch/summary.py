@@ -40,8 +40,8 @@ def _told(folder: BatchFolder, task: BatchTask, columns: Sequence[Column]) -> tu
     row = row_of(capture, columns, report=report, origin=origin, failure=failure)
     of = " / ".join(text for text in (capture.subject, capture.session) if text)
     picture = None if report is None else views_of(folder.result(name) / "turntable.png")
-    told = tuple(report["warnings"]) if report is not None else _why(failure)
-    return row, Card(name, of, str(row["state"]), figures_of(row), told, picture, f"{name}/")
+    messages = tuple(report["warnings"]) if report is not None else _why(failure)
+    return row, Card(name, of, str(row["state"]), figures_of(row), messages, picture, f"{name}/")
 
 
 def _result(folder: BatchFolder, task: BatchTask) -> tuple[Origin | None, dict[str, Any] | None]:

@@ -52,8 +52,8 @@ def _own_group() -> Path:
         lines = Path("/proc/self/cgroup").read_text().splitlines()
     except OSError:
         return CGROUP
-    own = next((line[3:] for line in lines if line.startswith("0::")), "/")
-    return CGROUP / own.lstrip("/")
+    group = next((line[3:] for line in lines if line.startswith("0::")), "/")
+    return CGROUP / group.lstrip("/")
 
 
 def _number(path: Path) -> int | None:

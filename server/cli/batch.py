@@ -91,8 +91,8 @@ def batch(
 
     share = _share(shard)
     outputs = {"surface": surface, "formats": formats.split(",") if formats else None}
-    given = {name: value for name, value in outputs.items() if value}
-    document = settings_document(settings, method=method, detail=detail, outputs=given or None)
+    requested = {name: value for name, value in outputs.items() if value}
+    document = settings_document(settings, method=method, detail=detail, outputs=requested or None)
     with wrong_usage("FOLDER|LIST"):
         found = _found(captures, out)
     with wrong_usage("settings"):
@@ -134,22 +134,22 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     from server.batch.workers import free_memory, threads_of_worker, usable_cores, worker_count
     from server.cli.batch_display import BatchDisplay
 
-    own = [task for task in tasks if share.takes(task.capture.name)]
+    share_tasks = [task for task in tasks if share.takes(task.capture.name)]
     folder, cores = BatchFolder(out), usable_cores()
-    count = workers or worker_count(cores, free_memory(), len(own))
+    count = workers or worker_count(cores, free_memory(), len(share_tasks))
     files: list[Path] = []
-    with _terminated_like_interrupted(), BatchDisplay.opened(count, own) as display:
-        display.prepare(own)
+    with _terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
+        display.prepare(share_tasks)
         variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _given_threads()
-        run = BatchRun(folder, own, workers=count, variables=variables, observer=display)
+        run = BatchRun(folder, share_tasks, workers=count, variables=variables, observer=display)
         outcomes = run.run(lambda: files.extend(write_summary(folder, tasks)))
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
-    _warn_of_versions(folder, own)
+    _warn_of_versions(folder, share_tasks)
     if not has_parquet():
         warn(compose("batch-no-parquet", install=how_to_install("parquet")).text)
     answer(_document(outcomes, out, files, share, count, display.seconds()), json_out, [str(file) for file in files])
     if failed:
-        fail(str(CapturesFailed([outcome.name for outcome in failed], len(own))))
+        fail(str(CapturesFailed([outcome.name for outcome in failed], len(share_tasks))))
 
 
 def _given_threads() -> dict[str, str]:

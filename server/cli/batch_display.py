@@ -33,8 +33,8 @@ class BatchDisplay:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        told, left = TextColumn("{task.description}"), TextColumn("{task.fields[left]}")
-        columns = (told, BarColumn(), TimeElapsedColumn(), left)
+        description, left = TextColumn("{task.description}"), TextColumn("{task.fields[left]}")
+        columns = (description, BarColumn(), TimeElapsedColumn(), left)
         with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
             yield cls(workers, expected_s, bar)
 
@@ -83,9 +83,9 @@ class BatchDisplay:
             return
         progress = self._progress
         failed = f", {progress.failed} failed" if progress.failed else ""
-        told = f"{progress.ended} of {self._count}{failed}"
+        description = f"{progress.ended} of {self._count}{failed}"
         left = f"about {told_time(progress.remaining_s())} left"
-        self._bar.update(self._task, description=told, completed=progress.share(), left=left)
+        self._bar.update(self._task, description=description, completed=progress.share(), left=left)
 
     def _say(self, line: str) -> None:
         if self._bar is not None:

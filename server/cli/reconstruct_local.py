@@ -12,7 +12,7 @@ from rig.progress import Progress
 from server.cli.answers import CannotWrite, SpoilsCapture
 from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 from server.tasks.progress import JobProgress
 from server.tasks.reconstruct_folder import folder_of, reconstruct_folder
 
@@ -52,9 +52,9 @@ def _reconstruct_folder(
         progress.report(stage, fraction)
         report(stage, progress.progress())
 
-    with closing(Bench()) as bench:
+    with closing(WorkerContext()) as context:
         reconstruct_folder(
-            bench, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, ahead=report
+            context, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, ahead=report
         )  # fmt: skip
     durations.learn(chosen, progress.finish())
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from rig.formats.archive import extract_archive
 from rig.progress import Progress
 from server.processes import end_with_parent, share_one_heap
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
     from pipeline.settings import Settings
@@ -31,7 +31,7 @@ def folder_of(capture: Path) -> Iterator[Path]:
 
 
 def reconstruct_folder(
-    bench: Bench,
+    context: WorkerContext,
     report: Progress,
     *,
     folder: Path,
@@ -50,7 +50,7 @@ def reconstruct_folder(
 
     prepared = read_or_calibrate(folder, kept, front=chosen.front, report=ahead)
     kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
-    bench.keep(f"loops {kind}", lambda: prepare_kernels(ahead, chosen))
+    context.keep(f"loops {kind}", lambda: prepare_kernels(ahead, chosen))
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
@@ -60,19 +60,21 @@ def reconstruct_folder(
 
     report("read", 0.0)
     name = model or "default"
-    head_model = bench.keep(f"model {name}", lambda: load_model(name))
+    head_model = context.keep(f"model {name}", lambda: load_model(name))
     template = load_template(chosen.outputs.template, head_model)
-    renderer = bench.keep("renderer", Renderer.create)
+    renderer = context.keep("renderer", Renderer.create)
     segment = partial(keep_masks, kept)
-    context = ReconstructionContext(prepared.capture, prepared.rig, head_model, chosen, renderer, report, segment)
-    done = reconstruct(context)
+    reconstruction = ReconstructionContext(
+        prepared.capture, prepared.rig, head_model, chosen, renderer, report, segment
+    )
+    done = reconstruct(reconstruction)
     done = replace(done, warnings=(*prepared.warnings, *done.warnings))
     report("write", 0.0)
     write_result(out, done, prepared.capture, template)
 
 
 def reconstruct_beside(
-    bench: Bench,
+    context: WorkerContext,
     report: Progress,
     *,
     parent: int,
@@ -92,5 +94,5 @@ def reconstruct_beside(
     chosen, out = settings_from_document(settings), Path(result)
     with folder_of(Path(capture)) as folder:
         reconstruct_folder(
-            bench, report, folder=folder, out=out, kept=out, model=model, chosen=chosen, ahead=report
+            context, report, folder=folder, out=out, kept=out, model=model, chosen=chosen, ahead=report
         )  # fmt: skip

@@ -27,9 +27,9 @@ def reason_of(error: OSError | ValueError | RecursionError) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def settings_document(path: Path | None, **given: str | Mapping[str, object] | None) -> dict[str, object]:
+def settings_document(path: Path | None, **options: str | Mapping[str, object] | None) -> dict[str, object]:
     """Settings from a TOML or JSON file, then from options; tables are merged. Raises InputError."""
-    return merged_settings({} if path is None else read_settings_file(path), given)
+    return merged_settings({} if path is None else read_settings_file(path), options)
 
 
 def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:

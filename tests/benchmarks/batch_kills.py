@@ -97,8 +97,8 @@ def figures_of(kind: str, captures: int, kills: int, processes: int, folder: Pat
     } | ({"begun_twice": begun_twice(shots, folder)} if kind == "pinned" else {})
 
 
-def main(kind: str, *given: str) -> None:
-    captures, kills, processes = [*map(int, given), *(500 if kind == "pinned" else 60, 20, 2)[len(given) :]]
+def main(kind: str, *numbers: str) -> None:
+    captures, kills, processes = [*map(int, numbers), *(500 if kind == "pinned" else 60, 20, 2)[len(numbers) :]]
     with tempfile.TemporaryDirectory() as folder:
         figures = figures_of(kind, captures, kills, processes, Path(folder))
     sys.stdout.write(json.dumps({"figures": figures}, indent=1) + "\n")

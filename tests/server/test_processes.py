@@ -12,7 +12,7 @@ import pytest
 
 from rig.progress import Progress
 from server.processes import process_identity, process_started, python_command, python_environment
-from server.tasks.child import Bench, Child
+from server.tasks.child import Child, WorkerContext
 from server.tasks.egl import try_egl
 from tests.support.hostile_folder import hostile_folder
 from tests.support.services import ROOT
@@ -94,5 +94,5 @@ def test_a_child_has_the_variables_that_it_was_given() -> None:
         assert child.remote(thread_variable)() == "3"
 
 
-def thread_variable(bench: Bench, report: Progress) -> str:
+def thread_variable(context: WorkerContext, report: Progress) -> str:
     return os.environ["EIGENHEAD_THREADS"]

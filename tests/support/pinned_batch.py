@@ -41,35 +41,35 @@ class Silent:
 
     def __init__(self) -> None:
         self.pending = -1
-        self.told: list[tuple[str, str]] = []
+        self.events: list[tuple[str, str]] = []
 
     def begin(self, pending: int) -> None:
         self.pending = pending
 
     def start(self, name: str) -> None:
-        self.told.append(("start", name))
+        self.events.append(("start", name))
 
     def report(self, name: str, share: float) -> None:
         assert 0 <= share <= 1
 
     def leave(self, name: str) -> None:
-        self.told.append(("leave", name))
+        self.events.append(("leave", name))
 
     def end(self, outcome: Outcome) -> None:
-        self.told.append((outcome.state, outcome.name))
+        self.events.append((outcome.state, outcome.name))
 
 
 def plan(folder: Path, out: Path, settings: Mapping[str, object] | None = None) -> tuple[BatchTask, ...]:
     return plan_batch(find_captures(folder, out), settings or {}, None)
 
 
-def run_pinned(folder: Path, out: Path, *, workers: int = 2, shard: Shard = WHOLE, **given: Any) -> list[Outcome]:
+def run_pinned(folder: Path, out: Path, *, workers: int = 2, shard: Shard = WHOLE, **options: Any) -> list[Outcome]:
     """A batch of pinned captures in this process; ``given``: as ``BatchRun`` takes it, or ``settings``."""
-    tasks = plan(folder, out, given.pop("settings", None))
+    tasks = plan(folder, out, options.pop("settings", None))
     target = BatchFolder(out)
-    own = [task for task in tasks if shard.takes(task.capture.name)]
-    given = {"observer": Silent(), "variables": {}, "work": work, **given}
-    run = BatchRun(target, own, workers=workers, **given)
+    share_tasks = [task for task in tasks if shard.takes(task.capture.name)]
+    options = {"observer": Silent(), "variables": {}, "work": work, **options}
+    run = BatchRun(target, share_tasks, workers=workers, **options)
     return run.run(lambda: write_summary(target, tasks))
 
 

@@ -21,7 +21,7 @@ from rig.errors import InputError
 from rig.messages.message import compose
 from rig.progress import Progress
 from server.processes import end_with_parent
-from server.tasks.child import Bench
+from server.tasks.child import WorkerContext
 
 SECONDS, LOG = "EIGENHEAD_PINNED_S", "EIGENHEAD_PINNED_LOG"
 MEASURED = ("head_breadth", "head_length", "nose_length")
@@ -57,7 +57,7 @@ def pinned_report(seed: int, settings: Mapping[str, object], seconds: float = 1.
 
 
 def work(
-    bench: Bench,
+    context: WorkerContext,
     report: Progress,
     *,
     parent: int,

@@ -101,7 +101,7 @@ def test_every_fault_of_a_list_is_named_with_its_line(shots: Path) -> None:
         "photos,S07,,,,\n"
         "photos,S08,monday/anna/deep,[]\n"
     )
-    told = faults_of(shots / "study.csv")
+    faults = faults_of(shots / "study.csv")
     for line, words in [
         (3, f"{shots / 'monday/gone'} is not there"),
         (4, "lamp.jpg is no capture"),
@@ -111,11 +111,13 @@ def test_every_fault_of_a_list_is_named_with_its_line(shots: Path) -> None:
         (8, "6 cells, and the first row names 4 columns"),
         (9, "[]: cannot be read"),
     ]:
-        assert [fault for fault in told if fault.startswith(f"line {line}: ") and words in fault], (line, told)
-    assert "line 2, line 6 have the same name, monday/anna: say another one in the column name" in told
-    assert [fault for fault in told if fault.startswith("line 7: '../up' cannot name a folder")]
-    assert [fault for fault in told if fault.startswith("monday/anna/deep would lie within the result of monday/anna")]
-    assert len(told) == 10
+        assert [fault for fault in faults if fault.startswith(f"line {line}: ") and words in fault], (line, faults)
+    assert "line 2, line 6 have the same name, monday/anna: say another one in the column name" in faults
+    assert [fault for fault in faults if fault.startswith("line 7: '../up' cannot name a folder")]
+    assert [
+        fault for fault in faults if fault.startswith("monday/anna/deep would lie within the result of monday/anna")
+    ]
+    assert len(faults) == 10
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def open_claims(folder: Path, count: int, **given: float) -> Iterator[list[Claims]]:
+def open_claims(folder: Path, count: int, **options: float) -> Iterator[list[Claims]]:
     with ExitStack() as stack:
-        claims = [Claims(folder, **given) for _ in range(count)]
+        claims = [Claims(folder, **options) for _ in range(count)]
         for each in claims:
             stack.enter_context(each.beating())
         yield claims

@@ -42,9 +42,9 @@ def test_wrong_settings_are_named_with_their_captures() -> None:
     captures = [capture("anna", detial="photo"), capture("bert"), capture("carl", detail="deep", front=3)]
     with pytest.raises(InputError) as caught:
         plan_batch(captures, {}, None)
-    told = texts_of(caught.value.faults)
-    assert [fault.partition(":")[0] for fault in told] == ["anna", "carl", "carl"]
-    assert "detail" in told[0]
+    faults = texts_of(caught.value.faults)
+    assert [fault.partition(":")[0] for fault in faults] == ["anna", "carl", "carl"]
+    assert "detail" in faults[0]
 
 
 def test_what_is_wrong_for_all_is_said_once() -> None:

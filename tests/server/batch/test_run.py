@@ -37,7 +37,7 @@ def test_each_capture_becomes_a_folder_and_a_second_run_makes_nothing(tmp_path: 
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/*")}
     observer = Silent()
     assert set(states(run_pinned(shots, out, observer=observer)).values()) == {"kept"}
-    assert (observer.pending, observer.told) == (0, [])
+    assert (observer.pending, observer.events) == (0, [])
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/*")} == before
 
 
@@ -110,10 +110,10 @@ def test_what_another_process_has_is_waited_for_and_taken_as_it_comes(tmp_path: 
     environment = os.environ | {SECONDS: "0.15", LOG: str(log)}
     command = [*COMMAND, str(shots), str(out), "2", "1/1"]
     both = [subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE) for _ in range(2)]
-    told = [json.loads(process.communicate(timeout=120)[0]) for process in both]
+    printed = [json.loads(process.communicate(timeout=120)[0]) for process in both]
     assert [process.returncode for process in both] == [0, 0]
     for name in (f"s{k:04}" for k in range(12)):
-        assert sorted(states[name] for states in told) == ["kept", "made"]
+        assert sorted(states[name] for states in printed) == ["kept", "made"]
     begun = [line.split()[2] for line in log.read_text().splitlines() if "begins" in line]
     assert sorted(begun) == [f"s{k:04}" for k in range(12)]
     assert not (out / ".batch").exists()
@@ -136,8 +136,8 @@ def test_a_failure_of_another_process_is_told_and_not_tried_twice(tmp_path: Path
         time.sleep(0.5)
         folder.note_failure("bad", FailureRecord(other.token, "refused", compose("batch-list-empty"), (), None))
         other.release(file_name("bad"))
-        told = running.communicate(timeout=60)[0]
-    assert json.loads(told) == {"bad": "failed"}
+        printed = running.communicate(timeout=60)[0]
+    assert json.loads(printed) == {"bad": "failed"}
     assert not log.exists()
 
 

@@ -16,12 +16,12 @@ from server.batch.sheet import PANEL_PX, REMARKS, SEVERE, Card, card_class, figu
 from tests.support.services import ROOT
 
 
-def told(*codes: str) -> tuple[MessageDocument, ...]:
+def messages(*codes: str) -> tuple[MessageDocument, ...]:
     return tuple(MessageDocument(code=code, message=f"words of {code}") for code in codes)
 
 
 def card(name: str, state: str = "done", *codes: str, picture: bytes | None = b"jpeg") -> Card:
-    return Card(name, "S01", state, "breadth 150.0 mm", told(*codes), picture, f"{name}/")
+    return Card(name, "S01", state, "breadth 150.0 mm", messages(*codes), picture, f"{name}/")
 
 
 class Found(HTMLParser):
@@ -43,7 +43,7 @@ def test_the_sheet_needs_nothing_beside_it() -> None:
 
 
 def test_names_and_messages_are_text() -> None:
-    hostile = Card("<script>x</script>&", "<b>", "failed", "", told("<i>"), None, "x")
+    hostile = Card("<script>x</script>&", "<b>", "failed", "", messages("<i>"), None, "x")
     found = Found()
     page = sheet_html("<script>", [hostile])
     found.feed(page)

@@ -84,6 +84,6 @@ def test_the_page_documents_every_column_with_its_unit() -> None:
     assert {name: words for name, words in rows.items() if name in documented} == documented
     assert patterns <= rows.keys()
     assert all(f"`{name}`" in text for name in NAMES)
-    told = {re.sub(r"_[xyz]_", "_x_", column.name) for column in landmark_columns()}
-    assert told == {f"{name}_x_{rest}" for name in NAMES for rest in ("mm", "std_mm")}
+    described = {re.sub(r"_[xyz]_", "_x_", column.name) for column in landmark_columns()}
+    assert described == {f"{name}_x_{rest}" for name in NAMES for rest in ("mm", "std_mm")}
     assert [column.name for column in expression_columns(["a"])] == ["expression_a", "expression_a_std"]

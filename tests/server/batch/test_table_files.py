@@ -53,10 +53,10 @@ def test_without_pyarrow_there_is_the_csv_alone(tmp_path: Path, monkeypatch: pyt
     assert [path.name for path in write_table(tmp_path, COLUMNS, ROWS)] == ["heads.csv", "heads.parquet"]
     real = builtins.__import__
 
-    def without(name: str, *given: Any, **named: Any) -> Any:
+    def without(name: str, *positional: Any, **named: Any) -> Any:
         if name.startswith("pyarrow"):
             raise ImportError(name)
-        return real(name, *given, **named)
+        return real(name, *positional, **named)
 
     monkeypatch.setattr(builtins, "__import__", without)
     assert not has_parquet()

@@ -31,8 +31,8 @@ def shots(tmp_path: Path) -> Path:
 def _pinned(monkeypatch: pytest.MonkeyPatch) -> None:
     real = batch_run.BatchRun
 
-    def pinned(*given: Any, **named: Any) -> batch_run.BatchRun:
-        return real(*given, **named, work=work)
+    def pinned(*positional: Any, **named: Any) -> batch_run.BatchRun:
+        return real(*positional, **named, work=work)
 
     monkeypatch.setattr(batch_run, "BatchRun", pinned)
     monkeypatch.setattr("server.tasks.prepare.prepare_kernels", lambda report, settings=None: None)
@@ -42,7 +42,7 @@ def invoke(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["batch", *map(str, arguments)])
 
 
-def told(result: Result) -> str:
+def message_of(result: Result) -> str:
     return " ".join(result.stderr.replace("│", " ").split())
 
 
@@ -84,7 +84,7 @@ def test_status_1_names_what_failed(shots: Path, tmp_path: Path) -> None:
 def test_status_2_for_wrong_options(shots: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
     done = invoke(shots, "--out", tmp_path / "heads", *arguments)
     assert done.exit_code == 2
-    assert words in told(done)
+    assert words in message_of(done)
     assert not (tmp_path / "heads").exists()
 
 
@@ -94,19 +94,19 @@ def test_status_2_for_a_list_with_every_fault_of_it(shots: Path, tmp_path: Path)
     )
     done = invoke(tmp_path / "study.csv", "--out", tmp_path / "heads")
     assert done.exit_code == 2
-    assert "shots/s0000: " in told(done)
-    assert "shots/s0001: " in told(done)
+    assert "shots/s0000: " in message_of(done)
+    assert "shots/s0001: " in message_of(done)
     (tmp_path / "study.csv").write_text("capture\ngone\nlost\n")
     done = invoke(tmp_path / "study.csv", "--out", tmp_path / "heads")
     assert done.exit_code == 2
-    assert "line 2: " in told(done)
-    assert "line 3: " in told(done)
+    assert "line 2: " in message_of(done)
+    assert "line 3: " in message_of(done)
 
 
 def test_results_never_lie_within_a_capture(shots: Path) -> None:
     done = invoke(shots, "--out", shots / "s0000" / "heads")
     assert done.exit_code == 2
-    assert "lies within the capture s0000" in told(done)
+    assert "lies within the capture s0000" in message_of(done)
 
 
 def test_shards_share_the_captures_out(shots: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from rig.errors import InputError
 from rig.formats.archive import pack_folder
 from rig.render.renderer import Renderer
-from server.tasks.child import Bench, Child
+from server.tasks.child import Child, WorkerContext
 from server.tasks.reconstruct_folder import folder_of, reconstruct_beside
 from tests.support.services import ROOT, packed_capture, small_capture
 from tests.support.small_studio import small_studio_captures
@@ -33,10 +33,10 @@ def test_an_archive_is_a_folder_for_as_long_as_it_is_needed(tmp_path: Path) -> N
 
 
 def test_what_a_bench_keeps_is_made_once_and_closed_at_its_end(tmp_path: Path) -> None:
-    with closing(Bench()) as bench:
+    with closing(WorkerContext()) as context:
         (tmp_path / "file").write_text("x")
-        first = bench.keep("file", (tmp_path / "file").open)
-        assert bench.keep("file", lambda: pytest.fail("made twice")) is first
+        first = context.keep("file", (tmp_path / "file").open)
+        assert context.keep("file", lambda: pytest.fail("made twice")) is first
         assert not first.closed
     assert first.closed
 
