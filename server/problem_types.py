@@ -177,6 +177,7 @@ FAILURE_TYPES = {
     "CalibrationRefused": "calibration-refused",
     "CannotFetch": "cannot-fetch",
     "CannotImport": "cannot-import",
+    "Damaged": "bad-model",
     "DamagedNetwork": "damaged-network",
     "EglUnavailable": "egl-unavailable",
     "EigenheadError": "eigenhead-error",

@@ -83,7 +83,7 @@ def test_distances_are_the_same_to_the_last_bit_wherever_the_mask_lies_in_memory
     rng = np.random.default_rng(0)
     rows, columns = np.mgrid[: shape[0], : shape[1]].astype(float)
     mask = np.hypot((rows - shape[0] / 2) / 1.3, columns - shape[1] / 2.2) < 30.0
-    wanted = distance_transform_edt(mask) + distance_transform_edt(~mask)
+    wanted = np.asarray(distance_transform_edt(mask)) + np.asarray(distance_transform_edt(~mask))
     held = []
     for _ in range(60):
         held.append(np.empty(rng.integers(100, 60_000), np.uint8))
