@@ -28,6 +28,7 @@ RAW = {
     "pipeline/experiments/people.py": 1,
     "pipeline/experiments/people_subjects.py": 1,
     "pipeline/experiments/real.py": 1,
+    "pipeline/experiments/relief.py": 2,
     "pipeline/experiments/runner.py": 5,
     "pipeline/experiments/span.py": 1,
     "pipeline/experiments/surfaces.py": 1,
