@@ -63,16 +63,16 @@ def camera_sensitivity(
     write_image_motion(view, places, axes, np.stack([packed_camera(camera) for camera in cameras]), ahead, slides)
     # The surface moves freely: u = - (ahead . (H delta + gradient)) / (ahead . H ahead).
     across = np.einsum("nab,nb->na", matrix, ahead)
-    own = np.einsum("na,na->n", ahead, across)
-    own = np.where(own > 1e-12, own, np.inf)[:, None]
+    curvature = np.einsum("na,na->n", ahead, across)
+    curvature = np.where(curvature > 1e-12, curvature, np.inf)[:, None]
     down = np.einsum("na,na->n", ahead, gradient)[:, None]
     by_camera = np.zeros((len(view), 6 * len(cameras)))
-    add_by_camera(view, -across / own, slides, by_camera)
+    add_by_camera(view, -across / curvature, slides, by_camera)
     return CameraSensitivity(
         by_camera=by_camera,
         view=view,
-        stiff=(matrix - across[:, :, None] * across[:, None, :] / own[:, :, None]) / own[:, :, None],
-        slope=(gradient - across * down / own) / own,
+        stiff=(matrix - across[:, :, None] * across[:, None, :] / curvature[:, :, None]) / curvature[:, :, None],
+        slope=(gradient - across * down / curvature) / curvature,
         slides=slides,
     )
 

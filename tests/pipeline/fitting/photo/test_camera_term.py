@@ -65,9 +65,9 @@ def test_the_cameras_sums_are_those_of_dense_matrices(planted: dict) -> None:
                 dense[row, 6 * view[n, row // 2] :][:6] = found.slides[n, row]
         matrix += information[n] * dense.T @ found.stiff[n] @ dense
         gradient -= information[n] * dense.T @ found.slope[n]
-    told = found.cameras(information)
-    np.testing.assert_allclose(told[0], matrix, rtol=1e-9, atol=1e-9 * np.abs(matrix).max())
-    np.testing.assert_allclose(told[1], gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
+    equations = found.cameras(information)
+    np.testing.assert_allclose(equations[0], matrix, rtol=1e-9, atol=1e-9 * np.abs(matrix).max())
+    np.testing.assert_allclose(equations[1], gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 
 def test_slopes_of_a_picture_are_differences_of_what_is_read_everywhere() -> None:
