@@ -38,7 +38,6 @@ PUBLIC = {
 }
 NOT_DONE = {
     "pipeline",
-    "pipeline/alignment",
     "pipeline/dense",
     "pipeline/dense/surface",
     "pipeline/eigenheads",
@@ -57,7 +56,6 @@ NOT_DONE = {
     "pipeline/texture",
     "pipeline/verification",
     "tests/pipeline",
-    "tests/pipeline/alignment",
     "tests/pipeline/dense",
     "tests/pipeline/eigenheads/sources",
     "tests/pipeline/estimation",

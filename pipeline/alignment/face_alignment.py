@@ -42,15 +42,17 @@ def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> 
     modes = basis.reshape(len(basis), -1).T.astype(float)
     idea, shape = places.covariance(which), modes @ modes.T  # of the network and of heads, head frame
     by_view = face.shared_mm[:, which].reshape(len(face.shared_mm), -1)
-    target, own = face.points_world[which], face.covariances[which]
+    target, point_covariances = face.points_world[which], face.covariances[which]
     source = mean + places.offset_mm[which]
-    expected = np.diag(idea + shape).reshape(-1, 3).sum(axis=1) + own.trace(axis1=1, axis2=2)
+    expected = np.diag(idea + shape).reshape(-1, 3).sum(axis=1) + point_covariances.trace(axis1=1, axis2=2)
     pose, squares = procrustes(source, target, 1.0 / expected), np.zeros(len(which))
     noise = np.zeros_like(idea)
     for _ in range(ROUNDS):
         squares = ((target - pose.apply(source)) ** 2).sum(axis=1) / expected
         doubt = 1.0 + squares / FORGIVEN_SIGMAS**2
-        noise = block_diagonal((doubt - 1.0)[:, None, None] * (expected / 3.0)[:, None, None] * np.eye(3) + own)
+        noise = block_diagonal(
+            (doubt - 1.0)[:, None, None] * (expected / 3.0)[:, None, None] * np.eye(3) + point_covariances
+        )
         noise += by_view.T @ by_view
         pose = generalised_procrustes(source, target, idea + shape, noise, start=pose)
     turn = pose.scale * np.kron(np.eye(len(which)), pose.rotation)

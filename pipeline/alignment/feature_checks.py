@@ -25,8 +25,8 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
     points = [point.position_world for point in located.points.values()]
     if len(points) < POINTS_LEAST:
         few = compose("features-too-few", count=len(points), needed=POINTS_LEAST)
-        told = located.remarks
-        faults.append(compose("features-too-few-because", few=few, reasons=told) if told else few)
+        remarks = located.remarks
+        faults.append(compose("features-too-few-because", few=few, reasons=remarks) if remarks else few)
     elif flatness(np.stack(points)) < TRIANGLE_LEAST_MM:
         faults.append(compose("features-on-line"))
     return faults

@@ -28,8 +28,8 @@ def found(model: HeadModel, places: LandmarkMap, pose: Similarity, rng: np.rando
     """Landmarks of a random head at a pose, off by what the map says and by triangulation."""
     vertices = model.vertices(0.8 * rng.standard_normal(len(model.modes)))
     together = np.einsum("m,mnc->nc", rng.standard_normal(len(places.shared_mm)), places.shared_mm)
-    own = places.deviation_mm * rng.standard_normal((468, 3))
-    points = pose.apply(places.expected(vertices) + together + own) + rng.normal(0.0, NOISE_MM, (468, 3))
+    separate = places.deviation_mm * rng.standard_normal((468, 3))
+    points = pose.apply(places.expected(vertices) + together + separate) + rng.normal(0.0, NOISE_MM, (468, 3))
     return matched(points, pose)
 
 
