@@ -12,13 +12,13 @@ DATA, MODELS = "EIGENHEAD_DATA", "EIGENHEAD_MODELS"
 
 def data_folder() -> Path:
     """The folder of captures, results, keys, jobs and models. It need not exist."""
-    given = os.environ.get(DATA)
-    if given:
-        return Path(given)
+    configured = os.environ.get(DATA)
+    if configured:
+        return Path(configured)
     return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "eigenhead"
 
 
 def models_folder() -> Path:
     """The folder of the user's own head models. It need not exist."""
-    given = os.environ.get(MODELS)
-    return Path(given) if given else data_folder() / "models"
+    configured = os.environ.get(MODELS)
+    return Path(configured) if configured else data_folder() / "models"

@@ -88,11 +88,11 @@ def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     return found
 
 
-def weights_from_text(given: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
+def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
     """``NAME=WEIGHT`` with names of the model, in its own manner or Apple's. Raises InputError naming every fault."""
     known = {plain_name(name): name for name in names} | {name: name for name in names}
     found, faults = {}, []
-    for text in given:
+    for text in texts:
         name, _, amount = text.partition("=")
         try:
             weight = float(amount)

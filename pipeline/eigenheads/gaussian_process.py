@@ -95,8 +95,8 @@ def kernel_modes(model: HeadModel, scales: tuple[KernelScale, ...], most: int) -
     # Nystroem: f_k(x) = k(x, nodes) u_k / sqrt(value_k) has covariance sum_k f_k f_k^T ~ k.
     fields = covariance(points, points[nodes], scales) @ (vectors[:, order] / np.sqrt(values[order]))
     modes = (fields.T[:, :, None] * normals[None]).reshape(len(order), -1)
-    own, _ = np.linalg.qr(model.modes.reshape(len(model.modes), -1).astype(float).T)
-    modes -= (modes @ own) @ own.T
+    span, _ = np.linalg.qr(model.modes.reshape(len(model.modes), -1).astype(float).T)
+    modes -= (modes @ span) @ span.T
     return modes.reshape(len(order), -1, 3).astype(np.float32)
 
 
