@@ -57,7 +57,6 @@ NOT_DONE = {
     "tests/pipeline",
     "tests/pipeline/dense",
     "tests/pipeline/eigenheads/sources",
-    "tests/pipeline/estimation",
     "tests/pipeline/evidence",
     "tests/pipeline/experiments",
     "tests/pipeline/faces",

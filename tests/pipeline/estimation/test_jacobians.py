@@ -167,8 +167,8 @@ def rim_of_a_head() -> Case:
     steps, shared = head_steps(problem, stage), stage.modes + POSE
     jacobian = np.zeros((len(rows), len(steps)))
     jacobian[:, :shared] = rows[:, :shared]
-    own = shared + PER_CAMERA * rim.view[:, None] + np.arange(PER_CAMERA)
-    jacobian[np.arange(len(rows))[:, None], own] = rows[:, shared:]
+    columns = shared + PER_CAMERA * rim.view[:, None] + np.arange(PER_CAMERA)
+    jacobian[np.arange(len(rows))[:, None], columns] = rows[:, shared:]
     share = np.stack([1.0 - rim.blend, rim.blend], axis=1)[:, :, None]
 
     def on_mesh(at: State) -> np.ndarray:
