@@ -51,7 +51,6 @@ NOT_DONE = {
     "pipeline/results",
     "pipeline/silhouettes",
     "pipeline/silhouettes/without_plates",
-    "pipeline/templates",
     "pipeline/texture",
     "pipeline/verification",
     "tests/pipeline",
@@ -67,7 +66,6 @@ NOT_DONE = {
     "tests/pipeline/results",
     "tests/pipeline/silhouettes",
     "tests/pipeline/silhouettes/without_plates",
-    "tests/pipeline/templates",
     "tests/pipeline/texture",
     "tests/pipeline/verification",
 }

@@ -86,9 +86,9 @@ def register(
 
     Raises InputError where the mesh is no head, and NotRegistered where it is none that the model can follow."""
     report("placing", 0.0)
-    own = outward(mesh.vertices, mesh.triangles())
-    place = place_by_landmarks(model, landmarks, name) if landmarks else find_place(model, own, name)
-    placed = own.placed(place)
+    surface = outward(mesh.vertices, mesh.triangles())
+    place = place_by_landmarks(model, landmarks, name) if landmarks else find_place(model, surface, name)
+    placed = surface.placed(place)
     welded, joined = weld(placed)
     parts = components(welded)
     skin = skin_parts(welded, parts, _head(model, model.vertices(np.zeros(0))))
@@ -138,9 +138,9 @@ def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
     each became. Lashes that begin on a lid stay parts of their own: the lid does not end there."""
     ends = np.zeros(len(mesh.vertices), bool)
     ends[boundary_edges(mesh.faces)] = True
-    own = np.where(ends, -1, np.arange(len(ends)))[:, None]
+    identity = np.where(ends, -1, np.arange(len(ends)))[:, None]
     _, first, joined = np.unique(
-        np.concatenate([mesh.vertices + 0.0, own], axis=1), axis=0, return_index=True, return_inverse=True
+        np.concatenate([mesh.vertices + 0.0, identity], axis=1), axis=0, return_index=True, return_inverse=True
     )
     joined = joined.ravel()
     faces, vertices = joined[mesh.faces].astype(np.int32), mesh.vertices[first]
@@ -238,12 +238,12 @@ def _drawn(
     faces = place[mesh.faces[skin[mesh.faces].all(axis=1)]]
     target = Target(head.vertices, head.normals, np.zeros((0, 3)))
     out = mesh.vertices.copy()
-    own = mesh.vertices[rows]
+    vertices = mesh.vertices[rows]
     pulled = {}
     for here, there in marks:
-        nearest = int(np.linalg.norm(own - here, axis=1).argmin())
-        pulled[nearest] = there + own[nearest] - here
-    out[rows] = refined(own, faces, target, DRAWN, STIFFNESS, pulled, MARK_WEIGHT)
+        nearest = int(np.linalg.norm(vertices - here, axis=1).argmin())
+        pulled[nearest] = there + vertices[nearest] - here
+    out[rows] = refined(vertices, faces, target, DRAWN, STIFFNESS, pulled, MARK_WEIGHT)
     return out
 
 

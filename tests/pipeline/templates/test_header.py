@@ -32,14 +32,14 @@ def test_a_header_is_read_without_the_mesh_and_damage_is_told(tmp_path: Path) ->
 def test_a_job_may_use_a_template_of_its_model_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(DATA, str(tmp_path))
     header_file(tmp_path, "flame")
-    own = tmp_path / "own.npz"
-    own.write_bytes(model_path("default").read_bytes())
+    model_file = tmp_path / "own.npz"
+    model_file.write_bytes(model_path("default").read_bytes())
     check_template(None, "default")
-    for model in ("default", "makehuman-138", str(own)):
+    for model in ("default", "makehuman-138", str(model_file)):
         check_template("flame", model)  # told by its content
-    own.write_bytes(own.read_bytes() + b"\n")
+    model_file.write_bytes(model_file.read_bytes() + b"\n")
     with pytest.raises(OtherModel, match="registered to the model 'makehuman-138'"):
-        check_template("flame", str(own))
+        check_template("flame", str(model_file))
     with pytest.raises(UnknownTemplate, match="known are flame"):
         check_template("ict", "default")
     for name in (None, "flame"):
