@@ -61,7 +61,6 @@ NOT_DONE = {
     "tests/pipeline/faces",
     "tests/pipeline/fitting",
     "tests/pipeline/fitting/fine",
-    "tests/pipeline/fitting/simplex",
     "tests/pipeline/multiview",
     "tests/pipeline/results",
     "tests/pipeline/silhouettes",

@@ -67,18 +67,18 @@ def test_it_ends_at_the_spread_or_at_the_limit_and_says_which() -> None:
 
 def test_evaluations_are_counted_and_the_best_is_never_lost() -> None:
     calls: list[float] = []
-    told: list[tuple[int, float]] = []
+    watched: list[tuple[int, float]] = []
 
     def counted(x: np.ndarray) -> float:
         calls.append(rosen(x))
         return calls[-1]
 
     found = minimise(
-        counted, np.zeros(3), np.ones(3), tolerance=1e-8, limit=500, watch=lambda n, cost: told.append((n, cost))
+        counted, np.zeros(3), np.ones(3), tolerance=1e-8, limit=500, watch=lambda n, cost: watched.append((n, cost))
     )
-    assert found.stats.evaluations == len(calls) == told[-1][0]
+    assert found.stats.evaluations == len(calls) == watched[-1][0]
     assert found.stats.cost == min(calls)
-    costs = [cost for _, cost in told]
+    costs = [cost for _, cost in watched]
     assert costs == sorted(costs, reverse=True)
 
 

@@ -224,11 +224,11 @@ def test_the_fit_reports_uses_what_is_usable_and_may_be_cancelled(
 ) -> None:
     seen = views(model, rig, renderer, np.array([1.0, -1.0]))
     seen["cam02"] = Silhouette(seen["cam02"].mask, seen["cam02"].distance, ViewQuality(usable=False))
-    told: list[float] = []
+    fractions: list[float] = []
     settings = FittingSettings(modes=2)
-    fit = fit_simplex(model, POSE, seen, rig, settings, renderer=renderer, report=lambda stage, f: told.append(f))
-    assert told == sorted(told)
-    assert told[-1] <= 1.0
+    fit = fit_simplex(model, POSE, seen, rig, settings, renderer=renderer, report=lambda stage, f: fractions.append(f))
+    assert fractions == sorted(fractions)
+    assert fractions[-1] <= 1.0
     assert fit.used == {"cam00": True, "cam02": False, "cam07": True, "cam08": True}
     assert fit.stopped_because.count("converged") == len(HIERARCHY)
     assert fit.evaluations < len(HIERARCHY) * LIMIT
