@@ -45,8 +45,8 @@ class Posable:
 
 def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
     """Every expression of the fit's model; nothing where it has none."""
-    given = fit.coefficients[model.posed.start : model.posed.stop] if len(model.posed) else ()
-    return dict(zip(model.expressions.names, (float(w) for w in given), strict=False))
+    fitted = fit.coefficients[model.posed.start : model.posed.stop] if len(model.posed) else ()
+    return dict(zip(model.expressions.names, (float(w) for w in fitted), strict=False))
 
 
 def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = LEAST_SIGMA) -> tuple[Found, ...]:
@@ -77,15 +77,15 @@ def posable_head(model: HeadModel, place: Similarity, mesh_world: Mesh, found: C
     """The neutral head with Apple's 52 morphs, and one of its own for whatever of the found expression they leave out,
     so that the morphs' weights give the head as photographed."""
     operator, names = model.levels["full"].operator, model.expressions.names
-    given = {each.name: each.weight for each in found}
-    morphs, weights, left = {}, {}, dict(given)
+    expression_weights = {each.name: each.weight for each in found}
+    morphs, weights, left = {}, {}, dict(expression_weights)
     parts = arkit_parts(names)
     for name, rows in parts.items():
         shape = model.expressions.shapes[list(rows)].sum(axis=0) if rows else np.zeros_like(model.mean)
         morphs[name] = place.scale * (operator @ shape)
-        weights[name] = float(np.mean([given.get(names[row], 0.0) for row in rows])) if rows else 0.0
+        weights[name] = float(np.mean([expression_weights.get(names[row], 0.0) for row in rows])) if rows else 0.0
         for row in rows:
-            left[names[row]] = given.get(names[row], 0.0) - weights[name]
+            left[names[row]] = expression_weights.get(names[row], 0.0) - weights[name]
     for name, weight in left.items():
         if abs(weight) > 1e-6:
             morphs[name] = place.scale * (operator @ model.expressions.shapes[names.index(name)])

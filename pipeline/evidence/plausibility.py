@@ -42,8 +42,8 @@ class ImplausibleResult(EigenheadError):
     """A result with warnings that the settings do not let pass."""
 
     def __init__(self, warnings: Sequence[ReportWarning]) -> None:
-        told = [compose("warning-of-code", warning=warning.code, text=warning) for warning in warnings]
-        super().__init__(compose("result-refused", warnings=told))
+        reasons = [compose("warning-of-code", warning=warning.code, text=warning) for warning in warnings]
+        super().__init__(compose("result-refused", warnings=reasons))
 
 
 def plausibility_warnings(
@@ -98,15 +98,15 @@ def _shape(coefficients: Float[np.ndarray, " m"]) -> list[ReportWarning]:
     total = float(coefficients @ coefficients)
     if largest <= COEFFICIENT_MOST and float(chdtrc(len(coefficients), total)) >= CHANCE_LEAST:
         return []
-    told = compose("shape-implausible", largest=largest, rms=np.sqrt(total / len(coefficients)))
-    return [told]
+    warning = compose("shape-implausible", largest=largest, rms=np.sqrt(total / len(coefficients)))
+    return [warning]
 
 
 def _scale(scale: float) -> list[ReportWarning]:
     if abs(float(np.log(scale))) <= SCALE_OFF_MOST:
         return []
-    told = compose("scale-implausible", finding=compose("head-scale-off", scale=scale))
-    return [told]
+    warning = compose("scale-implausible", finding=compose("head-scale-off", scale=scale))
+    return [warning]
 
 
 def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
@@ -132,8 +132,8 @@ def size_by_mode(model: HeadModel) -> Float[np.ndarray, " m"]:
 def _size(size: float, sigmas: float) -> list[ReportWarning]:
     if abs(sigmas) <= SIZE_MOST:
         return []
-    told = compose("size-unusual", size=size, sigmas=abs(sigmas))
-    return [told]
+    warning = compose("size-unusual", size=size, sigmas=abs(sigmas))
+    return [warning]
 
 
 def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]) -> list[ReportWarning]:

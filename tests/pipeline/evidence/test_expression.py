@@ -58,8 +58,8 @@ def test_closed_eyes_blink(posed: tuple[HeadModel, Fit, Mesh]) -> None:
 def test_without_its_expression_a_head_is_neutral(posed: tuple[HeadModel, Fit, Mesh]) -> None:
     model, fit, mesh = posed
     neutral = neutral_mesh(model, PLACE, mesh, found_expressions(model, fit))
-    told = {"jawOpen": WEIGHTS["jawOpen"]}  # what is not told is not taken back
-    truth = PLACE.apply(model.posed_vertices(fit.coefficients[:4], told))
+    taken_back = {"jawOpen": WEIGHTS["jawOpen"]}  # the least weights stay
+    truth = PLACE.apply(model.posed_vertices(fit.coefficients[:4], taken_back))
     np.testing.assert_allclose(neutral.vertices, truth, atol=1e-3)
 
 

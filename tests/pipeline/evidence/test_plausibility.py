@@ -41,12 +41,12 @@ def codes(coefficients, scale=1.0, outside_px=None):
 
 def test_heads_of_the_prior_are_plausible():
     rng = np.random.default_rng(0)
-    model, told = standard_model(), []
+    model, warned = standard_model(), []
     for _ in range(600):
         z = rng.standard_normal(len(model.modes))
         z[list(model.posed)] = 0.0
-        told += codes(z, float(np.exp(0.01 * rng.normal())))
-    assert max(map(told.count, set(told)), default=0) <= 6  # 1 in 200 are 3, and chance
+        warned += codes(z, float(np.exp(0.01 * rng.normal())))
+    assert max(map(warned.count, set(warned)), default=0) <= 6  # 1 in 200 are 3, and chance
 
 
 def test_one_coefficient_or_all_of_them_out_of_reason_are_named():
@@ -62,9 +62,9 @@ def test_a_scale_beyond_other_populations_is_named(scale, named):
 
 
 @pytest.mark.parametrize(
-    ("scale", "own", "named"), [(0.88, 0.0, True), (1.14, 0.0, True), (0.88, 1.0, False), (1.0, 2.0, False)]
+    ("scale", "true_sigmas", "named"), [(0.88, 0.0, True), (1.14, 0.0, True), (0.88, 1.0, False), (1.0, 2.0, False)]
 )
-def test_a_size_that_few_heads_have_is_named_whichever_took_it_up(scale, own, named):
+def test_a_size_that_few_heads_have_is_named_whichever_took_it_up(scale, true_sigmas, named):
     """A rig that is 12 % off is taken up by the shape, as heads differ by 4 %: of a head that is a deviation larger
     itself nothing is told, as it would be of too many good ones."""
     model = standard_model()
@@ -75,9 +75,9 @@ def test_a_size_that_few_heads_have_is_named_whichever_took_it_up(scale, own, na
     by_mode[list(model.posed)] = 0.0
     spread = float(np.linalg.norm(by_mode))  # of log size, z ~ N(0, I)
     assert 0.035 < spread < 0.045
-    z = (np.log(scale) / spread + own) * by_mode / spread  # the likeliest head of that size
+    z = (np.log(scale) / spread + true_sigmas) * by_mode / spread  # the likeliest head of that size
     assert codes(z) == (["size-unusual"] if named else [])
-    assert size_of(fit_of(z), model)[1] == pytest.approx(np.log(scale) / spread + own, abs=0.25)
+    assert size_of(fit_of(z), model)[1] == pytest.approx(np.log(scale) / spread + true_sigmas, abs=0.25)
 
 
 def test_a_camera_whose_contour_the_head_misses_is_named():
