@@ -143,9 +143,9 @@ def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"
     """The distance to a binary mask's contour without its stairs, which would make a thin line look broken; taken in
     the mask's own frame and a margin, infinite outside."""
     distance = np.full(mask.shape, np.inf, np.float32)
-    own = box_around(mask, MARGIN_PX)
-    if mask[own].size:
-        distance[own] = cv2.GaussianBlur(chamfer(mask[own].view(np.uint8)), (0, 0), 1.0)
+    window = box_around(mask, MARGIN_PX)
+    if mask[window].size:
+        distance[window] = cv2.GaussianBlur(chamfer(mask[window].view(np.uint8)), (0, 0), 1.0)
     return distance
 
 

@@ -106,20 +106,20 @@ def test_files_hold_what_the_contract_says(result: Reconstruction, photographed,
     assert isinstance(glb, trimesh.Trimesh)
     expected = (bust.mesh_world.vertices - PLACE.translation) @ PLACE.rotation / 1000
     np.testing.assert_allclose(np.sort(glb.vertices[:, 1]), np.sort(expected[:, 1]), atol=1e-5)
-    told = json.loads((tmp_path / "report.json").read_text())["bust"]
-    assert told["closed"] is True
-    assert told["spacing_mm"] == 3.0
-    assert told["vertices"] == len(bust.views)
-    assert 0.5 < told["seen_share"] < 0.9
-    assert sum(told["parts"].values()) == pytest.approx(1.0)
+    section = json.loads((tmp_path / "report.json").read_text())["bust"]
+    assert section["closed"] is True
+    assert section["spacing_mm"] == 3.0
+    assert section["vertices"] == len(bust.views)
+    assert 0.5 < section["seen_share"] < 0.9
+    assert sum(section["parts"].values()) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("surface", "files"), [("head", {"head"}), ("bust", {"bust"}), ("both", {"head", "bust"})])
 def test_surface_says_which_are_written(
     surface, files: set[str], result: Reconstruction, photographed, tmp_path: Path
 ) -> None:
-    asked = replace(SETTINGS, outputs=OutputSettings(surface=surface))
-    made = replace(result, settings=asked, bust=None if surface == "head" else result.bust)
+    requested = replace(SETTINGS, outputs=OutputSettings(surface=surface))
+    made = replace(result, settings=requested, bust=None if surface == "head" else result.bust)
     write_result(tmp_path, made, photographed[1])
     assert {path.stem for path in tmp_path.glob("*.ply")} == files
     assert {path.stem for path in tmp_path.glob("*.glb")} == files

@@ -201,8 +201,8 @@ def opened_glb(path: Path) -> tuple[dict[str, Any], bytes]:
 def validated(path: Path, validator: Path) -> tuple[int, int, list[Any]]:
     """Errors, warnings and all messages."""
     command = ["node", str(validator / "validate.js"), str(path)]
-    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout)
-    return told["numErrors"], told["numWarnings"], told["messages"]
+    verdict = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout)
+    return verdict["numErrors"], verdict["numWarnings"], verdict["messages"]
 
 
 @pytest.fixture(scope="session")
