@@ -40,7 +40,6 @@ NOT_DONE = {
     "pipeline",
     "pipeline/dense",
     "pipeline/dense/surface",
-    "pipeline/eigenheads/correspondence",
     "pipeline/eigenheads/sources",
     "pipeline/experiments",
     "pipeline/faces",

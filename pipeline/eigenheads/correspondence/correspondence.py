@@ -89,19 +89,19 @@ def correspond(
     """Corresponded heads on the template's cage connectivity. Scans must have passed ``scan_checks.check``."""
     matching = matching or Matching()
     frames = common_frame(scans, template)
-    given = list(zip(scans, frames, strict=True))
-    reference = nearest_mean(np.array([frame.apply(stacked(scan.landmarks)) for scan, frame in given]))
+    placed_scans = list(zip(scans, frames, strict=True))
+    reference = nearest_mean(np.array([frame.apply(stacked(scan.landmarks)) for scan, frame in placed_scans]))
     with workers(matching.workers, len(scans)) as crew:
         shape = on_reference(prepared(scans[reference], frames[reference]), template, matching)
         heads, void = np.zeros((0, 0, 3)), np.zeros((0, 0), bool)
         for stage in ("first pass", "second pass"):
             sample = partial(_resampled, shape, _landmark_rows(template), matching)
-            found = crew.over(sample, given, stage, report)
+            found = crew.over(sample, placed_scans, stage, report)
             heads, void = np.array([head for head, _ in found]), np.array([mask for _, mask in found])
             reference = nearest_mean(heads)
             shape = heads[reference]
         if matching.refine:
-            heads = _refined(given, template, matching, crew, report)
+            heads = _refined(placed_scans, template, matching, crew, report)
     return Correspondence(heads, void, reference, frames)
 
 
@@ -180,16 +180,16 @@ def _resampled(
     shape: Float[np.ndarray, "V 3"],
     index: Int[np.ndarray, " L"],
     matching: Matching,
-    given: tuple[Scan, RigidTransform],
+    placed_scan: tuple[Scan, RigidTransform],
 ) -> tuple[Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
-    scan, frame_from_scan = given
+    scan, frame_from_scan = placed_scan
     vertices = frame_from_scan.apply(scan.vertices)
     marks = frame_from_scan.apply(stacked(scan.landmarks))
     return warp_and_resample(shape, index, marks, CylinderIndex(vertices, scan.faces), matching)[1:]
 
 
 def _refined(
-    given: Sequence[tuple[Scan, RigidTransform]],
+    placed_scans: Sequence[tuple[Scan, RigidTransform]],
     template: HeadModel,
     matching: Matching,
     crew: Workers,
@@ -199,7 +199,7 @@ def _refined(
     faces, mean = template.levels["cage"].faces, template.vertices(np.zeros(0))[:count]
     prior = registration_prior(mean, template.basis("full", len(template.modes), np.arange(count)), faces)
     one = partial(_most_probable, prior, faces, _landmark_rows(template), matching)
-    return np.array(crew.over(one, given, "refining", report))
+    return np.array(crew.over(one, placed_scans, "refining", report))
 
 
 def _most_probable(
@@ -207,9 +207,9 @@ def _most_probable(
     faces: Int[np.ndarray, "F 3"],
     index: Int[np.ndarray, " L"],
     matching: Matching,
-    given: tuple[Scan, RigidTransform],
+    placed_scan: tuple[Scan, RigidTransform],
 ) -> Float[np.ndarray, "V 3"]:
-    scan, frame = given
+    scan, frame = placed_scan
     target = prepared(scan, frame)
     likeness = statistical(prior, faces, index, target, matching)
     return refined(likeness, faces, target, matching.fine, matching.stiffness)

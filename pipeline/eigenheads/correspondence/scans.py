@@ -49,11 +49,11 @@ def find_scans(folder: Path) -> list[Path]:
 def read_scan(path: Path) -> Scan:
     """A scan with its landmarks. Raises InputError."""
     vertices, faces = welded(read_mesh(path))
-    given = landmark_file(path)
-    if given is None:
+    landmarks_path = landmark_file(path)
+    if landmarks_path is None:
         beside = ", ".join(path.with_suffix(suffix).name for suffix in LANDMARK_SUFFIXES)
         raise InputError(path.name, [f"has no landmarks beside it ({beside})"])
-    return Scan(path.stem, vertices, faces, read_landmarks(given))
+    return Scan(path.stem, vertices, faces, read_landmarks(landmarks_path))
 
 
 def landmark_file(mesh: Path) -> Path | None:
@@ -84,8 +84,8 @@ def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
         ) from None
     known = {name: point for name, point in points.items() if name in NAMES}
     if not known:
-        told = ", ".join(sorted(points)[:8]) or "nothing"
-        raise InputError(path.name, [f"names none of the 26 landmarks ({', '.join(NAMES[:3])}, ...) but {told}"])
+        listed = ", ".join(sorted(points)[:8]) or "nothing"
+        raise InputError(path.name, [f"names none of the 26 landmarks ({', '.join(NAMES[:3])}, ...) but {listed}"])
     bad = [name for name, point in known.items() if point.shape != (3,) or not np.isfinite(point).all()]
     if bad:
         raise InputError(path.name, [f"{name} is no point of three finite numbers" for name in bad])

@@ -60,11 +60,11 @@ def _grid(
     vertices: Float[np.ndarray, "V 3"], scanner: Scanner, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, " A"], Float[np.ndarray, " H"]]:
     """Angles and heights of the samples: about ``spacing_mm`` apart on a head of 90 mm radius, never twice alike."""
-    own = scanner.spacing_mm * rng.uniform(0.95, 1.05)
-    count = round(2 * np.pi * 90 / own)
+    spacing_mm = scanner.spacing_mm * rng.uniform(0.95, 1.05)
+    count = round(2 * np.pi * 90 / spacing_mm)
     angles = -np.pi + 2 * np.pi * (np.arange(count) + rng.uniform()) / count
     low, high = vertices[:, 1].min(), vertices[:, 1].max()
-    return angles, np.arange(low + own * rng.uniform(), high, own)
+    return angles, np.arange(low + spacing_mm * rng.uniform(), high, spacing_mm)
 
 
 def _swallowed(
