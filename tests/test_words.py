@@ -39,7 +39,6 @@ PUBLIC = {
 NOT_DONE = {
     "pipeline",
     "pipeline/dense",
-    "pipeline/dense/surface",
     "pipeline/eigenheads/sources",
     "pipeline/experiments",
     "pipeline/faces",

@@ -28,8 +28,8 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
         blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
         mark_contradicted(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
         solid = np.bitwise_count(blocks) >= VIEWS_LEAST
-        own = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
-        return _beyond_windows(solid, own.reshape(height, width)) if solid.any() else None
+        outline_px = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
+        return _beyond_windows(solid, outline_px.reshape(height, width)) if solid.any() else None
 
     wrong = map_in_threads(wrong_pixels, len(views.cameras))
     shares = np.array([0.0 if mask is None else mask.mean() for mask in wrong])

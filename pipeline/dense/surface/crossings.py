@@ -36,9 +36,9 @@ def _crossing_by_size(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray,
     widest = float(wide.max(initial=0.0))
     for size in range(SIZES):
         rows = np.flatnonzero(wide <= widest / 2.0**size)
-        own = wide[rows] > (widest / 2.0 ** (size + 1) if size < SIZES - 1 else -1.0)
-        if own.any():
-            crossing[rows] |= _crossing(vertices, faces[rows], boxes[rows], own)
+        same_size = wide[rows] > (widest / 2.0 ** (size + 1) if size < SIZES - 1 else -1.0)
+        if same_size.any():
+            crossing[rows] |= _crossing(vertices, faces[rows], boxes[rows], same_size)
     return crossing
 
 
@@ -51,8 +51,12 @@ def _crossing(
     low, high = boxes[:, :3], boxes[:, 3:]
     cells = sorted_into_cells(0.5 * (low + high), max(float((high - low).max(initial=0.0)), 1e-9))
     crossing = np.zeros(len(faces), bool)
-    given = (vertices, faces, boxes[cells.order], *cells, active, crossing)
-    in_threads(len(faces), lambda first, last: crossing_triangles(*given, first, last))
+    sorted_boxes, (order, keys, spans) = boxes[cells.order], cells
+
+    def mark(first: int, last: int) -> None:
+        crossing_triangles(vertices, faces, sorted_boxes, order, keys, spans, active, crossing, first, last)
+
+    in_threads(len(faces), mark)
     return crossing
 
 

@@ -55,6 +55,10 @@ def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewS
     offset, information, scatter = (np.zeros(count) for _ in range(3))
     seen = np.zeros(count, np.uint8)
     limits = np.array([gate_mm, AGREEMENT_MM, FLOOR_MM])
-    given = (mesh.vertices, normals, views.packed(), limits, offset, information, scatter, seen)
-    in_threads(count, lambda first, last: measure(*given, first, last))
+    vertices, packed = mesh.vertices, views.packed()
+
+    def fill(first: int, last: int) -> None:
+        measure(vertices, normals, packed, limits, offset, information, scatter, seen, first, last)
+
+    in_threads(count, fill)
     return Measured(offset, information, scatter, seen)

@@ -85,8 +85,11 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
     fixed = grid.outer | (votes.bound >= reach)
     membrane = Membrane(target, pull, votes.bound, fixed)
     for sweep in range(2 * sweeps):
-        given = (field, membrane, grid.index, grid.neighbours, sweep % 2, factor)
-        in_threads(len(grid), lambda first, last, given=given: relax(*given, first, last))
+
+        def sweep_nodes(first: int, last: int, parity: int = sweep % 2) -> None:
+            relax(field, membrane, grid.index, grid.neighbours, parity, factor, first, last)
+
+        in_threads(len(grid), sweep_nodes)
     return Level(grid, field, votes.weight)
 
 
@@ -95,9 +98,12 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
     value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
     step = grid.step_mm
     limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
-    place = (grid.index, grid.corner, step)
-    given = (*place, views.packed(), limits, value, weight, bound)
-    in_threads(len(grid), lambda first, last: vote(*given, first, last))
+    packed = views.packed()
+
+    def fill(first: int, last: int) -> None:
+        vote(grid.index, grid.corner, step, packed, limits, value, weight, bound, first, last)
+
+    in_threads(len(grid), fill)
     return Votes(value, weight, bound)
 
 

@@ -46,20 +46,20 @@ def drawn_to_skin(
     same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(mesh_world.faces, deviation_mm, skin))
     reach = FARTHEST * float(same_mm.max(initial=SAME_MM))
     low, high = head_skin_world.vertices.min(axis=0) - reach, head_skin_world.vertices.max(axis=0) + reach
-    asked = np.flatnonzero((skin > 0.0) & ((vertices > low) & (vertices < high)).all(axis=1))
-    if not len(asked) or not len(head_skin_world.faces):
+    candidates = np.flatnonzero((skin > 0.0) & ((vertices > low) & (vertices < high)).all(axis=1))
+    if not len(candidates) or not len(head_skin_world.faces):
         return mesh_world
-    normals = mesh_world.normals()[asked]
-    hit = SurfaceIndex(head_skin_world.vertices, head_skin_world.faces).closest(vertices[asked], CANDIDATES)
-    same = (hit.distances <= FARTHEST * same_mm[asked]) & ((hit.normals * normals).sum(axis=1) >= 0.0)
+    normals = mesh_world.normals()[candidates]
+    hit = SurfaceIndex(head_skin_world.vertices, head_skin_world.faces).closest(vertices[candidates], CANDIDATES)
+    same = (hit.distances <= FARTHEST * same_mm[candidates]) & ((hit.normals * normals).sum(axis=1) >= 0.0)
     agreement, shown = np.zeros(len(vertices)), np.zeros(len(vertices))
-    agreement[asked] = same * np.exp(-((hit.distances / same_mm[asked]) ** 2))
-    shown[asked] = skin[asked]
-    around = mean_around(mesh_world.faces, agreement, shown)[asked]
+    agreement[candidates] = same * np.exp(-((hit.distances / same_mm[candidates]) ** 2))
+    shown[candidates] = skin[candidates]
+    around = mean_around(mesh_world.faces, agreement, shown)[candidates]
     consent = np.clip((around - CONSENT[0]) / (CONSENT[1] - CONSENT[0]), 0.0, 1.0)
-    near = agreement[asked]
-    share = skin[asked] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
-    vertices[asked] += share[:, None] * (hit.points - vertices[asked])
+    near = agreement[candidates]
+    share = skin[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
+    vertices[candidates] += share[:, None] * (hit.points - vertices[candidates])
     return Mesh(vertices, mesh_world.faces)
 
 

@@ -44,13 +44,17 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     pixels = np.zeros((starts[-1], 8), np.float32)
     for depth_map, first, last in zip(depth_maps, starts[:-1], starts[1:], strict=True):
-        camera, own = rig[depth_map.camera.name], pixels[first:last]
-        own[:, DEPTH] = depth_map.depth_mm.ravel()
-        own[:, NORMAL : NORMAL + 3] = depth_map.normal.reshape(-1, 3)
+        camera, view_pixels = rig[depth_map.camera.name], pixels[first:last]
+        view_pixels[:, DEPTH] = depth_map.depth_mm.ravel()
+        view_pixels[:, NORMAL : NORMAL + 3] = depth_map.normal.reshape(-1, 3)
         alone = depth_map.views.ravel() < VIEWS_SURE
-        own[:, SIGMA] = depth_map.deviation_mm.ravel() * np.where(alone, np.float32(ALONE_FACTOR), np.float32(1))
+        view_pixels[:, SIGMA] = depth_map.deviation_mm.ravel() * np.where(
+            alone, np.float32(ALONE_FACTOR), np.float32(1)
+        )
         crop = depth_map.camera.intrinsics.values()[:4]
-        write_outline(crop, packed_lens(camera), depth_map.depth_mm.shape[1], silhouettes[camera.name].distance, own)
+        write_outline(
+            crop, packed_lens(camera), depth_map.depth_mm.shape[1], silhouettes[camera.name].distance, view_pixels
+        )
     return ViewStack(np.stack([_packed(depth_map.camera) for depth_map in depth_maps]), sizes, starts[:-1], pixels)
 
 
