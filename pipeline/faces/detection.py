@@ -177,9 +177,9 @@ def _seen(pyramid: Pyramid, frame: Crop, networks: FaceNetworks) -> Iterator[tup
 
 def _verified(pyramid: Pyramid, proposals: Sequence[Crop], networks: FaceNetworks) -> tuple[FaceDetection, ...]:
     """The proposals that are faces, best first, each face once: by the score of a first look, the most likely first."""
-    looks = [_place(pyramid, crop, networks) for crop in proposals]
+    candidates = [_place(pyramid, crop, networks) for crop in proposals]
     chosen: list[FaceDetection] = []
-    for points, _, _ in sorted(looks, key=lambda look: -look[2]):
+    for points, _, _ in sorted(candidates, key=lambda candidate: -candidate[2]):
         crop = crop_around(points)
         if any(_is_same(crop, crop_around(face.landmarks_px)) for face in chosen):
             continue

@@ -124,7 +124,7 @@ def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
         return {"rows": faces[hits.triangles], "weights": hits.weights}
 
     table = _table()
-    given = (
+    inputs = (
         mean,
         np.asarray(faces),
         targets,
@@ -133,7 +133,7 @@ def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
         table["makehuman_rows"],
         table["makehuman_weights"],
     )
-    return kept_arrays("landmark-map", given, make, made_by=(SurfaceIndex, landmark_warp))
+    return kept_arrays("landmark-map", inputs, make, made_by=(SurfaceIndex, landmark_warp))
 
 
 @cache

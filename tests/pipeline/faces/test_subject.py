@@ -156,10 +156,10 @@ def test_small_faces_are_found_where_none_is_large(networks: FaceNetworks) -> No
 
 
 def test_progress_is_told_and_may_end_the_search(networks: FaceNetworks, pictures: dict[str, ImageRgb]) -> None:
-    told: list[float] = []
-    find_subject(pictures, studio(), networks, report=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    shares: list[float] = []
+    find_subject(pictures, studio(), networks, report=shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
 
     def stop(share: float) -> None:
         raise KeyboardInterrupt
