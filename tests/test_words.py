@@ -47,7 +47,6 @@ NOT_DONE = {
     "pipeline/silhouettes",
     "pipeline/silhouettes/without_plates",
     "pipeline/texture",
-    "pipeline/verification",
     "tests/pipeline",
     "tests/pipeline/dense",
     "tests/pipeline/eigenheads/sources",
@@ -58,7 +57,6 @@ NOT_DONE = {
     "tests/pipeline/silhouettes",
     "tests/pipeline/silhouettes/without_plates",
     "tests/pipeline/texture",
-    "tests/pipeline/verification",
 }
 
 SPELLED: dict[type[ast.AST], str] = {  # the field in which a node of a syntax tree spells a name of its own

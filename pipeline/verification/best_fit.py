@@ -121,11 +121,11 @@ def _refined(
             break
         reach = max(0.5 * reach, 0.5)
     hits = reference.index.closest(place.apply(points))
-    told = ~reference.beside(hits)
-    if told.mean() < LEAST_TOLD:
+    covered = ~reference.beside(hits)
+    if covered.mean() < LEAST_TOLD:
         return place, np.inf, 0
-    off = np.minimum(hits.distances, FAR_MM)[told]
-    return place, float(np.sqrt(np.average(off**2, weights=weights[told]))), int(counted(hits, reference).sum())
+    off = np.minimum(hits.distances, FAR_MM)[covered]
+    return place, float(np.sqrt(np.average(off**2, weights=weights[covered]))), int(counted(hits, reference).sum())
 
 
 def _step(
@@ -159,8 +159,9 @@ def _searched(measured: Measured, reference: Reference, rng: np.random.Generator
     rotations, translations = np.repeat(turns, len(places), axis=0), np.tile(places, (len(turns), 1))
     for stage in ROUNDS:
         some = slice(0, stage.points)
-        given = (points[some], normals[some], surface, tree, rotations, translations, stage)
-        means, rotations, translations = _closest_points(*given)
+        means, rotations, translations = _closest_points(
+            points[some], normals[some], surface, tree, rotations, translations, stage
+        )
         best = np.argsort(means)[: stage.kept]
         rotations, translations = rotations[best], translations[best]
     return [Similarity(1.0, r, t - r @ middle) for r, t in zip(rotations, translations, strict=True)]

@@ -88,8 +88,8 @@ def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) ->
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])
-    told = np.isfinite(deviations).all(axis=0)
-    repeated_mm = np.where(told, np.where(told, deviations, 0.0).mean(axis=0), np.nan)
+    known = np.isfinite(deviations).all(axis=0)
+    repeated_mm = np.where(known, np.where(known, deviations, 0.0).mean(axis=0), np.nan)
     repeatability: dict[str, dict[str, float]] = {}
     if len(measured) > 1:
         heads = np.stack([one.mesh_world.vertices for one in measured])
@@ -122,10 +122,10 @@ def judge_one(measured: Measured, reference: Reference) -> Judged:
 def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> dict[str, RegionError]:
     """Errors of every region of which the reference covers enough."""
     found = {}
-    told = np.isfinite(deviation_mm)
+    known = np.isfinite(deviation_mm)
     for name in REGIONS:
         region = measured.regions[name]
-        whole, kept = float(measured.areas[region].sum()), region & told
+        whole, kept = float(measured.areas[region].sum()), region & known
         covered = float(measured.areas[kept].sum()) / whole if whole else 0.0
         if covered >= LEAST_COVERED:
             found[name] = _region_error(deviation_mm[kept], measured.areas[kept], covered)

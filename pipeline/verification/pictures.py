@@ -38,7 +38,7 @@ class Pictures:
 def draw(first: Measured, reference: Reference, judgement: Judgement) -> Pictures:
     """``first``: the capture of ``judgement``'s first entry; the error is what all captures have in common."""
     head = first.head_from_world.apply(first.mesh_world.vertices)
-    own = Mesh(head, first.mesh_world.faces)
+    fitted = Mesh(head, first.mesh_world.faces)
     head_from_reference = first.head_from_world @ judgement.captures[0].fit.reference_from_world.inverse()
     scan = Mesh(head_from_reference.apply(reference.mesh.vertices), reference.mesh.faces)
     box = (head.min(axis=0), head.max(axis=0))
@@ -48,13 +48,13 @@ def draw(first: Measured, reference: Reference, judgement: Judgement) -> Picture
     def views(mesh: Mesh, **colour: Any) -> tuple[Resized, ...]:
         return tuple(clay(mesh, azimuth_deg=of, panel=PANEL, box=box, paper=PAPER, **colour) for of in AZIMUTHS_DEG)
 
-    return Pictures(views(scan), views(own), views(own, colours=heat, darkest=HEAT_DARKEST), end_mm)
+    return Pictures(views(scan), views(fitted), views(fitted, colours=heat, darkest=HEAT_DARKEST), end_mm)
 
 
 def scale_end(deviation_mm: Float[np.ndarray, " n"]) -> float:
     """The least of ``STEPS_MM`` that holds most of the deviations."""
-    told = np.abs(deviation_mm[np.isfinite(deviation_mm)])
-    wanted = float(np.quantile(told, SHOWN)) if len(told) else 0.0
+    known = np.abs(deviation_mm[np.isfinite(deviation_mm)])
+    wanted = float(np.quantile(known, SHOWN)) if len(known) else 0.0
     return next((step for step in STEPS_MM if step >= wanted), STEPS_MM[-1])
 
 

@@ -65,8 +65,8 @@ def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
     Raises InputError naming every fault.
     """
     vertices, faces = welded(read_mesh(path))
-    given = landmarks or landmark_file(path)
-    marks = {} if given is None else read_landmarks(given)
+    landmarks_path = landmarks or landmark_file(path)
+    marks = {} if landmarks_path is None else read_landmarks(landmarks_path)
     return Reference.of(Mesh(vertices, faces), marks, path.name, hashlib.sha256(path.read_bytes()).hexdigest())
 
 

@@ -15,9 +15,9 @@ from rig.mesh import Mesh
 from tests.support.measured_heads import mannequin, marks
 
 
-def refused(mesh: Mesh, given: dict[str, np.ndarray] | None = None) -> str:
+def refused(mesh: Mesh, landmarks: dict[str, np.ndarray] | None = None) -> str:
     with pytest.raises(InputError) as error:
-        Reference.of(mesh, given or {}, "scan.ply")
+        Reference.of(mesh, landmarks or {}, "scan.ply")
     return str(error.value)
 
 
@@ -69,9 +69,9 @@ def test_triangles_that_look_different_ways_are_named() -> None:
 
 def test_landmarks_of_another_frame_are_named_with_all_else() -> None:
     moved = {name: point + (0.0, 0.0, 50.0) for name, point in marks().items()}
-    told = refused(replace(mannequin(), vertices=mannequin().vertices / 10), moved)
-    assert "landmarks off the surface: " in told
-    assert "in cm" in told
+    refusal = refused(replace(mannequin(), vertices=mannequin().vertices / 10), moved)
+    assert "landmarks off the surface: " in refusal
+    assert "in cm" in refusal
 
 
 def test_closest_points_at_the_rim_are_known() -> None:
