@@ -45,7 +45,6 @@ NOT_DONE = {
     "pipeline/fitting/fine",
     "pipeline/multiview",
     "pipeline/silhouettes",
-    "pipeline/silhouettes/without_plates",
     "pipeline/texture",
     "tests/pipeline",
     "tests/pipeline/dense",
@@ -55,7 +54,6 @@ NOT_DONE = {
     "tests/pipeline/fitting/fine",
     "tests/pipeline/multiview",
     "tests/pipeline/silhouettes",
-    "tests/pipeline/silhouettes/without_plates",
     "tests/pipeline/texture",
 }
 

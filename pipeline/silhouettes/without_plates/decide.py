@@ -62,8 +62,8 @@ def decide_without_plates(
         camera.name: background_seen(points, camera.name, camera.intrinsics.width, sizes[camera.name], volume, plane)
         for camera in rig
     }
-    told = partial(_between, report, POINTS_SHARE, MASKS_SHARE)
-    found = search_masks(small, rig, volume, background, bounded=plane is not None, head=head, report=told)
+    report_masks = partial(_between, report, POINTS_SHARE, MASKS_SHARE)
+    found = search_masks(small, rig, volume, background, bounded=plane is not None, head=head, report=report_masks)
     decisions = {
         name: decision_without_plate(images[name], small[name], found[name], settings, solid=head is not None)
         for name in rig.names
@@ -71,9 +71,9 @@ def decide_without_plates(
     cluttered = {n for n, one in decisions.items() if plane is not None or plate_noise(one) > PLATE_NOISE_MOST}
     if not cluttered:
         return WithoutPlates(decisions, {})
-    told = partial(_between, report, MASKS_SHARE, 1.0)
+    report_cuts = partial(_between, report, MASKS_SHARE, 1.0)
     reduced = {name: _reduced(images[name], COLUMNS) for name in rig.names}
-    cuts = cut_views(reduced, {name: one.mask for name, one in found.items()}, volume, report=told)
+    cuts = cut_views(reduced, {name: one.mask for name, one in found.items()}, volume, report=report_cuts)
     shares = {name: _enlarged(cuts[name], images[name].shape[:2]) for name in rig.names if name in cluttered}
     return WithoutPlates({name: one for name, one in decisions.items() if name not in cluttered}, shares)
 
@@ -87,10 +87,10 @@ def background_seen(
     plane: Float[np.ndarray, " 4"] | None,
 ) -> Bool[np.ndarray, "h w"]:
     """Reduced pixels (``size``: height, width) around points that are far from all subjects or on what it stands on."""
-    own = points.points[points.rows[name]]
-    behind = np.linalg.norm(own - volume.centre_world, axis=1) > volume.radius_mm
+    seen_points = points.points[points.rows[name]]
+    behind = np.linalg.norm(seen_points - volume.centre_world, axis=1) > volume.radius_mm
     if plane is not None:
-        behind |= own @ plane[:3] + plane[3] < NEAR * volume.radius_mm
+        behind |= seen_points @ plane[:3] + plane[3] < NEAR * volume.radius_mm
     mask = np.zeros(size, np.uint8)
     for x, y in (points.pixels[name][behind] + 0.5) * (size[1] / width):
         cv2.circle(mask, (int(x), int(y)), POINT_PX, 1, -1)

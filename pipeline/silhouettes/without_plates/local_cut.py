@@ -112,8 +112,10 @@ def _carved(
         name: (MOST_ODDS * (2 * cv2.resize(share, masks[name].shape[::-1], interpolation=cv2.INTER_AREA) - 1))
         for name, share in shares.items()
     }
-    told = ask_other_views(volume, odds)
-    return {name: (share > 0.5) & ~_resized(told[name].support < DENIED, share.shape) for name, share in shares.items()}
+    others = ask_other_views(volume, odds)
+    return {
+        name: (share > 0.5) & ~_resized(others[name].support < DENIED, share.shape) for name, share in shares.items()
+    }
 
 
 def _resized(mask: Bool[np.ndarray, "_ _"], size: tuple[int, ...]) -> Bool[np.ndarray, "_ _"]:

@@ -62,7 +62,7 @@ class CoarseMask:
 
     odds: Float32[np.ndarray, "h w"]
     mask: Mask
-    told: OtherViews
+    other_views: OtherViews
 
 
 def find_seeds(
@@ -114,18 +114,18 @@ def search_masks(
     found: dict[str, CoarseMask] = {}
     for step in range(ROUNDS):
         report(step / ROUNDS)
-        common = np.sum([histogram(images[name][own.subject]) for name, own in samples.items()], axis=0)
+        common = np.sum([histogram(images[name][sample.subject]) for name, sample in samples.items()], axis=0)
         local = step >= (BORDER_ROUNDS if bounded else LOCAL_ROUNDS)
         odds = {}
         for name, image in images.items():
-            own = colour_odds(image, samples[name], common, noise[name], nearby=local)
-            own = np.where(known[name], own + BORDER_ODDS, own)
-            odds[name] = np.where(seeds[name].reachable, own, -MOST_ODDS).astype(np.float32)
+            evidence = colour_odds(image, samples[name], common, noise[name], nearby=local)
+            evidence = np.where(known[name], evidence + BORDER_ODDS, evidence)
+            odds[name] = np.where(seeds[name].reachable, evidence, -MOST_ODDS).astype(np.float32)
         start = {name: mask.odds for name, mask in found.items()} if local else odds
         for _ in range(2):
-            told = ask_other_views(volume, start)
+            other_views = ask_other_views(volume, start)
             found = {
-                name: _with_neighbours(image, odds[name], told[name], seeds[name], noise[name])
+                name: _with_neighbours(image, odds[name], other_views[name], seeds[name], noise[name])
                 for name, image in images.items()
             }
             start = {name: mask.odds for name, mask in found.items()}
@@ -136,16 +136,20 @@ def search_masks(
 def _with_neighbours(
     image: Float32[np.ndarray, "h w 3"],
     odds: Float32[np.ndarray, "h w"],
-    told: OtherViews,
+    other_views: OtherViews,
     seeds: Seeds,
     noise: Float[np.ndarray, " 3"],
 ) -> CoarseMask:
-    given = odds + np.clip(SUPPORT_WEIGHT * told.support, -DENIAL_MOST, SUPPORT_MOST) + SOLID_ODDS * told.solid
-    given = np.where(seeds.reachable, given + seeds.core_odds * seeds.core, -MOST_ODDS)
-    given = np.clip(given, -MOST_ODDS, MOST_ODDS).astype(np.float32)
-    smooth = mean_field_sweeps(given, (image / (LINK_NOISE * noise)).astype(np.float32), LINK, SWEEPS)
+    combined = (
+        odds
+        + np.clip(SUPPORT_WEIGHT * other_views.support, -DENIAL_MOST, SUPPORT_MOST)
+        + SOLID_ODDS * other_views.solid
+    )
+    combined = np.where(seeds.reachable, combined + seeds.core_odds * seeds.core, -MOST_ODDS)
+    combined = np.clip(combined, -MOST_ODDS, MOST_ODDS).astype(np.float32)
+    smooth = mean_field_sweeps(combined, (image / (LINK_NOISE * noise)).astype(np.float32), LINK, SWEEPS)
     smooth = np.asarray(2 * smooth, np.float32)
-    return CoarseMask(smooth, _one_piece(smooth > 0, seeds.core), told)
+    return CoarseMask(smooth, _one_piece(smooth > 0, seeds.core), other_views)
 
 
 def _learn(found: CoarseMask, known: Mask, *, border: bool) -> Samples:
@@ -153,7 +157,7 @@ def _learn(found: CoarseMask, known: Mask, *, border: bool) -> Samples:
     subject = inner if inner.any() else found.mask
     if border:
         return Samples(subject, known)
-    background = (~dilated(found.mask, 2) & (found.told.support < 0)) | (known & ~found.mask)
+    background = (~dilated(found.mask, 2) & (found.other_views.support < 0)) | (known & ~found.mask)
     return Samples(subject, background if background.sum() >= SAMPLES_LEAST else known)
 
 

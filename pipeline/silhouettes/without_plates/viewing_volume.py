@@ -114,23 +114,23 @@ def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray
         around = cv2.erode(field, np.ones((width, width), np.uint8), borderValue=2 * SOLID_ODDS)
         doubts[name] = shown & (around.ravel()[at] < SOLID_ODDS)
         total, seen, against = total + words[name], seen + shown, against + doubts[name]
-    told = {}
+    other_views = {}
     witnesses = min(WITNESSES_LEAST, len(odds) - 1)  # of three cameras no voxel has three others
     for name, field in odds.items():
         places = volume.places[name]
-        asked = (places >= 0) & (seen > witnesses)
+        witnessed = (places >= 0) & (seen > witnesses)
         support = np.full(field.size, -DENIES_MOST * len(odds), np.float32)
-        np.maximum.at(support, places[asked], (total - words[name])[asked])
+        np.maximum.at(support, places[witnessed], (total - words[name])[witnessed])
         if witnesses < WITNESSES_LEAST:  # two views from nearly one side take the same wall for the subject
             support = np.minimum(support, np.float32(0.0))
         wanted = max(WITNESSES_LEAST, WITNESSES_SHARE * (len(odds) - 1))
-        held = asked & (against == doubts[name]) & (seen - 1 >= wanted)
+        held = witnessed & (against == doubts[name]) & (seen - 1 >= wanted)
         solid = np.zeros(field.size, np.uint8)
         solid[places[held]] = 1
         window = _window(volume.reach_px[name])
         closed = cv2.morphologyEx(solid.reshape(field.shape), cv2.MORPH_CLOSE, window).view(bool)
-        told[name] = OtherViews(cv2.dilate(support.reshape(field.shape), window), closed)
-    return told
+        other_views[name] = OtherViews(cv2.dilate(support.reshape(field.shape), window), closed)
+    return other_views
 
 
 def _window(reach: int) -> np.ndarray:

@@ -25,11 +25,11 @@ def test_masks_of_the_studio_without_its_plates(renderer: Renderer) -> None:
         taken, _ = take(seed, renderer)
         bare = Capture(taken.capture.images)
         found = segment(bare, taken.rig, SegmentationSettings(), report=lambda *_: None)
-        told = " ".join(warning.text for warning in view_warnings(found))
+        warned = " ".join(warning.text for warning in view_warnings(found))
         for name, silhouette in found.items():
             overlap.append(iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5))
             off.append(rms(silhouette, coverage(taken, name, RESOLUTION_PX)))
-            silent += [f"{seed} {name}"] if overlap[-1] < 0.95 and f"{name}:" not in told else []
+            silent += [f"{seed} {name}"] if overlap[-1] < 0.95 and f"{name}:" not in warned else []
     assert (np.array(overlap) >= 0.99).mean() >= 0.9
     assert np.median(off) <= 0.6
     assert silent == []

@@ -57,8 +57,8 @@ def test_the_matting_finds_the_edge_to_a_fraction_of_a_pixel() -> None:
     image, _, away = photograph(0.0)
     small, from_edge = coarse_of(image, away)
     odds = np.where(from_edge < 3, 4.0, -4.0).astype(np.float32)
-    told = OtherViews(odds, odds > 0)
-    decision = decision_without_plate(image, small, CoarseMask(odds, odds > 0, told), SegmentationSettings())
+    others = OtherViews(odds, odds > 0)
+    decision = decision_without_plate(image, small, CoarseMask(odds, odds > 0, others), SegmentationSettings())
     assert plate_noise(decision) < 4
     matte = solve_matte(image, decision, SegmentationSettings())
     inside = np.zeros(away.shape, bool)

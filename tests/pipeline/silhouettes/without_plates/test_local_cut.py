@@ -13,8 +13,8 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
     row, column = np.mgrid[:300, :400]
     mask = np.hypot(column - 200, row - 150) < 90
     cloth = 85 + 100 * cv2.GaussianBlur(rng.normal(size=(300, 400)), (0, 0), 3)
-    own = 170 - 30 * (np.hypot(column - 200, row - 150) / 90) ** 2
-    image = np.where(mask, own, cloth)[:, :, None] * np.array([1.0, 0.95, 0.9]) + rng.normal(0, 4, (300, 400, 3))
+    subject = 170 - 30 * (np.hypot(column - 200, row - 150) / 90) ** 2
+    image = np.where(mask, subject, cloth)[:, :, None] * np.array([1.0, 0.95, 0.9]) + rng.normal(0, 4, (300, 400, 3))
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.8), 0, 255).astype(np.uint8), mask
 
 

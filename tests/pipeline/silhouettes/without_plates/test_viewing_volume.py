@@ -47,14 +47,14 @@ def test_other_views_hold_the_ball_and_deny_what_is_beside_it() -> None:
     volume = viewing_volume(rig, dict.fromkeys(rig.names, SIZE), viewing_ball(rig))
     odds = {c.name: np.where(from_ball(c, RADIUS_MM) < 0, 5.0, -5.0).astype(np.float32) for c in rig}
     odds["c0"][:] = -5.0  # this view is blind, and asks
-    told = ask_other_views(volume, odds)["c0"]
+    others = ask_other_views(volume, odds)["c0"]
     beside = from_ball(rig["c0"], RADIUS_MM)
     voxel_mm = 2 * volume.radius_mm / 96
-    assert (told.support[beside < -2 * voxel_mm] > 0).all()
+    assert (others.support[beside < -2 * voxel_mm] > 0).all()
     # Eight views leave a hull that is wider than the ball by 1 / cos(pi / 8), 8 %, and by voxels.
-    assert (told.support[beside > 0.09 * RADIUS_MM + 3 * voxel_mm] < 0).all()
-    assert told.solid[beside < -4 * voxel_mm].all()
-    assert not told.solid[beside > 0.09 * RADIUS_MM].any()
+    assert (others.support[beside > 0.09 * RADIUS_MM + 3 * voxel_mm] < 0).all()
+    assert others.solid[beside < -4 * voxel_mm].all()
+    assert not others.solid[beside > 0.09 * RADIUS_MM].any()
 
 
 def test_nothing_is_left_beyond_the_plane() -> None:
