@@ -39,7 +39,6 @@ PUBLIC = {
 NOT_DONE = {
     "pipeline",
     "pipeline/dense",
-    "pipeline/eigenheads/sources",
     "pipeline/experiments",
     "pipeline/fitting",
     "pipeline/fitting/fine",
@@ -48,7 +47,6 @@ NOT_DONE = {
     "pipeline/texture",
     "tests/pipeline",
     "tests/pipeline/dense",
-    "tests/pipeline/eigenheads/sources",
     "tests/pipeline/experiments",
     "tests/pipeline/fitting",
     "tests/pipeline/fitting/fine",

