@@ -42,7 +42,6 @@ NOT_DONE = {
     "pipeline/experiments",
     "pipeline/fitting",
     "pipeline/fitting/fine",
-    "pipeline/multiview",
     "pipeline/silhouettes",
     "pipeline/texture",
     "tests/pipeline",
@@ -50,7 +49,6 @@ NOT_DONE = {
     "tests/pipeline/experiments",
     "tests/pipeline/fitting",
     "tests/pipeline/fitting/fine",
-    "tests/pipeline/multiview",
     "tests/pipeline/silhouettes",
     "tests/pipeline/texture",
 }

@@ -164,13 +164,13 @@ def mean_misfit(misses: Float[np.ndarray, "n n 2"], cut_off: float | None = None
 
 def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Assignment:
     """The permutation as an answer: none where it leaves a camera that it moves in contradiction."""
-    own = np.arange(len(rig))
-    displaced = np.flatnonzero(held != own)
+    identity = np.arange(len(rig))
+    displaced = np.flatnonzero(held != identity)
     if not len(displaced):
         return NOTHING
-    before, after = (_rows(misfit, pictures)[own, pictures] for pictures in (own, held))
+    before, after = (_rows(misfit, pictures)[identity, pictures] for pictures in (identity, held))
     mean_after = after / (2 * (len(rig) - 1))
-    gain = float(_cost(misfit, own) - _cost(misfit, held))
+    gain = float(_cost(misfit, identity) - _cost(misfit, held))
     if gain < NAMED_GAIN or (mean_after[displaced] > FITTING_MISFIT).any() or (after > before)[displaced].any():
         return NOTHING
     pictures = {rig.names[i]: rig.names[held[i]] for i in displaced.tolist()}
@@ -267,10 +267,10 @@ def _descended(
     held, every = start.copy(), np.arange(len(start))
     while True:
         rows = _rows(misfit, held)
-        own = rows[every, held]
+        current = rows[every, held]
         p, q = np.ix_(every, every)
         a, b = held[p], held[q]
-        before = own[:, None] + own[None, :] - misfit[p, a, q, b]
+        before = current[:, None] + current[None, :] - misfit[p, a, q, b]
         crossed = rows[p, b] - misfit[p, b, q, b] + rows[q, a] - misfit[q, a, p, a] + misfit[p, b, q, a]
         gain = np.where(allowed, before - crossed, -np.inf)
         np.fill_diagonal(gain, -np.inf)

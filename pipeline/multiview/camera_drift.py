@@ -101,15 +101,15 @@ def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | Non
     """The shift that the camera's own equations agree on, if there is one worth an alarm."""
     rest = _normalised([t for t in tangencies if name not in t.cameras])
     scale = max(1.0, 1.4826 * float(np.median(np.abs(rest)))) if len(rest) else 1.0
-    own = ShiftEquations.of(name, tangencies, scale * NOISE_FLOOR_PX)
-    if len(own.excess_px) < EQUATIONS_LEAST:
+    equations = ShiftEquations.of(name, tangencies, scale * NOISE_FLOOR_PX)
+    if len(equations.excess_px) < EQUATIONS_LEAST:
         return None
-    found = _robust_shift(own)
-    before, after = _misfits(own.excess_px / own.noise_px), _misfits(own.missed(found.shift_px, 0.0))
+    found = _robust_shift(equations)
+    before, after = _misfits(equations.excess_px / equations.noise_px), _misfits(equations.missed(found.shift_px, 0.0))
     size = float(np.linalg.norm(found.shift_px))
     if found.sigmas < SIGMAS_LEAST or size < SHIFT_LEAST_PX or not _explains(before, after):
         return None
-    moved = _beyond_loose_masks(own, found) >= MOVED_SIGMAS_LEAST and _disagrees(before, _misfits(rest / scale))
+    moved = _beyond_loose_masks(equations, found) >= MOVED_SIGMAS_LEAST and _disagrees(before, _misfits(rest / scale))
     turn = np.degrees(np.arctan(size / camera.intrinsics.fx))
     return Drift(name, found.shift_px, found.deviation_px, float(turn), found.sigmas, moved)
 
@@ -139,12 +139,12 @@ class ShiftEquations:
 
     @classmethod
     def of(cls, name: str, tangencies: list[Tangency], contour_noise_px: float) -> "ShiftEquations":
-        own = [(t, side) for t in tangencies for side in range(2) if t.cameras[side] == name]
-        ratio = np.array([t.steepness[1 - side] / t.steepness[side] for t, side in own])
+        involved = [(t, side) for t in tangencies for side in range(2) if t.cameras[side] == name]
+        ratio = np.array([t.steepness[1 - side] / t.steepness[side] for t, side in involved])
         return cls(
-            np.array([t.normals[side] for t, side in own]).reshape(-1, 2),
-            np.array([t.outward for t, _ in own]),
-            np.array([t.excess_px[side] for t, side in own]),
+            np.array([t.normals[side] for t, side in involved]).reshape(-1, 2),
+            np.array([t.outward for t, _ in involved]),
+            np.array([t.excess_px[side] for t, side in involved]),
             np.hypot(1.0, ratio),
             contour_noise_px,
         )
@@ -161,9 +161,9 @@ class ShiftTerm:
     equations: ShiftEquations
 
     def at(self, shift_px: Float[np.ndarray, " 2"]) -> Residuals:
-        own = self.equations
-        miss = own.missed(shift_px, 0.0)
-        return Residuals(miss[:, None], lambda: (own.normals / own.noise_px[:, None])[:, None], _LOSS)
+        equations = self.equations
+        miss = equations.missed(shift_px, 0.0)
+        return Residuals(miss[:, None], lambda: (equations.normals / equations.noise_px[:, None])[:, None], _LOSS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,34 +175,36 @@ class _Shift:
     sigmas: float
 
 
-def _robust_shift(own: ShiftEquations) -> _Shift:
+def _robust_shift(equations: ShiftEquations) -> _Shift:
     """The shift of least robust misfit, from the best of those that pairs of equations propose. Where the equations
     are all of one direction, the shift stays zero across it."""
-    pairs = np.stack(np.triu_indices(len(own.excess_px), 1), axis=1)
-    pairs = pairs[np.abs(np.linalg.det(own.normals[pairs])) > INDEPENDENT_LEAST]
-    met = np.linalg.solve(own.normals[pairs], own.excess_px[pairs][:, :, None])[:, :, 0]
+    pairs = np.stack(np.triu_indices(len(equations.excess_px), 1), axis=1)
+    pairs = pairs[np.abs(np.linalg.det(equations.normals[pairs])) > INDEPENDENT_LEAST]
+    met = np.linalg.solve(equations.normals[pairs], equations.excess_px[pairs][:, :, None])[:, :, 0]
     proposals = np.concatenate([np.zeros((1, 2)), met])
-    misses = (own.excess_px - proposals @ own.normals.T) / own.noise_px
+    misses = (equations.excess_px - proposals @ equations.normals.T) / equations.noise_px
     start = proposals[int(np.argmin(_misfits(misses).sum(axis=1)))]
     known = NO_SHIFT_INFORMATION * np.eye(2)
-    problem = Problem((ShiftTerm(own), Quadratic.prior(known, np.zeros(2))), 2, np.add)
+    problem = Problem((ShiftTerm(equations), Quadratic.prior(known, np.zeros(2))), 2, np.add)
     found = minimise(problem, start, Limits(tolerance=1e-6))
     information = problem.equations(found.at).matrix - known
     deviation = float(np.sqrt(np.trace(np.linalg.inv(information + 1e-9 * np.eye(2)))))
     return _Shift(found.value, deviation, float(np.sqrt(found.value @ information @ found.value)))
 
 
-def _beyond_loose_masks(own: ShiftEquations, found: _Shift) -> float:
+def _beyond_loose_masks(equations: ShiftEquations, found: _Shift) -> float:
     """By how many standard deviations the shift explains the planes better than masks that are loose do: the root of
     the difference of their costs, 0 where loose masks do as well. Each equation proposes a looseness."""
-    deviation_px = LOOSE_PX * float(np.median(own.pixels))
-    proposed = np.append(own.outward * own.excess_px, 0.0)
-    loose = min(_cost(own, np.zeros(2), loose_px) + (loose_px / deviation_px) ** 2 for loose_px in proposed.tolist())
-    return float(np.sqrt(max(0.0, loose - _cost(own, found.shift_px, 0.0))))
+    deviation_px = LOOSE_PX * float(np.median(equations.pixels))
+    proposed = np.append(equations.outward * equations.excess_px, 0.0)
+    loose = min(
+        _cost(equations, np.zeros(2), loose_px) + (loose_px / deviation_px) ** 2 for loose_px in proposed.tolist()
+    )
+    return float(np.sqrt(max(0.0, loose - _cost(equations, found.shift_px, 0.0))))
 
 
-def _cost(own: ShiftEquations, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> float:
-    return float(_LOSS.cost(own.missed(shift_px, loose_px) ** 2).sum())
+def _cost(equations: ShiftEquations, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> float:
+    return float(_LOSS.cost(equations.missed(shift_px, loose_px) ** 2).sum())
 
 
 def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -> bool:
@@ -212,11 +214,11 @@ def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -
     return all(after[k].sum() <= (1.0 - GAIN_LEAST) * before[k].sum() for k in (slice(None), others))
 
 
-def _disagrees(own: Float[np.ndarray, " n"], rest: Float[np.ndarray, " m"]) -> bool:
+def _disagrees(misfits: Float[np.ndarray, " n"], rest: Float[np.ndarray, " m"]) -> bool:
     """Whether planes agree better without a camera's own than chance allows (F test of the mean misfits)."""
     if not len(rest) or not rest.any():
         return True
-    return bool(fdtrc(len(own), len(rest), own.mean() / rest.mean()) < CHANCE)
+    return bool(fdtrc(len(misfits), len(rest), misfits.mean() / rest.mean()) < CHANCE)
 
 
 def _misfits(miss: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -57,8 +57,8 @@ class WrongScale(EigenheadError):
     """Outlines of a head that no head has the size of: the unit of the cameras is not millimetres."""
 
     def __init__(self, diameter_mm: float) -> None:
-        told = compose("size-refused", size=_size_told(diameter_mm), remedy=compose("advice-known-length"))
-        super().__init__(told)
+        message = compose("size-refused", size=_size_told(diameter_mm), remedy=compose("advice-known-length"))
+        super().__init__(message)
 
 
 def judge_head_size(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[ReportWarning]:

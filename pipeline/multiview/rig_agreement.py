@@ -55,11 +55,11 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
         return None
     square = all(camera.intrinsics.width == camera.intrinsics.height for camera in seen)
     readings = (*_READINGS, *(_SQUARE_READINGS if square else ()))
-    found = [(_median_misfit(_read(hulls, seen, turn), seen), told) for told, turn in readings]
+    found = [(_median_misfit(_read(hulls, seen, turn), seen), message) for message, turn in readings]
     for other, read, remedy in alternative_conventions(seen):
-        told = compose("other-convention", convention=other, remedy=remedy)
-        found.append((_median_misfit(hulls, read), told))
-    believed = [(misfit, told) for misfit, told in found if misfit <= RIGHT_MOST]
+        message = compose("other-convention", convention=other, remedy=remedy)
+        found.append((_median_misfit(hulls, read), message))
+    believed = [(misfit, message) for misfit, message in found if misfit <= RIGHT_MOST]
     if believed:
         return min(believed, key=lambda one: one[0])[1]
     return None if _are_loose(hulls, seen) else compose("other-rig")

@@ -49,11 +49,11 @@ def find_scene_points(
         first, second = _matches(seen[a], seen[b])
         found, good = _where_rays_pass(rig[a], first, rig[b], second)
         points.append(found[good])
-        own = np.arange(total, total + np.count_nonzero(good))
-        total += len(own)
+        indices = np.arange(total, total + np.count_nonzero(good))
+        total += len(indices)
         for name, at in ((a, first), (b, second)):
             pixels[name].append(at[good])
-            rows[name].append(own)
+            rows[name].append(indices)
     return ScenePoints(
         np.concatenate(points) if points else np.zeros((0, 3)),
         {name: np.concatenate(at) if at else np.zeros((0, 2)) for name, at in pixels.items()},

@@ -112,8 +112,8 @@ def planes(
     equations: list[tuple[float, float, float]], noise_px: float = NOISE_PX, ratio: float = 1.0
 ) -> list[Tangency]:
     """Those of cam02, and some that it takes no part in."""
-    own = [plane(("cam02", f"cam{k:02}"), (x, y), excess, ratio) for k, (x, y, excess) in enumerate(equations, 3)]
-    return own + 20 * [plane(("cam00", "cam01"), (0.0, 1.0), noise_px)]
+    involved = [plane(("cam02", f"cam{k:02}"), (x, y), excess, ratio) for k, (x, y, excess) in enumerate(equations, 3)]
+    return involved + 20 * [plane(("cam00", "cam01"), (0.0, 1.0), noise_px)]
 
 
 CROWN = [(x, y, 0.0) for x, y, _ in BAD_STRETCH[2:]]  # all but the two steepest
