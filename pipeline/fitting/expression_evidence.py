@@ -35,18 +35,18 @@ def with_expression_evidence(solved: Solved, eigenheads: int) -> Solved:
         return solved
     equations = normal_equations(solved)
     count, unknowns = len(state.coefficients), len(equations.gradient)
-    median, own = solved.problem.settings.expression_median, np.arange(count)
+    median, diagonal = solved.problem.settings.expression_median, np.arange(count)
     weights = slice(posed.start, posed.stop)
     matrix, gradient = equations.matrix.copy(), equations.gradient.copy()
-    matrix[own, own] -= 1.0  # what the evidence says without the priors
+    matrix[diagonal, diagonal] -= 1.0  # what the evidence says without the priors
     gradient[:count] -= state.coefficients
     gradient[weights] -= weight_slope(np.maximum(state.coefficients[weights], 0.0), median)
-    groups = (own[:eigenheads], own[eigenheads : posed.start], own[posed.stop :])
+    groups = (diagonal[:eigenheads], diagonal[eigenheads : posed.start], diagonal[posed.stop :])
     variance, now, step = np.ones(count), state.coefficients, np.zeros(unknowns)
     room = weight_room(state, posed, unknowns)
     for _ in range(ROUNDS):
         whole, slope = matrix.copy(), gradient.copy()
-        whole[own, own] += 1.0 / variance
+        whole[diagonal, diagonal] += 1.0 / variance
         slope[:count] += state.coefficients / variance
         slope[weights] += weight_slope(np.maximum(now[weights], 0.0), median)
         step = least_within(whole, slope, *room)

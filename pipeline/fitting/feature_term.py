@@ -55,12 +55,12 @@ class FeatureTerm:
         rows[:, :, : stage.modes] = np.einsum("nad,mnd->nam", turned, observed.basis[: stage.modes], optimize=True)
         rotation, translation = views.rotation[observed.view], views.translation[observed.view]
         inside = np.einsum("nij,nj->ni", rotation, points) + translation
-        own = stage.modes + POSE + PER_CAMERA * observed.view[:, None] + np.arange(PER_CAMERA)
+        columns = stage.modes + POSE + PER_CAMERA * observed.view[:, None] + np.arange(PER_CAMERA)
         for axis in range(2):
             rows[:, axis, stage.modes : stage.modes + POSE] = _pose_rows(points - pose.translation, slopes[:, axis])
             if stage.cameras:
                 gradient = np.einsum("nij,nj->ni", rotation, slopes[:, axis])
-                rows[np.arange(count)[:, None], axis, own] = _pose_rows(inside, gradient)[:, :PER_CAMERA]
+                rows[np.arange(count)[:, None], axis, columns] = _pose_rows(inside, gradient)[:, :PER_CAMERA]
         return rows
 
 

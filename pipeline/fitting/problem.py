@@ -188,9 +188,9 @@ def level_basis(model: HeadModel, name: str) -> LevelBasis:
     """Mean and modes (mm, head frame) where a level's vertices come from them: a coarse level has its own."""
     level = model.levels[name]
     if level.count < len(model.mean):
-        own = model.basis(name, len(model.modes)).transpose(1, 2, 0)
+        coarse_basis = model.basis(name, len(model.modes)).transpose(1, 2, 0)
         same = sparse.csr_array(sparse.identity(level.count, format="csr"))
-        return LevelBasis(same, model.vertices(np.zeros(0), name), np.ascontiguousarray(own))
+        return LevelBasis(same, model.vertices(np.zeros(0), name), np.ascontiguousarray(coarse_basis))
     return LevelBasis(level.operator, model.mean.astype(float), np.ascontiguousarray(model.modes.transpose(1, 2, 0)))
 
 

@@ -91,12 +91,12 @@ class RimAt:
         if not stage.cameras:
             return
         for k, (first, last) in enumerate(pairwise(ends)):
-            part, own = rows[first:last, shared:], slice(shared + PER_CAMERA * k, shared + PER_CAMERA * (k + 1))
+            part, columns = rows[first:last, shared:], slice(shared + PER_CAMERA * k, shared + PER_CAMERA * (k + 1))
             across = common[first:last].T @ part
-            matrix[:shared, own] += across
-            matrix[own, :shared] += across.T
-            matrix[own, own] += part.T @ part
-            gradient[own] += residual[first:last] @ part
+            matrix[:shared, columns] += across
+            matrix[columns, :shared] += across.T
+            matrix[columns, columns] += part.T @ part
+            gradient[columns] += residual[first:last] @ part
 
 
 def _loss(residual_px: Float[np.ndarray, " s"], scale_px: float) -> GemanMcClure:

@@ -103,14 +103,17 @@ def turned_faces(
     faces, count = topology.faces, len(vertices)
     near = np.ones(len(faces), bool) if active is None else _around(_around(active, faces, count), faces, count)
     rows, pairs = np.flatnonzero(near), topology.pairs
-    own = face_normals(vertices, faces[rows])
+    triangle_normals = face_normals(vertices, faces[rows])
     corners = faces[rows].ravel()
-    mean = np.stack([np.bincount(corners, np.repeat(own[:, k], 3), count) for k in range(3)], axis=1)
+    mean = np.stack([np.bincount(corners, np.repeat(triangle_normals[:, k], 3), count) for k in range(3)], axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     turned, unit = np.zeros(len(faces), bool), np.zeros((len(faces), 3))
     a, b, c = faces[rows].T
-    turned[rows] = np.einsum("fk,fk->f", own, mean[a] + mean[b] + mean[c]) <= 0.0
-    unit[rows] = own / np.maximum(np.sqrt(np.einsum("fk,fk->f", own, own)), 1e-12)[:, None]
+    turned[rows] = np.einsum("fk,fk->f", triangle_normals, mean[a] + mean[b] + mean[c]) <= 0.0
+    unit[rows] = (
+        triangle_normals
+        / np.maximum(np.sqrt(np.einsum("fk,fk->f", triangle_normals, triangle_normals)), 1e-12)[:, None]
+    )
     pairs = pairs if active is None else pairs[near[pairs[:, 0]] & near[pairs[:, 1]]]
     cosine = np.einsum("ek,ek->e", unit[pairs[:, 0]], unit[pairs[:, 1]])
     turned[pairs[cosine < np.cos(np.radians(MAX_FOLD_DEG))]] = True

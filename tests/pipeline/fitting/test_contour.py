@@ -139,9 +139,9 @@ def mask_with_blobs(mask: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarra
 
 def test_kernel_modes_are_orthogonal_to_the_span_and_carry_the_process(model):
     wide = with_kernel(load_model(), 60)
-    own = wide.modes[:60].reshape(60, -1).astype(float)
+    population = wide.modes[:60].reshape(60, -1).astype(float)
     kernel = wide.modes[60:].reshape(len(wide.modes) - 60, -1).astype(float)
-    cosines = own @ kernel.T / np.outer(np.linalg.norm(own, axis=1), np.linalg.norm(kernel, axis=1))
+    cosines = population @ kernel.T / np.outer(np.linalg.norm(population, axis=1), np.linalg.norm(kernel, axis=1))
     assert np.abs(cosines).max() < 1e-3
     points = wide.mean[::37].astype(float)
     prior = np.diag(covariance(points, points, SCALES))

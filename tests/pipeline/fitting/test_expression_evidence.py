@@ -19,7 +19,7 @@ from server.tasks.subjects import model_subject
 WEIGHTS = {"mouthSmileLeft": 0.7, "mouthSmileRight": 0.6, "jawOpen": 0.15}
 
 
-def told(model: HeadModel, weights: dict[str, float], renderer: Renderer) -> tuple[Found, ...]:
+def found_in(model: HeadModel, weights: dict[str, float], renderer: Renderer) -> tuple[Found, ...]:
     """What level photo says of a head of the population that makes that face."""
     coefficients = np.random.default_rng(31).standard_normal(len(model.modes))
     subject = model_subject(model, coefficients, "planted", weights)
@@ -31,7 +31,7 @@ def told(model: HeadModel, weights: dict[str, float], renderer: Renderer) -> tup
 
 @pytest.mark.slow
 def test_a_smile_is_named_and_its_weights_are_told(renderer: Renderer) -> None:
-    found = {each.name: each for each in told(load_model(), WEIGHTS, renderer)}
+    found = {each.name: each for each in found_in(load_model(), WEIGHTS, renderer)}
     for name, weight in WEIGHTS.items():
         assert found[name].weight == pytest.approx(weight, abs=0.15), name  # three of its deviations
     spurious = [each for name, each in found.items() if name not in WEIGHTS and each.weight > 0.25]
@@ -40,4 +40,4 @@ def test_a_smile_is_named_and_its_weights_are_told(renderer: Renderer) -> None:
 
 @pytest.mark.slow
 def test_a_neutral_face_is_said_to_make_none(renderer: Renderer) -> None:
-    assert [each for each in told(load_model(), {}, renderer) if each.weight > 0.1] == []
+    assert [each for each in found_in(load_model(), {}, renderer) if each.weight > 0.1] == []

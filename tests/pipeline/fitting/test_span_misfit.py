@@ -32,8 +32,8 @@ def test_what_two_fits_differ_by_is_misfit(span: HeadModel, wider: HeadModel) ->
     """A mode of the kernel, two deviations of it, that the narrower fit cannot have."""
     count = 61
     narrow = Fit("contour", np.zeros(60), Similarity.identity(), 1, "test", 1e-6 * np.eye(67))
-    given = np.concatenate([np.zeros(60), [2.0]])
-    wide = Fit("contour", given, Similarity.identity(), 1, "test", 1e-6 * np.eye(count + 7), sliding_mm=1.5)
+    coefficients = np.concatenate([np.zeros(60), [2.0]])
+    wide = Fit("contour", coefficients, Similarity.identity(), 1, "test", 1e-6 * np.eye(count + 7), sliding_mm=1.5)
     found = judged_by(with_modes(wider, count), wide, span, narrow)
     assert found.misfit_mm is not None
     normals = vertex_normals(span.mean.astype(float), span.levels["cage"].faces)

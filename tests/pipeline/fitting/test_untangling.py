@@ -32,9 +32,9 @@ HOSTILE_MM, LENGTH_MM = 1.5, 5.0  # standard deviation of a displacement along t
 def test_turned_and_folded_triangles_are_those_that_a_plain_test_finds() -> None:
     vertices, faces, _ = subdivided_sphere()
     shaken = vertices + np.random.default_rng(0).normal(0.0, 0.8, vertices.shape)
-    own, mean = face_normals(shaken, faces), vertex_normals(shaken, faces)
-    expected = (own * mean[faces].mean(axis=1)).sum(axis=1) <= 0.0
-    unit = own / np.linalg.norm(own, axis=1, keepdims=True)
+    normals, mean = face_normals(shaken, faces), vertex_normals(shaken, faces)
+    expected = (normals * mean[faces].mean(axis=1)).sum(axis=1) <= 0.0
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     at_edge: dict[tuple[int, int], int] = {}
     for f, (a, b, c) in enumerate(faces.tolist()):
         for edge in ((a, b), (b, c), (c, a)):
