@@ -40,13 +40,11 @@ NOT_DONE = {
     "pipeline",
     "pipeline/dense",
     "pipeline/experiments",
-    "pipeline/fitting/fine",
     "pipeline/silhouettes",
     "pipeline/texture",
     "tests/pipeline",
     "tests/pipeline/dense",
     "tests/pipeline/experiments",
-    "tests/pipeline/fitting/fine",
     "tests/pipeline/silhouettes",
     "tests/pipeline/texture",
 }

@@ -77,8 +77,11 @@ class Target:
         near = near.reshape(len(points), count)
         triangle = np.empty(len(points), np.int64)
         blend, square = np.zeros((len(points), 3)), np.empty(len(points))
-        given = points, normals, near, self.head, least_agreement, triangle, blend, square
-        in_threads(len(points), lambda a, b: closest_at_vertices(a, b, *given))
+
+        def fill(first: int, last: int) -> None:
+            closest_at_vertices(first, last, points, normals, near, self.head, least_agreement, triangle, blend, square)
+
+        in_threads(len(points), fill)
         row = np.flatnonzero((triangle >= 0) & (square <= reach_mm**2))
         return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
 

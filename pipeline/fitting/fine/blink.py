@@ -61,8 +61,8 @@ def judged_lids(
     """
     found, otherwise = {}, set[str]()
     for side, place in blinks_of(model).items():
-        own, moved = float(fit.coefficients[place]), _moved(fit, model, place)
-        share, half = _told(base - own * moved, moved, own, model, surface, eye_fissure(model, side))
+        fitted, moved = float(fit.coefficients[place]), _moved(fit, model, place)
+        share, half = _told(base - fitted * moved, moved, fitted, model, surface, eye_fissure(model, side))
         shown = eyes.get(side)
         shut = shown is not None and shown.closed
         found[side] = 1.0 if shut and share >= SHUT else share
@@ -106,26 +106,26 @@ def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray
 def _told(
     open_lids: Float[np.ndarray, "v 3"],
     moved: Float[np.ndarray, "v 3"],
-    own: float,
+    fitted: float,
     model: HeadModel,
     surface: SurfacePoints,
     slit: Fissure,
 ) -> tuple[float, float]:
-    """The weight whose lids lie nearest; the fit's ``own`` where too few points tell, or none is nearer. And the misfit
-    of half closed lids by that of open ones, 1 where too few points tell.
+    """Returns the weight whose lids lie nearest, ``fitted`` where too few points tell or none is nearer; and the misfit
+    of half closed lids divided by that of open ones, 1 where too few points tell.
 
     ``moved`` is what closes open lids."""
     middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
     off = np.linalg.norm(surface.points - middle, axis=1)
     about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != Part.UNSEEN))
     if len(about.points) < LEAST_POINTS:
-        return own, 1.0
+        return fitted, 1.0
     near, faces = _patch(open_lids, model, middle, NEAR * slit.length_mm + REACH_MM)
     still = _misfit(open_lids[near], faces, about)
     misfits = {HALF: _misfit((open_lids + HALF * moved)[near], faces, about)}
     half = misfits[HALF] / max(still, 1e-9)
     if half >= GAIN:  # lids that are down at all are nearer half way
-        return own, half
+        return fitted, half
     misfits |= {weight: _misfit((open_lids + weight * moved)[near], faces, about) for weight in OTHERS}
     return min(misfits, key=lambda weight: misfits[weight]), half
 
@@ -144,8 +144,10 @@ def _patch(
 
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
     """Mean of Geman and McClure's loss of the points' distances; a point without a place counts whole."""
-    given = (points.points, points.normals, vertices, vertex_normals(vertices, faces), faces)
-    found = associate(*given, reach_mm=REACH_MM, least_agreement=AGREEMENT)
+    normals = vertex_normals(vertices, faces)
+    found = associate(
+        points.points, points.normals, vertices, normals, faces, reach_mm=REACH_MM, least_agreement=AGREEMENT
+    )
     loss = np.ones(len(points.points))
     loss[found.row] = found.distance_mm**2 / (found.distance_mm**2 + ROBUST_MM**2)
     return float(loss.mean())

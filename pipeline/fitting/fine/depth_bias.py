@@ -39,8 +39,8 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
     skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
         return OnFace(skin, np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-    given = (surface.points[skin], surface.normals[skin], vertices, normals, faces)
-    found = associate(*given, reach_mm=REACH_MM, least_agreement=AGREEMENT)
+    points, facing = surface.points[skin], surface.normals[skin]
+    found = associate(points, facing, vertices, normals, faces, reach_mm=REACH_MM, least_agreement=AGREEMENT)
     on_face = face[faces[found.triangle]].all(axis=1)
     row, corner, blend = skin[found.row[on_face]], faces[found.triangle[on_face]], found.blend[on_face]
     normal = interpolated(normals[corner], blend)

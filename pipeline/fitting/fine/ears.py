@@ -85,8 +85,8 @@ def _registered(
     place = np.full(len(vertices), -1)
     place[local] = np.arange(len(local))
     part = place[faces[(place[faces] >= 0).all(axis=1)]]
-    own = vertices[local] - centre
-    target = Target.of(own, vertex_normals(own, part), part)
+    local_vertices = vertices[local] - centre
+    target = Target.of(local_vertices, vertex_normals(local_vertices, part), part)
     up, ahead = _axes(vertices, model)
     found = []
     for rise in STARTS_MM:

@@ -58,16 +58,16 @@ class ReadingBasis:
 def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> ReadingBasis:
     """All eigenheads of ``population``, the smooth modes of ``model`` (of the fit) and the expressions."""
     full = population.levels["full"]
-    given = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
+    inputs = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
 
     def make() -> dict[str, np.ndarray]:
         mean = population.vertices(np.zeros(0))
         vertex = thinned(mean, np.flatnonzero(full.face_region), SPACING_MM)
-        own = population.basis("full", len(population.modes), vertex)
+        population_modes = population.basis("full", len(population.modes), vertex)
         fitted = model.basis("full", model.posed.stop, vertex)[eigenheads:]
-        return {"vertex": vertex, "mean": mean[vertex], "modes": np.concatenate([own, fitted])}
+        return {"vertex": vertex, "mean": mean[vertex], "modes": np.concatenate([population_modes, fitted])}
 
-    kept = kept_arrays("expression-places", given, make, made_by=(thinned, HeadModel))
+    kept = kept_arrays("expression-places", inputs, make, made_by=(thinned, HeadModel))
     faces = full.faces[full.face_region[full.faces].any(axis=1)]
     faces.setflags(write=False)  # as the head's own faces are: loops are compiled for those
     return ReadingBasis(kept["vertex"], kept["mean"], kept["modes"], len(population.modes), faces)
@@ -138,11 +138,11 @@ def _solved(
     rows *= root.astype(np.float32)[:, None]
     matrix = (rows.T @ rows).astype(float)
     right = (root * ((place - basis.mean) * normal).sum(axis=1)) @ rows
-    own, first = np.arange(len(matrix)), count - expressions
-    weights, smooth = slice(first, count), own[basis.eigenheads : first]
-    matrix[own[:first], own[:first]] += 1.0
-    matrix[own[first:count], own[first:count]] += 1.0
-    matrix[own[count:], own[count:]] += POSE_INFORMATION
+    diagonal, first = np.arange(len(matrix)), count - expressions
+    weights, smooth = slice(first, count), diagonal[basis.eigenheads : first]
+    matrix[diagonal[:first], diagonal[:first]] += 1.0
+    matrix[diagonal[first:count], diagonal[first:count]] += 1.0
+    matrix[diagonal[count:], diagonal[count:]] += POSE_INFORMATION
     least, most = np.full(len(matrix), -np.inf), np.full(len(matrix), np.inf)
     least[weights], most[weights] = 0.0, 1.0
     found, now, variance = np.zeros(len(matrix)), np.full(expressions, FIRST), 1.0 if len(smooth) else 0.0
@@ -154,7 +154,7 @@ def _solved(
         now = np.maximum(found[weights], 0.0)
         if k < EVIDENCE or k == REWEIGHTED - 1:
             held = matrix.copy()
-            bound = own[first:count][now <= 0.0]
+            bound = diagonal[first:count][now <= 0.0]
             held[bound, bound] += HELD  # what stays at its bound explains nothing of the others
             covariance = np.linalg.inv(held)
         if k < EVIDENCE and len(smooth):

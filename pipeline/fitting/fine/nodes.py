@@ -42,8 +42,8 @@ def solving_nodes(model: HeadModel) -> Nodes:
     """Both meshes of a model."""
     full, cage = model.levels["full"], model.levels["cage"]
     if full.count == cage.count:
-        own = node_mesh(full.faces, sparse.csr_array(sparse.identity(full.count, format="csr")))
-        return Nodes(_decimated(model) if full.count > COARSE_MOST else own, own)
+        full_nodes = node_mesh(full.faces, sparse.csr_array(sparse.identity(full.count, format="csr")))
+        return Nodes(_decimated(model) if full.count > COARSE_MOST else full_nodes, full_nodes)
     faces, to_nodes = cage.faces, sparse.csr_array(sparse.identity(cage.count, format="csr"))
     while 4 * len(faces) < len(full.faces):
         step, faces = subdivision(faces, row_count(to_nodes))

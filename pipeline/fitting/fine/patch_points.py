@@ -62,8 +62,8 @@ class PatchSearch:
         scale = pixels_per_mm(self.cameras, vertices.mean(axis=0))
         found = find_places(self.photographs, self.patches, seen_by, self.views, scale, SEARCH, self.settings)
         centres = self.model.vertices(np.zeros(0))[self.patches.centre]
-        given = (self.patches, self.hair, self.views.names, seen_by.pixel, seen_by.facing > 0, centres)
-        kept = np.flatnonzero(found.several & found.clear & ~under_hair(*given))
+        hidden = under_hair(self.patches, self.hair, self.views.names, seen_by.pixel, seen_by.facing > 0, centres)
+        kept = np.flatnonzero(found.several & found.clear & ~hidden)
         overlap = max(1.0, 4.0 * np.pi * SEARCH.window_mm**2 / CENTRE_MM**2)
         information = 1.0 / (overlap * found.variance[kept])
         return PatchPlaces(self.patches.centre[kept], found.place[kept], information)

@@ -158,8 +158,8 @@ def draw_to_surface(
         The same vertices displaced; where no point is near, as they were.
     """
     amplitude = np.maximum(deviation_mm, settings.least_amplitude_mm)
-    told = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
-    many = thinned(told, settings.cell_mm)
+    informative = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
+    many = thinned(informative, settings.cell_mm)
     few = thinned(many, settings.coarse_cell_mm)
     now = vertices
     field = _laid_out(nodes.coarse, vertices, settings.coarse_length_mm)

@@ -36,12 +36,12 @@ def read(
     return with_read_expression(fit, model, all_of_it, seen, observed, eigenheads=EIGENHEADS, median=0.1)
 
 
-def told(population: HeadModel, fit: Fit) -> dict[str, float]:
+def weights_of(population: HeadModel, fit: Fit) -> dict[str, float]:
     return dict(zip(population.expressions.names, fit.coefficients[EIGENHEADS:], strict=True))
 
 
 def test_planted_weights_are_read_though_the_fit_lacks_most_eigenheads(population: HeadModel) -> None:
-    found = told(population, read(population, FACE))
+    found = weights_of(population, read(population, FACE))
     for name, weight in FACE.items():
         # The prior takes up to TAIL / (w + median) of a variance off: 0.1 of a weight that is known to 0.15.
         assert found[name] == pytest.approx(weight, abs=0.12), name
@@ -50,14 +50,14 @@ def test_planted_weights_are_read_though_the_fit_lacks_most_eigenheads(populatio
 
 def test_what_a_head_has_of_other_eigenheads_is_no_expression(population: HeadModel) -> None:
     def off(known: int | None) -> float:
-        found = told(population, read(population, FACE, known=known))
+        found = weights_of(population, read(population, FACE, known=known))
         return sum(abs(weight - FACE.get(name, 0.0)) for name, weight in found.items())
 
     assert off(None) < 0.5 * off(EIGENHEADS)
 
 
 def test_a_neutral_surface_is_told_no_expression(population: HeadModel) -> None:
-    assert max(told(population, read(population, {})).values()) < 0.1
+    assert max(weights_of(population, read(population, {})).values()) < 0.1
 
 
 def test_weights_carry_their_deviations_and_nothing_else_changes(population: HeadModel) -> None:
@@ -74,8 +74,8 @@ def test_a_model_without_expressions_is_left_alone(population: HeadModel) -> Non
     bare = with_modes(population, EIGENHEADS)
     fit = Fit("contour", np.zeros(EIGENHEADS), PLACE, 1, "planted")
     head = PLACE.apply(population.vertices(np.zeros(0)))
-    given = (fit, replace(bare, posed=range(0)), population, head, np.ones(len(head), bool))
-    assert with_read_expression(*given, eigenheads=EIGENHEADS, median=0.1) is fit
+    model, seen = replace(bare, posed=range(0)), np.ones(len(head), bool)
+    assert with_read_expression(fit, model, population, head, seen, eigenheads=EIGENHEADS, median=0.1) is fit
 
 
 def test_a_head_of_another_population_keeps_what_the_fit_says(population: HeadModel) -> None:
@@ -87,5 +87,6 @@ def test_a_head_of_another_population_keeps_what_the_fit_says(population: HeadMo
         z[smooth] = spread * rng.standard_normal(model.posed.start - EIGENHEADS)
         z[model.posed.start + model.expressions.names.index("cheekPuff")] = 0.5
         head = PLACE.apply(model.vertices(z))
-        given = (fit, model, population, head, np.ones(len(head), bool))
-        assert (with_read_expression(*given, eigenheads=EIGENHEADS, median=0.1) is fit) == left_alone
+        seen = np.ones(len(head), bool)
+        result = with_read_expression(fit, model, population, head, seen, eigenheads=EIGENHEADS, median=0.1)
+        assert (result is fit) == left_alone
