@@ -38,12 +38,10 @@ PUBLIC = {
 }
 NOT_DONE = {
     "pipeline",
-    "pipeline/dense",
     "pipeline/experiments",
     "pipeline/silhouettes",
     "pipeline/texture",
     "tests/pipeline",
-    "tests/pipeline/dense",
     "tests/pipeline/experiments",
     "tests/pipeline/silhouettes",
     "tests/pipeline/texture",

@@ -80,9 +80,10 @@ def estimate_depth(
         if doublings:
             stack = stack_crops(crops, level)
             fields = doubled(fields, stack, settings)
-        given = (fields, stack, neighbours, pattern, settings)
         steps_px, rounds, speck_px = STEPS_PX[doublings], ROUNDS[doublings], SPECKS_PX[doublings]
-        fields = refined(*given, steps_px=steps_px, rounds=rounds, speck_px=speck_px)
+        fields = refined(
+            fields, stack, neighbours, pattern, settings, steps_px=steps_px, rounds=rounds, speck_px=speck_px
+        )
         report("dense", DONE[level])
     found = depth_maps(crops, stack, fields, settings)
     report("dense", 1.0)

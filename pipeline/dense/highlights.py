@@ -124,12 +124,12 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
     light, colours = light / gain, np.where(seen[:, :, None], colours, 0.0) / gain[:, :, None]
     rank = np.argsort(np.argsort(np.where(seen, light, np.inf), axis=0), axis=0)
     dark = seen & (rank < np.ceil(DARKEST_SHARE * views))
-    own = np.where(dark[:, :, None], colours, 0.0).sum(axis=0) / np.maximum(dark.sum(axis=0), 1)[:, None]
-    own_light = np.maximum(own @ LIGHT, 1e-4)
+    matt = np.where(dark[:, :, None], colours, 0.0).sum(axis=0) / np.maximum(dark.sum(axis=0), 1)[:, None]
+    own_light = np.maximum(matt @ LIGHT, 1e-4)
     # What is above the skin's own light, as a share of its colour and one of white.
-    tint = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-6)
+    tint = matt / np.maximum(np.linalg.norm(matt, axis=1, keepdims=True), 1e-6)
     apart = 1.0 - (tint @ WHITE) ** 2
-    above = colours - own
+    above = colours - matt
     white = (above @ WHITE - (tint @ WHITE) * np.einsum("kvc,vc->kv", above, tint)) / np.maximum(apart, COLOURED[0])
     added, floor = white * WHITE[0], MIN_SHARE * own_light
     share = np.clip((added - floor) / floor, 0.0, 1.0)

@@ -93,20 +93,20 @@ def classify_parts(
     def gathered(maps: list[np.ndarray]) -> np.ndarray:
         return np.concatenate([each[mask] for each, mask in zip(maps, inside, strict=True)])
 
-    looks = gathered([bins(view) for view in cells])
+    appearance = gathered([bins(view) for view in cells])
     start, lower = gathered([starts(view) for view in cells]), gathered([lower_face(view) for view in cells])
-    by_colour, by_both = unlike_cheeks(looks, start[:, SKIN_CHANNEL])
+    by_colour, by_both = unlike_cheeks(appearance, start[:, SKIN_CHANNEL])
     bearded = beard_evidence(by_both, lower)
     otherwise = by_colour + bearded * lower * (by_both - by_colour)
     place = gathered([place_prior(view, bearded) for view in cells])
     report("parts", 0.4)
-    share = posterior(learn(looks, place, start, lower, otherwise, settings), place)
+    share = posterior(learn(appearance, place, start, lower, otherwise, settings), place)
     report("parts", 0.6)
     rows = np.split(share, np.cumsum([np.count_nonzero(mask) for mask in inside])[:-1])
 
-    def one(view: Cells, mask: Bool[np.ndarray, "r c"], own: Float32[np.ndarray, "n 3"]) -> PartMap:
+    def one(view: Cells, mask: Bool[np.ndarray, "r c"], probabilities: Float32[np.ndarray, "n 3"]) -> PartMap:
         name = view.camera.name
-        return PartMap(name, finished(view, mask, own, images[name], masks[name], settings))
+        return PartMap(name, finished(view, mask, probabilities, images[name], masks[name], settings))
 
     with ThreadPoolExecutor(thread_count()) as pool:  # OpenCV and numpy release the interpreter lock
         found = list(pool.map(one, cells, inside, rows))
@@ -195,21 +195,21 @@ def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float3
 
 
 def unlike_cheeks(
-    looks: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
+    appearance: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """How far every cell does not look like those that are skin for certain, 0 to 1: by colour, and by colour and fine
     structure, which tells a blond beard from skin (but shadows' borders from skin, too)."""
-    everything = np.ones(len(looks), np.float32)
+    everything = np.ones(len(appearance), np.float32)
     colour, detail = (
         (of(which, cheeks) / of(which, everything))[which]
-        for which, of in ((looks[:, 0], colour_looks), (looks[:, 1], detail_looks))
+        for which, of in ((appearance[:, 0], colour_looks), (appearance[:, 1], detail_looks))
     )
     first, second = ((SKIN_RATIO / (SKIN_RATIO + ratio)) ** 2 for ratio in (colour, colour * detail))
     return first, second
 
 
 def learn(
-    looks: Int[np.ndarray, "n 2"],
+    appearance: Int[np.ndarray, "n 2"],
     prior: Float32[np.ndarray, "n 4"],
     start: Float32[np.ndarray, "n 3"],
     lower: Bool[np.ndarray, " n"],
@@ -220,7 +220,7 @@ def learn(
 
     Starts from the cells of each part that are sure by their place, less those of hair and clothes that look like skin.
     """
-    colour, detail = looks.T
+    colour, detail = appearance.T
     share = start.copy()
     share[:, HAIR_CHANNEL] = np.maximum(share[:, HAIR_CHANNEL], lower) * otherwise
     share[:, CLOTHES_CHANNEL] *= otherwise

@@ -38,9 +38,13 @@ def windowed_height(
     chosen = (
         np.ones(len(vertices), bool) if wanted is None else wanted.copy()
     )  # a model's own is read-only: another type
-    surface = (np.ascontiguousarray(vertices), np.ascontiguousarray(normals), chosen)
-    given = (*surface, *cells, WINDOW_MM, REACH_MM, height_mm)
-    in_threads(len(vertices), lambda first, last: windowed_heights(*given, first, last))
+    points, facing = np.ascontiguousarray(vertices), np.ascontiguousarray(normals)
+    order, keys, spans = cells
+
+    def fill(first: int, last: int) -> None:
+        windowed_heights(points, facing, chosen, order, keys, spans, WINDOW_MM, REACH_MM, height_mm, first, last)
+
+    in_threads(len(vertices), fill)
     return height_mm
 
 

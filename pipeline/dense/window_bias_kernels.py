@@ -29,14 +29,14 @@ def windowed_heights(
     ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
     falloff, most = -0.5 / (window_mm * window_mm), reach_mm * reach_mm
     for position in range(first, last):
-        own = order[position]
-        if not wanted[own]:
+        vertex = order[position]
+        if not wanted[vertex]:
             continue
         if keys[position] != cell:
             cell = keys[position]
             columns_about(cell, keys, spans, ranges)
-        x, y, z = vertices[own]
-        n_x, n_y, n_z = normals[own]
+        x, y, z = vertices[vertex]
+        n_x, n_y, n_z = normals[vertex]
         total, weighted = 0.0, 0.0
         for column in range(COLUMNS):
             for at in range(ranges[column, 0], ranges[column, 1]):
@@ -51,4 +51,4 @@ def windowed_heights(
                 weight = facing * np.exp(falloff * square)
                 total += weight
                 weighted += weight * (n_x * d_x + n_y * d_y + n_z * d_z)
-        height_mm[own] = weighted / total if total > 0.0 else 0.0
+        height_mm[vertex] = weighted / total if total > 0.0 else 0.0

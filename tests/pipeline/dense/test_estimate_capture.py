@@ -39,17 +39,17 @@ def test_smooth_skin_leaves_no_chance_matches() -> None:
     """An oily, path-traced head as it was photographed, highlights and all: what is told of it lies on the surface, and
     much is told. With chance matches left in, 93.5 % and 72.3 %; without those that the surface encloses 94.1 % and
     75.0 %. (Without those at outlines and beside each other 94.8 % and 75.4 %, and 6 % of draw-b's clothes go.)"""
-    precise, told = smooth_skin(1.0, 0.0)
+    precise, known_share = smooth_skin(1.0, 0.0)
     assert precise > 0.938
-    assert told > 0.745
+    assert known_share > 0.745
 
 
 @pytest.mark.slow
 def test_small_noisy_photographs_are_searched_at_the_size_that_skin_needs() -> None:
     """The same at 512 x 384 with noise of 6 levels: 89.1 %, searched at a quarter of that size 87.3 %."""
-    precise, told = smooth_skin(0.5, 6.0)
+    precise, known_share = smooth_skin(0.5, 6.0)
     assert precise > 0.882
-    assert told > 0.43
+    assert known_share > 0.43
 
 
 def smooth_skin(factor: float, noise_levels: float) -> tuple[float, float]:
@@ -64,11 +64,11 @@ def smooth_skin(factor: float, noise_levels: float) -> tuple[float, float]:
     shot = noisier(Capture({name: reduced(image) for name, image in capture.images.items()}), noise_levels)
     masks = {name: cv2.imread(str(truth / "silhouettes" / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in rig.names}
     silhouettes = {name: silhouette_from_mask(reduced(mask) > 127) for name, mask in masks.items() if mask is not None}
-    given = (shot.images, silhouettes, rig.scaled(factor), None, DenseSettings())
-    maps = estimate_depth(*given, report=lambda stage, share: None)
+    small, settings = rig.scaled(factor), DenseSettings()
+    maps = estimate_depth(shot.images, silhouettes, small, None, settings, report=lambda stage, share: None)
     distance, _, part = errors(maps, np.load(truth / "visible.npz"))
-    told = sum(int(each.known.sum()) for each in maps) / sum(int((each.mask > 0.5).sum()) for each in maps)
-    return float(np.mean(distance[part == HEAD] < 2.0)), told
+    known_share = sum(int(each.known.sum()) for each in maps) / sum(int((each.mask > 0.5).sum()) for each in maps)
+    return float(np.mean(distance[part == HEAD] < 2.0)), known_share
 
 
 def errors(

@@ -73,14 +73,14 @@ def test_two_views_decide_nothing_and_none_is_changed() -> None:
 
 def test_added_white_is_told_from_more_of_the_skin_s_own_light() -> None:
     rng = np.random.default_rng(0)
-    own = (SKIN * rng.uniform(0.5, 1.0, (400, 1))).astype(np.float32)
-    colours = np.repeat(own[None], 6, axis=0)
+    matt = (SKIN * rng.uniform(0.5, 1.0, (400, 1))).astype(np.float32)
+    colours = np.repeat(matt[None], 6, axis=0)
     colours[0, :100] += 0.2
     colours[1, 100:200] *= 1.6
     colours[2, 200:] = np.nan
     excess = highlight_levels(colours, np.zeros((0, 3), np.int32))
     levels = np.where(excess.sure, excess.levels, 0.0)
-    light = own[:100] @ LIGHT
+    light = matt[:100] @ LIGHT
     raised = 255.0 * ((light + 0.2) ** (1.0 / GAMMA) - light ** (1.0 / GAMMA))
     np.testing.assert_allclose(levels[0, :100], raised, rtol=1e-3)
     assert levels[1:].max() == 0.0

@@ -183,9 +183,9 @@ def test_nothing_is_said_outside_the_subject_and_of_views_that_do_not_count(rig)
 def test_the_same_photographs_give_the_same_bytes(rig):
     made, subject = planted(rig, "dark", "blue"), egg_head()
     assert subject.face_region is not None
-    given = rig, subject.mesh, subject.face_region, subject.landmarks, SETTINGS
+    head = rig, subject.mesh, subject.face_region, subject.landmarks, SETTINGS
     one, two = (
-        classify_parts(made.images, made.silhouettes, *given, report=lambda stage, share: None) for _ in range(2)
+        classify_parts(made.images, made.silhouettes, *head, report=lambda stage, share: None) for _ in range(2)
     )
     assert all(np.array_equal(one[name].probability, two[name].probability) for name in one)
 
@@ -229,9 +229,9 @@ def test_guide_measures_from_the_border_of_the_face_and_the_chin():
 def test_looks_are_probabilities():
     rng = np.random.default_rng(3)
     colour, detail, weight = rng.integers(0, 20_000, 500), rng.integers(0, 20, 500), rng.random(500).astype(np.float32)
-    for looks in (colour_looks(colour, weight), detail_looks(detail, weight), colour_looks(colour, 0 * weight)):
-        assert looks.min() > 0
-        assert looks.sum() <= 1 + 1e-6
+    for histogram in (colour_looks(colour, weight), detail_looks(detail, weight), colour_looks(colour, 0 * weight)):
+        assert histogram.min() > 0
+        assert histogram.sum() <= 1 + 1e-6
 
 
 def test_posterior_is_bayes_rule():
