@@ -101,10 +101,10 @@ class KeptFunction:
         """Where the function compiled for these argument types is or would be."""
         if not self._digest:  # late: a function may call one that its module defines further down
             self._digest = function_digest(self._dispatcher)
-        told = f"{self._digest} {signature!r} {machine()}"
+        key = f"{self._digest} {signature!r} {machine()}"
         function = self._dispatcher.py_func
         name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
-        return Path(self.cache_path) / f"{name}-{hashlib.sha256(told.encode()).hexdigest()}"
+        return Path(self.cache_path) / f"{name}-{hashlib.sha256(key.encode()).hexdigest()}"
 
     def is_kept(self, signature: Any) -> bool:
         """Whether there is a file for these argument types."""

@@ -36,7 +36,7 @@ USED_AFTER_S, UNUSED_S = 86400.0, 30 * 86400.0  # a use is noted once a day; a f
 
 def kept_arrays(
     name: str,
-    given: Sequence[Any],
+    inputs: Sequence[Any],
     make: Callable[[], Mapping[str, np.ndarray]],
     *,
     made_by: Iterable[Callable[..., Any]],
@@ -45,14 +45,14 @@ def kept_arrays(
 
     Args:
         name: what the arrays are, for the file's name.
-        given: all that ``make`` starts from: arrays, and values whose ``repr`` says what they are.
+        inputs: all that ``make`` starts from: arrays, and values whose ``repr`` says what they are.
         make: makes the arrays, of numbers or booleans.
         made_by: functions and classes of the other modules whose sources decide what comes out.
 
     Returns:
         The arrays by name, in C order and read-only.
     """
-    path = cache_folder() / "arrays" / f"{name}-{_digest(given, (make, *made_by))}"
+    path = cache_folder() / "arrays" / f"{name}-{_digest(inputs, (make, *made_by))}"
     found = _read(path)
     if found is not None:
         return found
@@ -67,11 +67,11 @@ def kept_arrays(
     return made
 
 
-def _digest(given: Sequence[Any], made_by: Iterable[Callable[..., Any]]) -> str:
+def _digest(inputs: Sequence[Any], made_by: Iterable[Callable[..., Any]]) -> str:
     threads = [os.environ.get(name) for name in BLAS_VARIABLES]
-    told = (np.__version__, scipy.__version__, machine(), threads, len(os.sched_getaffinity(0)))
-    digest = hashlib.sha256(repr(told).encode())
-    for value in given:
+    environment = (np.__version__, scipy.__version__, machine(), threads, len(os.sched_getaffinity(0)))
+    digest = hashlib.sha256(repr(environment).encode())
+    for value in inputs:
         if isinstance(value, np.ndarray):
             digest.update(f"{value.dtype.str} {value.shape}".encode())
             digest.update(np.ascontiguousarray(value).data)

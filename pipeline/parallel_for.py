@@ -23,12 +23,12 @@ SLICES = 8  # of a loop: enough that threads end together
 def thread_count() -> int:
     """How many threads share a loop: EIGENHEAD_THREADS, else the CPUs that this process may use. Raises
     WrongVariable."""
-    given = os.environ.get(THREADS, "").strip()
-    if not given:
+    requested = os.environ.get(THREADS, "").strip()
+    if not requested:
         return len(os.sched_getaffinity(0))
-    if not (given.isascii() and given.isdecimal() and 1 <= int(given[:9]) <= THREADS_MOST):
-        raise WrongVariable(THREADS, [compose("threads-wrong", value=f"{given!r}", most=THREADS_MOST)])
-    return int(given)
+    if not (requested.isascii() and requested.isdecimal() and 1 <= int(requested[:9]) <= THREADS_MOST):
+        raise WrongVariable(THREADS, [compose("threads-wrong", value=f"{requested!r}", most=THREADS_MOST)])
+    return int(requested)
 
 
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:

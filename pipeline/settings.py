@@ -240,8 +240,8 @@ class OutputSettings:
     @property
     def textured(self) -> bool:
         """Whether any file has a texture."""
-        asked = self.ply_texture or self.delit or bool({"glb", "obj", "usdz"} & set(self.written))
-        return self.surface != "bust" and asked
+        requested = self.ply_texture or self.delit or bool({"glb", "obj", "usdz"} & set(self.written))
+        return self.surface != "bust" and requested
 
     @property
     def delit(self) -> bool:

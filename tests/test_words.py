@@ -37,11 +37,9 @@ PUBLIC = {
     ("server/storage/records.py", "own"),  # of deliveries that wait in the job engine's queue
 }
 NOT_DONE = {
-    "pipeline",
     "pipeline/experiments",
     "pipeline/silhouettes",
     "pipeline/texture",
-    "tests/pipeline",
     "tests/pipeline/experiments",
     "tests/pipeline/silhouettes",
     "tests/pipeline/texture",

@@ -131,18 +131,18 @@ def test_another_process_with_another_hash_seed_finds_it(folder: Path) -> None:
     assert found == ["0\n", "1\n"]
 
 
-@pytest.mark.parametrize("given", [{}, {"NUMBA_CPU_NAME": "generic"}])
-def test_what_one_machine_compiled_runs_on_the_next(given: dict[str, str]) -> None:
+@pytest.mark.parametrize("variables", [{}, {"NUMBA_CPU_NAME": "generic"}])
+def test_what_one_machine_compiled_runs_on_the_next(variables: dict[str, str]) -> None:
     """For one level of x86-64 where the machine has it; NUMBA_CPU_NAME goes before."""
     features = llvmlite.binding.get_host_cpu_features()
     if not all(features.get(feature) for feature in compiled.PORTABLE_FEATURES):
         pytest.skip("another processor: it compiles for itself")
     code = "from pipeline.compiled import machine; print(machine())"
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")} | given
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")} | variables
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
     )
-    assert repr(given.get("NUMBA_CPU_NAME", compiled.PORTABLE_CPU)) in done.stdout
+    assert repr(variables.get("NUMBA_CPU_NAME", compiled.PORTABLE_CPU)) in done.stdout
 
 
 def test_every_compiled_loop_of_the_project_is_kept() -> None:

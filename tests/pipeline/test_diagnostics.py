@@ -17,9 +17,9 @@ PARTS = {
 
 
 def test_every_warning_that_a_stage_returns_is_listed() -> None:
-    told = {code for module in _modules("pipeline") for code in _told(module)}
-    assert told - PARTS - {*WARNING_CODES} == set()
-    assert len(told) > 20
+    returned = {code for module in _modules("pipeline") for code in _told(module)}
+    assert returned - PARTS - {*WARNING_CODES} == set()
+    assert len(returned) > 20
 
 
 def test_every_listed_code_is_emitted() -> None:

@@ -39,12 +39,12 @@ class Maker:
     def __init__(self) -> None:
         self.times = 0
 
-    def __call__(self, *given: object) -> dict[str, np.ndarray]:
+    def __call__(self, *inputs: object) -> dict[str, np.ndarray]:
         def make() -> dict[str, np.ndarray]:
             self.times += 1
             return MADE
 
-        return kept_arrays.kept_arrays("modes", given or GIVEN, make, made_by=(vertex_normals,))
+        return kept_arrays.kept_arrays("modes", inputs or GIVEN, make, made_by=(vertex_normals,))
 
 
 def equal(found: dict[str, np.ndarray]) -> bool:
@@ -71,12 +71,12 @@ def test_another_input_another_thread_count_and_another_source_are_another_file(
 ) -> None:
     maker = Maker()
     maker()
-    for given in (
+    for inputs in (
         (GIVEN[0] + 1, *GIVEN[1:]),
         (GIVEN[0].astype(np.float32), *GIVEN[1:]),
         (*GIVEN[:2], {"radius_mm": 5}),
     ):
-        maker(*given)
+        maker(*inputs)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     maker()
     monkeypatch.setattr(kept_arrays, "_source", lambda module: module.encode())

@@ -38,7 +38,7 @@ def test_stages_come_in_the_order_of_the_method(half_size_shot: SimulatedCapture
     began = [name for i, name in enumerate(visits) if i == 0 or visits[i - 1] != name]
     assert tuple(began) == STAGES
     assert set(result.seconds) == {*STAGES, "total"} - {"done"}
-    assert all(0.0 <= fraction <= 1.0 for told in fractions.values() for fraction in told)
+    assert all(0.0 <= fraction <= 1.0 for reported in fractions.values() for fraction in reported)
 
 
 @pytest.mark.slow

@@ -33,9 +33,9 @@ def nested(depth: int) -> list[Any]:
 def test_what_cannot_be_is_named_in_text_that_can_be_sent(document: dict[str, Any], fault: str) -> None:
     with pytest.raises(InputError) as error:
         settings_from_document(document)
-    (told,) = error.value.faults
-    assert fault in told.text
-    told.text.encode()
+    (message,) = error.value.faults
+    assert fault in message.text
+    message.text.encode()
 
 
 def test_a_whole_number_is_a_length() -> None:
