@@ -38,10 +38,8 @@ PUBLIC = {
 }
 NOT_DONE = {
     "pipeline/experiments",
-    "pipeline/silhouettes",
     "pipeline/texture",
     "tests/pipeline/experiments",
-    "tests/pipeline/silhouettes",
     "tests/pipeline/texture",
 }
 

@@ -108,8 +108,8 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: Se
     """The decision after other cameras spoke: ``dissent`` is how many of them deny that a doubtful pixel shows the
     subject, negative where they were not asked."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
-    told = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MOST_ODDS, MOST_ODDS)
-    odds = np.where(dissent >= 0, told, decision.odds).astype(np.float32)
+    revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MOST_ODDS, MOST_ODDS)
+    odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
     probability = smooth_odds(odds, decision.coarse, decision.background, settings)
     mask, detached_component_areas = whole_subject(probability > 0.5, decision.plain, settings)
     return replace(

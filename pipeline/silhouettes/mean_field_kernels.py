@@ -13,8 +13,8 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
     height, width = odds.shape
     steps = ((0, 1), (1, 0), (1, 1), (1, -1))
     links = np.zeros((4, height, width), np.float32)
-    asked = undecided_pixels(odds)
-    for place in asked:
+    undecided = undecided_pixels(odds)
+    for place in undecided:
         for back in range(2):
             for k in range(4):
                 y = place // width - back * steps[k][0]
@@ -28,8 +28,8 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
     field = 0.5 * odds
     mean = np.tanh(field)
     for sweep in range(sweeps):
-        for step in range(len(asked)):
-            place = asked[step] if sweep % 2 == 0 else asked[len(asked) - 1 - step]
+        for step in range(len(undecided)):
+            place = undecided[step] if sweep % 2 == 0 else undecided[len(undecided) - 1 - step]
             y, x = place // width, place % width
             total = 0.5 * odds[y, x]
             for k in range(4):

@@ -113,16 +113,16 @@ def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
     named = [name for name in rig.names if name in capture.images and capture.backgrounds.get(name)]
     pictures = {name: _thumbnail(capture.images[name]) for name in named}
     plates = {name: _thumbnail(capture.backgrounds[name][0]) for name in named}
-    asked = [name for name in named if _common_share(pictures[name], plates[name]) < PLATE_SEEN]
-    share = np.array([[_common_share(pictures[name], plates[other]) for other in asked] for name in asked])
-    if len(asked) < 2:
+    doubtful = [name for name in named if _common_share(pictures[name], plates[name]) < PLATE_SEEN]
+    share = np.array([[_common_share(pictures[name], plates[other]) for other in doubtful] for name in doubtful])
+    if len(doubtful) < 2:
         return {}
     from scipy.optimize import linear_sum_assignment  # loads all of scipy.optimize, and plates are rarely exchanged
 
     best = linear_sum_assignment(-share)[1]
-    moved = np.flatnonzero(best != np.arange(len(asked)))
+    moved = np.flatnonzero(best != np.arange(len(doubtful)))
     clear = share[moved, best[moved]] > PLATE_GAIN * share[moved, moved]
-    return {asked[i]: asked[best[i]] for i in moved.tolist()} if clear.all() else {}
+    return {doubtful[i]: doubtful[best[i]] for i in moved.tolist()} if clear.all() else {}
 
 
 def _thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]:

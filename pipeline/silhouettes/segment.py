@@ -57,18 +57,18 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
         raise InputError("capture", [compose("neither-plate-nor-mask", camera=name) for name in blind])
     silhouettes: dict[str, Silhouette] = {}
     with ThreadPoolExecutor(thread_count()) as pool:  # cv2 and the compiled kernels release the interpreter lock
-        given = {
+        from_masks = {
             name: pool.submit(_operators, capture.masks[name], capture.soft_masks.get(name), settings)
             for name in rig.names & capture.masks.keys()
         }
         jobs = {
             name: pool.submit(decide, capture.images[name], capture.backgrounds[name], settings)
             for name in rig.names
-            if name not in given
+            if name not in from_masks
         }
         decisions = {name: job.result() for name, job in jobs.items()}
         masks = {name: decision.mask for name, decision in decisions.items()}
-        masks |= {name: job.result().mask for name, job in given.items()}
+        masks |= {name: job.result().mask for name, job in from_masks.items()}
 
         def finish(name: str) -> Silhouette:
             decision = decisions[name]
@@ -79,7 +79,7 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
 
         finished = {name: pool.submit(finish, name) for name in decisions}
         for count, name in enumerate(rig.names, 1):
-            silhouettes[name] = (given | finished)[name].result()
+            silhouettes[name] = (from_masks | finished)[name].result()
             report("segmentation", 0.4 + 0.5 * count / len(rig))
     agreed = judge_agreement(silhouettes, rig, settings, ready=capture.masks.keys())
     report("segmentation", 1.0)
@@ -126,16 +126,16 @@ def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouet
     if weak <= settings.weak_share_warned:
         return silhouette
     text = compose("outline-guessed", share=weak)
-    kept = tuple(told for told in quality.warnings if not _speaks_of(told, "outline-weak"))
+    kept = tuple(warning for warning in quality.warnings if not _speaks_of(warning, "outline-weak"))
     if weak > settings.weak_share_unusable:
         return replace(silhouette, quality=replace(quality, warnings=(*kept, compose("view-unused", remark=text))))
     return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
 
 
-def _speaks_of(told: Message, code: str) -> bool:
+def _speaks_of(message: Message, code: str) -> bool:
     """Whether a message has a code, or says why a view is left out by one that has."""
-    remark = told.parameters.get("remark")
-    return told.code == code or (isinstance(remark, Message) and remark.code == code)
+    remark = message.parameters.get("remark")
+    return message.code == code or (isinstance(remark, Message) and remark.code == code)
 
 
 def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:

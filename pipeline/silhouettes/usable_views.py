@@ -75,13 +75,13 @@ def usable_views(
         WrongScale: of ``judge_head_size``.
         TooFewViews: fewer than ``VIEWS_LEAST`` silhouettes are of use.
     """
-    own = own_pictures(capture, rig, segmented, exchanged=exchanged)
-    if sum(silhouette.quality.usable for silhouette in own.silhouettes.values()) < VIEWS_LEAST:
-        raise TooFewViews(own.silhouettes, capture)
-    silhouettes, moved = without_moved_cameras(own.silhouettes, rig)
+    assigned = own_pictures(capture, rig, segmented, exchanged=exchanged)
+    if sum(silhouette.quality.usable for silhouette in assigned.silhouettes.values()) < VIEWS_LEAST:
+        raise TooFewViews(assigned.silhouettes, capture)
+    silhouettes, moved = without_moved_cameras(assigned.silhouettes, rig)
     size = judge_head_size(silhouettes, rig)
-    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *size, *capture.remarks)
-    return UsableViews(own.capture, silhouettes, own.pictures, warnings)
+    warnings = (*assigned.warnings, *view_warnings(silhouettes), *moved, *size, *capture.remarks)
+    return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 
 def without_moved_cameras(

@@ -199,12 +199,12 @@ def test_a_fault_in_one_view_is_named_by_the_others(
 
 def test_operator_masks_override_and_need_no_plate(scan: tuple[Capture, Rig]) -> None:
     capture, rig = scan
-    given = true_mask("cam02")
+    operator_mask = true_mask("cam02")
     backgrounds = {name: plates for name, plates in capture.backgrounds.items() if name != "cam02"}
     silhouettes = segment(
-        replace(capture, backgrounds=backgrounds, masks={"cam02": given}), rig, SETTINGS, report=quiet
+        replace(capture, backgrounds=backgrounds, masks={"cam02": operator_mask}), rig, SETTINGS, report=quiet
     )
-    np.testing.assert_array_equal(silhouettes["cam02"].mask, given)
+    np.testing.assert_array_equal(silhouettes["cam02"].mask, operator_mask)
     assert silhouettes["cam02"].quality.usable
 
 

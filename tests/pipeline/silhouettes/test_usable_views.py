@@ -98,7 +98,7 @@ def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
             mask = np.roll(bust, -40, axis=0) if cut else bust
             mask[-40:] |= cut & bust[-1]
             quality = _mask_quality(np.ascontiguousarray(np.rot90(mask, turns)), settings)
-            assert [told.text for told in quality.warnings if "cut off" in told.text] == (
+            assert [warning.text for warning in quality.warnings if "cut off" in warning.text] == (
                 [f"the head is cut off at the {side} of the image: move the camera back or "
                  f"{'tilt it up' if side == 'top' else 'turn it'}"] if cut else []
             )  # fmt: skip

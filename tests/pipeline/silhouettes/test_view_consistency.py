@@ -64,9 +64,9 @@ def test_a_missing_crown_is_named_and_a_ready_mask_kept(views, name):
     mask[: rows[0] + (rows[-1] - rows[0]) // 4] = False
     spoilt = silhouettes | {"cam01": replace(silhouette_from_mask(mask), quality=silhouettes["cam01"].quality)}
     judged = judge_agreement(spoilt, rig, SETTINGS)
-    assert any("the mask lacks" in told.text for told in judged["cam01"].quality.warnings)
+    assert any("the mask lacks" in warning.text for warning in judged["cam01"].quality.warnings)
     assert all(not judged[other].quality.warnings for other in rig.names if other != "cam01")
     assert not judged["cam01"].quality.usable or name == "six"
     ready = judge_agreement(spoilt, rig, SETTINGS, ready=rig.names)
     assert ready["cam01"].quality.usable
-    assert any("correct the mask" in told.text for told in ready["cam01"].quality.warnings)
+    assert any("correct the mask" in warning.text for warning in ready["cam01"].quality.warnings)
