@@ -38,9 +38,7 @@ PUBLIC = {
 }
 NOT_DONE = {
     "pipeline/experiments",
-    "pipeline/texture",
     "tests/pipeline/experiments",
-    "tests/pipeline/texture",
 }
 
 SPELLED: dict[type[ast.AST], str] = {  # the field in which a node of a syntax tree spells a name of its own

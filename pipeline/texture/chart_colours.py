@@ -46,7 +46,7 @@ def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list
 
 def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
     """The same of charts that were found, by camera."""
-    found = {name: chart_correction(own) for name, own in charts.items() if own}
+    found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:
         return None, [compose("no-chart")]

@@ -68,8 +68,8 @@ def delight(
     shading = white @ light.coefficients
     least = LEAST_SHADING * np.median(shading[seen & face_region], axis=0)
     shading = 0.5 * (shading + least + np.hypot(shading - least, 0.5 * least))  # a maximum without a crease
-    own = fill_unknown(matt / shading, seen, mesh_world.faces)
-    factors = own / np.maximum(shown, 1e-4)
+    albedo = fill_unknown(matt / shading, seen, mesh_world.faces)
+    factors = albedo / np.maximum(shown, 1e-4)
     return Albedo(Atlas(atlas.layout, multiplied(atlas, factors)), light), []
 
 

@@ -18,13 +18,13 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
     """The model's texture layout where a file of the result has a texture, and warnings of settings and model."""
     outputs = settings.outputs
     old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
-    told = [compose("old-setting", setting=name) for name, given in old.items() if given]
+    warnings = [compose("old-setting", setting=name) for name, is_set in old.items() if is_set]
     if not outputs.textured or settings.texture.blend == "reference":
-        return None, told
+        return None, warnings
     try:
-        return model_layout(model), told
+        return model_layout(model), warnings
     except NoLayout as reason:
-        return None, [*told, compose("no-texture-layout", reason=reason.message)]
+        return None, [*warnings, compose("no-texture-layout", reason=reason.message)]
 
 
 def paint_head(

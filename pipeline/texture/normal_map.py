@@ -47,11 +47,11 @@ def normal_mapped(
 ) -> NormalMapped:
     """The head's full mesh (mm, unit normals) as a reduced one with its normal map."""
     rows = layout.source[reduced.rows]
-    places, own, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
-    tangents = vertex_tangents(places, own, uv, reduced.faces)
+    places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
+    tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)
     sign = np.float32(tangents[0, 3])
     fine = _image(layout.uv, layout.faces, normals[layout.source], size)
-    coarse = _image(uv, reduced.faces, np.concatenate([own, tangents[:, :3]], axis=1), size)
+    coarse = _image(uv, reduced.faces, np.concatenate([reduced_normals, tangents[:, :3]], axis=1), size)
     turned = np.empty_like(fine)
 
     def work(first: int, last: int) -> None:
@@ -63,7 +63,7 @@ def normal_mapped(
     inside = np.asarray(np.isfinite(turned[:, :, 0]))
     codes = np.where(inside[:, :, None], np.rint(127.5 + 127.5 * turned), 0.0).astype(np.float32)
     image = np.clip(spread_texels(codes, inside), 0, 255).astype(np.uint8)
-    return NormalMapped(Mesh(places, reduced.faces), rows, uv, own, tangents, image)
+    return NormalMapped(Mesh(places, reduced.faces), rows, uv, reduced_normals, tangents, image)
 
 
 def vertex_tangents(

@@ -35,8 +35,8 @@ def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
         found = reduce(layout, mean, np.where(region, FACE_WEIGHT, 1.0))
         return {"rows": found.rows.astype(np.int32), "faces": found.faces.astype(np.int32)}
 
-    given = (model.mean, layout.faces, region, FACES)
-    kept = kept_arrays("reduced-layout", given, make, made_by=(reduce, decimate, boundary_vertices, unwrap))
+    inputs = (model.mean, layout.faces, region, FACES)
+    kept = kept_arrays("reduced-layout", inputs, make, made_by=(reduce, decimate, boundary_vertices, unwrap))
     return ReducedLayout(kept["rows"], kept["faces"])
 
 

@@ -88,8 +88,8 @@ def texture(
     def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
-        given = image, silhouettes[name], depths[name]
-        return see_points(camera, *given, mesh_world.vertices, normals, settings), image
+        sight = see_points(camera, image, silhouettes[name], depths[name], mesh_world.vertices, normals, settings)
+        return sight, image
 
     with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
         found = list(pool.map(look, views))
@@ -112,9 +112,9 @@ def texture(
     shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
-    told = _gain_warnings(by_camera)
+    warnings = _gain_warnings(by_camera)
     dim = None if dim_share is None else dim_views(weights, balanced, dim_share)
-    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, told)
+    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
 
 
 def dim_views(

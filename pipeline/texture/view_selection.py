@@ -102,8 +102,8 @@ def add_alike(
         Views (-1: none) and shares, the chosen one first.
     """
     off = differences(labels, views, detail, weights, around.starts, around.indices)
-    told = off[(off >= 0) & (views != labels[:, None])]
-    noise = max(float(np.median(told)), 0.25) if len(told) else 1.0
+    informative = off[(off >= 0) & (views != labels[:, None])]
+    noise = max(float(np.median(informative)), 0.25) if len(informative) else 1.0
     best = np.maximum(quality.max(axis=1, keepdims=True), 1e-12)
     shares = (quality / best) * np.exp(-np.maximum(off / (settings.noise_factor * noise) - 1.0, 0.0))
     shares = np.where((off >= 0) & (labels[:, None] >= 0), shares, 0.0).astype(np.float32)

@@ -15,13 +15,13 @@ def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -
     out = np.zeros((count, cameras), np.float32)
     for v in range(count):
         for k in range(cameras):
-            own = weights[k, v]
-            if own <= 0:
+            weight = weights[k, v]
+            if weight <= 0:
                 continue
-            least = own
+            least = weight
             for e in range(starts[v], starts[v + 1]):
                 least = min(least, weights[k, indices[e]])
-            out[v, k] = own * (1 - RING_SHARE) + least * RING_SHARE
+            out[v, k] = weight * (1 - RING_SHARE) + least * RING_SHARE
     return out
 
 
@@ -74,15 +74,15 @@ def propagate(
                 least = NEVER
                 for c in range(most):
                     if views[v, c] >= 0:
-                        told = belief[c] - messages[e, c]
-                        by_view[views[v, c]] = told
-                        least = min(least, told)
+                        cost = belief[c] - messages[e, c]
+                        by_view[views[v, c]] = cost
+                        least = min(least, cost)
                 back, receiver = opposite[e], indices[e]
                 limit = least + penalty[e]
                 for c in range(most):
                     label = views[receiver, c]
-                    told = by_view[label] if label >= 0 else NEVER
-                    messages[back, c] = min(told, limit) - limit
+                    cost = by_view[label] if label >= 0 else NEVER
+                    messages[back, c] = min(cost, limit) - limit
             for c in range(most):
                 if views[v, c] >= 0:
                     by_view[views[v, c]] = NEVER
@@ -141,8 +141,8 @@ def differences(
     count, most = views.shape
     out = np.full((count, most), np.float32(-1.0), np.float32)
     for v in range(count):
-        own = labels[v]
-        if own < 0:
+        chosen = labels[v]
+        if chosen < 0:
             continue
         for c in range(most):
             k = views[v, c]
@@ -151,9 +151,9 @@ def differences(
             total, n = np.float32(0.0), 0
             for e in range(starts[v] - 1, starts[v + 1]):
                 w = v if e < starts[v] else indices[e]
-                if weights[k, w] > 0 and weights[own, w] > 0:
+                if weights[k, w] > 0 and weights[chosen, w] > 0:
                     for channel in range(3):
-                        off = detail[k, w, channel] - detail[own, w, channel]
+                        off = detail[k, w, channel] - detail[chosen, w, channel]
                         total += off * off
                     n += 3
             out[v, c] = total / max(n, 1)

@@ -94,11 +94,11 @@ def sharpened(
     box = box_around(inside, 0)
     if not settings.sharpening or not inside[box].size:
         return image
-    own = image[box].astype(np.float32)
-    detail = own - cv2.GaussianBlur(own, (0, 0), UNSHARP_PX)
+    crop = image[box].astype(np.float32)
+    detail = crop - cv2.GaussianBlur(crop, (0, 0), UNSHARP_PX)
     power = cv2.GaussianBlur((detail * detail) @ np.full(3, 1 / 3, np.float32), (0, 0), POWER_PX)
     noise = NOISE_MARGIN * float(np.median(power[::4, ::4][inside[box][::4, ::4]]))
     gain = settings.sharpening * np.clip(1 - noise / np.maximum(power, 1e-3), 0, 1)
     out = image.copy()
-    out[box] = np.clip(own + gain[:, :, None] * detail + 0.5, 0, 255)
+    out[box] = np.clip(crop + gain[:, :, None] * detail + 0.5, 0, 255)
     return out

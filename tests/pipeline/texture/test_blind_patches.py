@@ -41,8 +41,7 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
     mesh, strip = with_strip(ellipsoid(5))
     settings, depths = TextureSettings(), depth_maps(shot.rig, mesh)
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
-    given = (shot.capture, shot.silhouettes, shot.rig, depths, settings)
-    found = texture(mesh, mesh.normals(), *given, around=around)
+    found = texture(mesh, mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings, around=around)
     assert found.decision is not None
     rim = np.unique(mesh.faces[strip])  # hidden by lids, as it were
     weights, slots, shares = (
@@ -70,9 +69,12 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
 
 def test_what_views_see_by_its_vertices_stays() -> None:
     shot = shoot()
-    given = (shot.capture, shot.silhouettes, shot.rig, depth_maps(shot.rig, shot.mesh), TextureSettings())
+    settings, depths = TextureSettings(), depth_maps(shot.rig, shot.mesh)
     around = Neighbourhood.of(*neighbours(shot.mesh.faces, len(shot.mesh.vertices)))
-    decision = texture(shot.mesh, shot.mesh.normals(), *given, around=around).decision
+    coloured = texture(
+        shot.mesh, shot.mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings, around=around
+    )
+    decision = coloured.decision
     assert decision is not None
-    again = see_blind_patches(decision, shot.mesh, shot.silhouettes, given[3], given[4])
+    again = see_blind_patches(decision, shot.mesh, shot.silhouettes, depths, settings)
     np.testing.assert_array_equal(again.slots, decision.slots)

@@ -75,8 +75,10 @@ def found(mesh: Mesh, layout: Layout) -> dict[str, tuple[Atlas, Albedo, np.ndarr
         shots = {camera.name: photograph(camera, lamp) for camera in rig}
         capture = Capture({key: codes for key, (codes, _) in shots.items()})
         silhouettes = {key: silhouette_from_mask(mask) for key, (_, mask) in shots.items()}
-        given = (mesh, normals, capture, silhouettes, rig, depth_maps(rig, mesh), TextureSettings())
-        coloured = texture(*given, around=around, dim_share=DIM_SHARE)
+        depths, settings = depth_maps(rig, mesh), TextureSettings()
+        coloured = texture(
+            mesh, normals, capture, silhouettes, rig, depths, settings, around=around, dim_share=DIM_SHARE
+        )
         assert coloured.decision is not None
         atlas = paint_texture(layout, mesh, coloured.colours, coloured.decision, 1024)
         albedo, warnings = delight(mesh, normals, coloured, atlas, np.ones(len(normals), bool), around)

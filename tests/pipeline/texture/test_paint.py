@@ -40,8 +40,8 @@ def layout(shot: Shot) -> Layout:
 def coloured(shot: Shot) -> Texture:
     mesh = shot.mesh
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
-    given = (shot.capture, shot.silhouettes, shot.rig, depth_maps(shot.rig, mesh), TextureSettings())
-    return texture(mesh, mesh.normals(), *given, around=around)
+    depths, settings = depth_maps(shot.rig, mesh), TextureSettings()
+    return texture(mesh, mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings, around=around)
 
 
 @pytest.fixture(scope="module")

@@ -16,16 +16,16 @@ def expected_blend(weights: np.ndarray, colours: np.ndarray, outlier: float) -> 
         seen = weights[:, v] > 0
         if not seen.any():
             continue
-        own, colour = weights[seen, v].astype(float), colours[seen, v].astype(float)
+        weight, colour = weights[seen, v].astype(float), colours[seen, v].astype(float)
         middle = np.zeros(3)
         for c in range(3):
             order = np.argsort(colour[:, c], kind="stable")
-            votes = np.minimum(own, MOST_VOTE * own.mean())
+            votes = np.minimum(weight, MOST_VOTE * weight.mean())
             middle[c] = colour[order, c][np.argmax(np.cumsum(votes[order]) >= 0.5 * votes.sum())]
         off = (colour - middle) / (outlier * middle + 0.005)
         off = np.where(off > 0, off, 0.5 * off)
-        share = own / (1 + (off**2).mean(axis=1))
-        out[v], views[v] = share @ colour / share.sum(), np.sum(own > LEAST_SHARE * own.sum())
+        share = weight / (1 + (off**2).mean(axis=1))
+        out[v], views[v] = share @ colour / share.sum(), np.sum(weight > LEAST_SHARE * weight.sum())
     return out, views
 
 

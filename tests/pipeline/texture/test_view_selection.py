@@ -121,16 +121,16 @@ def test_without_a_cost_of_seams_the_cheapest_view_is_chosen(seed: int) -> None:
     around, weights, codes, agreed, gains = scene
     levelled = (0.5 * (codes + agreed)).astype(np.float32)
     settings = SelectionSettings(smoothness=0.0)
-    labels, views, told = select_views(weights, codes, levelled, agreed, gains, around, settings)
+    labels, views, view_quality = select_views(weights, codes, levelled, agreed, gains, around, settings)
     cost, quality, _ = written_out(scene, levelled)
     for v in range(40):
         order = np.argsort(cost[v])
         count = min(6, np.count_nonzero(np.isfinite(cost[v])))
         assert labels[v] == order[0]
         assert views[v, :count].tolist() == order[:count].tolist()
-        np.testing.assert_allclose(told[v, :count], quality[v, order[:count]], rtol=1e-5)
+        np.testing.assert_allclose(view_quality[v, :count], quality[v, order[:count]], rtol=1e-5)
         assert (views[v, count:] == -1).all()
-        assert (told[v, count:] == 0).all()
+        assert (view_quality[v, count:] == 0).all()
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.06, 0.4])
