@@ -126,8 +126,11 @@ def run(
         jobs += [(f"draw-{i:02}_{label}", partial(known_row, partial(drawn, i), model, renderer)) for i in range(draws)]
         for kind, fault in FAULTS.items() if draws else ():
             jobs.append((f"{kind}_{label}", partial(known_row, partial(drawn, 0, fault=fault), model, renderer)))
-    own = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer)
-    jobs += [(f"inspan-{i:02}_{label}", partial(known_row, partial(own, i), model, renderer)) for i in range(in_span)]
+    photographed_in_span = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer)
+    jobs += [
+        (f"inspan-{i:02}_{label}", partial(known_row, partial(photographed_in_span, i), model, renderer))
+        for i in range(in_span)
+    ]
     for name, path in captures.items() if held_out else ():
         for camera in read_capture(path)[1].names:
             compute = partial(held_out_row, path, camera, model, renderer)

@@ -72,7 +72,7 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
     cut_rig, cut_seen = _with(believed, seen, {name: others[name] for name in cut})
     near_rig, near_seen = _with(believed, seen, {near: others[near]})
     _, near_wide = _with(believed, wide, {near: others[near]})
-    asked = {
+    cases = {
         "turned": (plain, knocked(believed, turned, TURN_DEG, rng)),
         "good": (plain, believed),
         "loose": ({name: wide[name] for name in rig.names}, believed),
@@ -81,7 +81,7 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
         "close_up": (near_seen, near_rig),
         "close_up_loose": (near_wide, near_rig),
     }
-    said = {condition: said_of(*given) for condition, given in asked.items()}
+    said = {condition: said_of(masks, cameras) for condition, (masks, cameras) in cases.items()}
     return {"turned_camera": turned, "close_up_camera": near, "said": said}
 
 
@@ -143,6 +143,6 @@ def as_markdown(found: Mapping[str, float]) -> str:
     """Captures by condition in which a good camera is named."""
     whats = ("moved", "loose_or_moved")
     rows = [[name, *(found[f"{name}_good_called_{what}"] for what in whats)] for name in CONDITIONS]
-    told = f"turned cameras named: {found['turned_named']:.0f} of {found['captures']:.0f}, "
+    summary = f"turned cameras named: {found['turned_named']:.0f} of {found['captures']:.0f}, "
     table = markdown.table(("condition", "a good camera called moved", "called loose or moved"), rows)
-    return f"{table}\n{told}called moved: {found['turned_called_moved']:.0f}\n"
+    return f"{table}\n{summary}called moved: {found['turned_called_moved']:.0f}\n"

@@ -114,9 +114,9 @@ def _exchanged_row(
             continue
         same = all(_same(good.silhouettes[name], found.silhouettes[name]) for name in rig.names)
         ratio = 1.0 if same else _error_mm(model, subject, found.silhouettes, rig) / base_mm
-        told = [warning.text for warning in found.warnings]
+        warnings = [warning.text for warning in found.warnings]
         named = _is_named(kind, filed, found)
-        row[kind] = {"filed": filed, "named": named, "repaired": ratio <= WORST_RATIO, "ratio": ratio, "told": told}
+        row[kind] = {"filed": filed, "named": named, "repaired": ratio <= WORST_RATIO, "ratio": ratio, "told": warnings}
         row[kind]["lost_view_only"] = _only_lost(good.silhouettes, found.silhouettes, filed)
     return row
 

@@ -128,11 +128,13 @@ def _correlation(rows: list[Row], label: str, counts: Callable[[str], bool] = la
     true, ours = [], []
     for row in rows:
         if row["model"] == label and row["kind"] == "posed":
-            told = {name: weight for name, weight in row["after"]["weights"].items() if counts(name)}
+            estimated = {name: weight for name, weight in row["after"]["weights"].items() if counts(name)}
             names = sorted(filter(counts, row["truth"]), key=lambda name, of=row["truth"]: -of[name])[:LARGEST]
-            others = sorted(set(told) - set(names), key=lambda name, of=told: -of[name])[: LARGEST - len(names)]
+            others = sorted(set(estimated) - set(names), key=lambda name, of=estimated: -of[name])[
+                : LARGEST - len(names)
+            ]
             true += [row["truth"].get(name, 0.0) for name in [*names, *others]]
-            ours += [told.get(name, 0.0) for name in [*names, *others]]
+            ours += [estimated.get(name, 0.0) for name in [*names, *others]]
     return float(np.corrcoef(true, ours)[0, 1]) if len(true) > 1 else float("nan")
 
 
@@ -147,16 +149,18 @@ def _weights(rows: list[Row], label: str) -> dict[str, float]:
     posed = [row for row in rows if (row["model"], row["kind"]) == (label, "posed")]
     names = sorted({name for row in posed for name in (*row["truth"], *row["after"]["weights"])})
     true = np.array([[row["truth"].get(name, 0.0) for name in names] for row in posed])
-    told = np.array([[row["after"]["weights"].get(name, 0.0) for name in names] for row in posed])
+    estimated = np.array([[row["after"]["weights"].get(name, 0.0) for name in names] for row in posed])
     there = true > 0.0
     if np.count_nonzero(there) < 2:
         return {}
-    each = {name: np.abs(told - true)[:, k][there[:, k]].mean() for k, name in enumerate(names) if there[:, k].any()}
+    each = {
+        name: np.abs(estimated - true)[:, k][there[:, k]].mean() for k, name in enumerate(names) if there[:, k].any()
+    }
     return {
-        "weights_correlation_true": float(np.corrcoef(true[there], told[there])[0, 1]),
-        "weights_correlation_all": float(np.corrcoef(true.ravel(), told.ravel())[0, 1]),
-        "weights_off": float(np.abs(told - true)[there].mean()),
-        "weights_told_of_none": float(told[~there].sum() / len(posed)),
+        "weights_correlation_true": float(np.corrcoef(true[there], estimated[there])[0, 1]),
+        "weights_correlation_all": float(np.corrcoef(true.ravel(), estimated.ravel())[0, 1]),
+        "weights_off": float(np.abs(estimated - true)[there].mean()),
+        "weights_told_of_none": float(estimated[~there].sum() / len(posed)),
         **{f"off_{name}": float(value) for name, value in each.items()},
     }
 
@@ -172,6 +176,6 @@ def _table(rows: list[Row], labels: tuple[str, ...]) -> str:
                 for quantity in ("median_mm", "vertex_mm", "fit_s")
                 for infix in ("", "before_")
             ]
-            told = f"r = {figures[f'{label}_weights_correlation']:.2f}" if kind == "posed" else "-"
-            lines.append([f"{label}, {kind}", count, *pairs, told])
+            correlation = f"r = {figures[f'{label}_weights_correlation']:.2f}" if kind == "posed" else "-"
+            lines.append([f"{label}, {kind}", count, *pairs, correlation])
     return markdown.table(header, lines)

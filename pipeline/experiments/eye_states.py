@@ -76,8 +76,8 @@ def eye_row(model: HeadModel, number: int, state: str, job: Job, renderer: Rende
         warnings = job(shot.capture, shot.rig).warnings
     except EigenheadError as error:
         return {"closed": sorted(closed), "refused": str(error)[:120], "is_wrong": True}
-    told = told_sides(warnings)
-    return {"closed": sorted(closed), "told": sorted(told), "is_wrong": told != closed}
+    named = told_sides(warnings)
+    return {"closed": sorted(closed), "told": sorted(named), "is_wrong": named != closed}
 
 
 def closed_sides(number: int) -> frozenset[str]:
@@ -87,8 +87,8 @@ def closed_sides(number: int) -> frozenset[str]:
 
 def told_sides(warnings: Sequence[ReportWarning]) -> frozenset[str]:
     """Returns the eyes that ``eyes-closed`` names; both where it names none."""
-    told = [warning.text for warning in warnings if warning.code == "eyes-closed"]
-    return frozenset(side for side in SIDES for text in told if side in text or not any(s in text for s in SIDES))
+    texts = [warning.text for warning in warnings if warning.code == "eyes-closed"]
+    return frozenset(side for side in SIDES for text in texts if side in text or not any(s in text for s in SIDES))
 
 
 def photograph_eyes(model: HeadModel, number: int, share: float, renderer: Renderer) -> SimulatedCapture:

@@ -126,8 +126,8 @@ def judge_case(case: Case, model: HeadModel, settings: Settings, renderer: Rende
     except EigenheadError as error:
         return {"refused": str(error)[:REFUSAL_LETTERS], "seconds": time.perf_counter() - began}
     except Exception as error:  # whatever the product does, the other rows are computed
-        told = f"{type(error).__name__}: {error}"
-        return {"crashed": told[:REFUSAL_LETTERS], "seconds": time.perf_counter() - began}
+        crash = f"{type(error).__name__}: {error}"
+        return {"crashed": crash[:REFUSAL_LETTERS], "seconds": time.perf_counter() - began}
     seconds = time.perf_counter() - began
     return judge_result(person, result, model) | {"seconds": seconds}
 
@@ -262,9 +262,9 @@ def summary_table(rows: Sequence[Row]) -> str:
 def _cells(row: Row) -> list[markdown.Cell]:
     keys = ("turn_deg", "shift_mm", "face_median_mm", "face_p90_mm", "deviation_mm", "deviations_off", "cover_95")
     ended = [f"{how}: {row[how]}" for how in ("refused", "crashed") if how in row]
-    told = ended[0] if ended else ", ".join(row["warnings"]) or "-"
+    outcome = ended[0] if ended else ", ".join(row["warnings"]) or "-"
     mark = "! " if not ended and is_wrong(row) and not is_warned(row) else ""
-    return [row["kind"], row["evidence"], mark + row["subject"], *(row.get(k) for k in keys), told, row["seconds"]]
+    return [row["kind"], row["evidence"], mark + row["subject"], *(row.get(k) for k in keys), outcome, row["seconds"]]
 
 
 def _by_count(kind: str) -> tuple[str, int]:

@@ -261,8 +261,8 @@ def photograph(
     """Photographs a random head in the studio. ``corresponds``: whether ``drawn`` is the model that will be fitted."""
     rng = np.random.default_rng(seed)
     modes, spread = (OWN_MODES, OWN_SPREAD) if corresponds else (len(drawn.modes), 1.0)
-    asked = studio.expression
-    weights = {name: asked[plain_name(name)] for name in drawn.expressions.names if plain_name(name) in asked}
+    requested = studio.expression
+    weights = {name: requested[plain_name(name)] for name in drawn.expressions.names if plain_name(name) in requested}
     vertices, level = drawn.posed_vertices(spread * rng.standard_normal(modes), weights), drawn.levels["full"]
     head, face = (Mesh(vertices, level.faces), level.face_region) if corresponds else _finer(vertices, level)
     marks = {name: head.vertices[row] for name, row in drawn.landmarks.items()}

@@ -67,35 +67,43 @@ def real(
     return {"figures": figures, "rows": rows}
 
 
-def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings: Settings, report: Progress) -> Row:
+def judge(
+    model: HeadModel, real_capture: RealCapture, *, renderer: Renderer, settings: Settings, report: Progress
+) -> Row:
     """The bust of eleven views, against the others."""
     started = time.perf_counter()
-    silhouettes = segment(given.capture, given.rig, settings.segmentation, report=report)
+    silhouettes = segment(real_capture.capture, real_capture.rig, settings.segmentation, report=report)
     seconds_masks = time.perf_counter() - started
-    near = views_in_front(given.rig, given.front)
+    near = views_in_front(real_capture.rig, real_capture.front)
     sound = [name for name in near if silhouettes[name].quality.usable]
     if len(sound) <= USED:
-        raise InputError(given.name, [f"{len(sound)} views of use on the front side; more than {USED} are needed"])
-    used = choose(given, sound, silhouettes)
-    rig = given.rig.subset(used)
+        raise InputError(
+            real_capture.name, [f"{len(sound)} views of use on the front side; more than {USED} are needed"]
+        )
+    used = choose(real_capture, sound, silhouettes)
+    rig = real_capture.rig.subset(used)
     found = {name: silhouettes[name] for name in rig.names}
 
     def ready(*_: object, **__: object) -> dict[str, Silhouette]:
         return found
 
-    chosen = replace(settings, front=given.front if given.front in used else None)
-    shot = Capture({name: given.capture.images[name] for name in rig.names})
+    chosen = replace(settings, front=real_capture.front if real_capture.front in used else None)
+    shot = Capture({name: real_capture.capture.images[name] for name in rig.names})
     started = time.perf_counter()
     done = reconstruct(ReconstructionContext(shot, rig, model, chosen, renderer, report, segment=ready))
     seconds = time.perf_counter() - started
     mesh, colours = surface_of(done)
-    held_out = [given.rig[name] for name in near if name not in used]
-    outline = {c.name: outline_px(c, mesh, given.drawn[c.name]) for c in held_out if c.name in given.drawn}
+    held_out = [real_capture.rig[name] for name in near if name not in used]
+    outline = {
+        c.name: outline_px(c, mesh, real_capture.drawn[c.name]) for c in held_out if c.name in real_capture.drawn
+    }
     of_masks = {c.name: outline_px(c, mesh, silhouettes[c.name].mask) for c in held_out if c.name in sound}
-    psnr = {c.name: psnr_db(c, mesh, colours, given.capture.images[c.name], silhouettes[c.name]) for c in held_out}
-    away = distances_mm(given, near, silhouettes, mesh)
+    psnr = {
+        c.name: psnr_db(c, mesh, colours, real_capture.capture.images[c.name], silhouettes[c.name]) for c in held_out
+    }
+    away = distances_mm(real_capture, near, silhouettes, mesh)
     return {
-        "views": len(given.rig),
+        "views": len(real_capture.rig),
         "used": used,
         "held_out": len(held_out),
         "surface": "bust" if done.bust is not None else "head",
@@ -110,17 +118,17 @@ def judge(model: HeadModel, given: RealCapture, *, renderer: Renderer, settings:
         "seconds": seconds,
         "outline_px_of": outline,
         "psnr_db_of": psnr,
-        "warnings": [f"{told.code}: {told.text}" for told in done.warnings],
+        "warnings": [f"{warning.code}: {warning.text}" for warning in done.warnings],
     }
 
 
-def choose(given: RealCapture, sound: list[str], silhouettes: Mapping[str, Silhouette]) -> list[str]:
+def choose(real_capture: RealCapture, sound: list[str], silhouettes: Mapping[str, Silhouette]) -> list[str]:
     """The eleven: spread, where there are enough none that somebody drew an outline of, and none that cuts the subject
     off."""
-    undrawn = [name for name in sound if name not in given.drawn]
+    undrawn = [name for name in sound if name not in real_capture.drawn]
     whole = [name for name in undrawn if not silhouettes[name].quality.cut_off]
     enough = next((names for names in (whole, undrawn) if len(names) >= USED), sound)
-    return spread_views(given.rig.subset(enough), USED)
+    return spread_views(real_capture.rig.subset(enough), USED)
 
 
 def views_in_front(rig: Rig, front: str | None) -> list[str]:
@@ -172,17 +180,17 @@ def psnr_db(
 
 
 def distances_mm(
-    given: RealCapture, views: list[str], silhouettes: Mapping[str, Silhouette], mesh: Mesh
+    real_capture: RealCapture, views: list[str], silhouettes: Mapping[str, Silhouette], mesh: Mesh
 ) -> Float[np.ndarray, " n"]:
     """Of the points that neighbouring views (of ``views``) agree on, where their masks show the subject."""
-    points = find_scene_points(given.capture.images, given.rig.subset(views))
+    points = find_scene_points(real_capture.capture.images, real_capture.rig.subset(views))
     subject = np.zeros(len(points.points), int)
     for name in points.rows:
         at = np.rint(points.pixels[name]).astype(int)
         distance = silhouettes[name].distance[at[:, 1], at[:, 0]]
         np.add.at(subject, points.rows[name][distance < -INSIDE_PX], 1)
-    own = points.points[subject == 2]
-    return SurfaceIndex(mesh.vertices, mesh.faces).closest(own).distances if len(own) else np.zeros(0)
+    on_subject = points.points[subject == 2]
+    return SurfaceIndex(mesh.vertices, mesh.faces).closest(on_subject).distances if len(on_subject) else np.zeros(0)
 
 
 def _median(values: Mapping[str, float]) -> float | None:

@@ -151,8 +151,8 @@ def compare_relief(whole: BustSurface, first: BustSurface, second: BustSurface) 
 def sparse_mean(places: Float[np.ndarray, "n 3"]) -> sparse.csr_array:
     """Returns the matrix that takes the mean of values over each place's surroundings, itself included."""
     pairs = KDTree(places).query_pairs(SMOOTH_MM, output_type="ndarray")
-    own = np.arange(len(places))
-    rows, columns = np.r_[pairs[:, 0], pairs[:, 1], own], np.r_[pairs[:, 1], pairs[:, 0], own]
+    diagonal = np.arange(len(places))
+    rows, columns = np.r_[pairs[:, 0], pairs[:, 1], diagonal], np.r_[pairs[:, 1], pairs[:, 0], diagonal]
     share = 1.0 / np.bincount(rows, minlength=len(places))
     return sparse.csr_array((share[rows], (rows, columns)), shape=(len(places), len(places)))
 

@@ -72,8 +72,8 @@ def repeat(
     )
     rows = []
     for i, condition in enumerate(CONDITIONS):
-        told = partial(_of_condition, report, condition, i)
-        compute = partial(_row, model, condition, max(2, subjects), renderer, told)
+        report_shots = partial(_of_condition, report, condition, i)
+        compute = partial(_row, model, condition, max(2, subjects), renderer, report_shots)
         rows.append({"condition": condition} | records.row(condition, compute))
     figures = {f"{row['condition']}_{name}": row[name] for row in rows for name in row if name != "condition"}
     columns = ("rms_mm", "median_mm", "seen_rms_mm", "normal_rms_mm", "stated_mm", "stated_median_mm", "repeated_mm")
@@ -122,8 +122,10 @@ def scenes(
         light_rng, pose_rng, drift_rng, shot_rng = np.random.default_rng([SEED, i]).spawn(4)
         if kept is None or condition not in STILL:
             pose = random_pose(rig.centre_world(), PRESET.pose_spread_deg, PRESET.pose_spread_mm, pose_rng)
-            given = (subject, rig, PRESET, np.random.default_rng(SEED))
-            kept = build_scene(*given, renderer=renderer, look=look, world_from_head=pose, lamps=moved(light_rng))
+            scene_rng, lamps = np.random.default_rng(SEED), moved(light_rng)
+            kept = build_scene(
+                subject, rig, PRESET, scene_rng, renderer=renderer, look=look, world_from_head=pose, lamps=lamps
+            )
         calibrated = off_by(calibrated, DRIFT_PX, drift_rng) if condition == "drift" else rig
         yield replace(kept, rig=calibrated), shot_rng
 

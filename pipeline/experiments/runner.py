@@ -126,8 +126,8 @@ def _drawn(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
 
 def _table(table: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
     def run(task: Task) -> Outcome:
-        given = {"subjects": task.subjects, "simplex_subjects": task.options.simplex}
-        count = {key: value for key, value in given.items() if value is not None}
+        requested = {"subjects": task.subjects, "simplex_subjects": task.options.simplex}
+        count = {key: value for key, value in requested.items() if value is not None}
         with Renderer.create() as renderer:
             return table(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
 

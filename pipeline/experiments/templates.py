@@ -72,8 +72,8 @@ def foreign(
 
 def _round_trips(model: HeadModel, facekit: HeadModel, drawn: bool, marked: bool, draws: int) -> Row:
     rng = np.random.default_rng((SEED, 2))
-    own = rng.standard_normal(len(facekit.modes)) * (OWN_SHAPE if drawn else 0.0)
-    mesh, order = foreign(facekit, facekit.vertices(own), int(drawn))
+    coefficients = rng.standard_normal(len(facekit.modes)) * (OWN_SHAPE if drawn else 0.0)
+    mesh, order = foreign(facekit, facekit.vertices(coefficients), int(drawn))
     place = np.argsort(order)
     marks = {name: mesh.vertices[place[facekit.landmarks[name]]] for name in MULTI_PIE}
     began = time.perf_counter()

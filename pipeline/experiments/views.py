@@ -49,8 +49,8 @@ def views(
     records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
     heads = random_subjects(CHOSEN_ON + subjects, seed=33)
     candidates = rig_from_directions(CANDIDATES_DEG)
-    told = [_told(span, head, candidates, report, i / len(heads)) for i, head in enumerate(heads[:CHOSEN_ON])]
-    chosen = a_optimal(told, VIEWS, prior(span))
+    information = [_told(span, head, candidates, report, i / len(heads)) for i, head in enumerate(heads[:CHOSEN_ON])]
+    chosen = a_optimal(information, VIEWS, prior(span))
     directions = [CANDIDATES_DEG[k] for k in chosen]
     rigs = {"planned": rig_from_directions(tuple(directions))}
     rigs |= {name: rig_from_directions(directions_deg) for name, directions_deg in ARRANGEMENTS_DEG.items()}

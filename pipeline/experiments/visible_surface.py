@@ -59,12 +59,12 @@ def score_visible(truth: VisiblePoints, mesh: Mesh) -> VisibleScore:
     recall[np.isinf(recall)] = MISSING_MM
     counted = rng.choice(len(points), min(len(points), COUNTED_MOST), replace=False)
     far, near = KDTree(true_points).query(points[counted])
-    told = (far < REACH_MM) & (np.einsum("nx,nx->n", normals[counted], true_normals[near]) > 0)
+    comparable = (far < REACH_MM) & (np.einsum("nx,nx->n", normals[counted], true_normals[near]) > 0)
     precision = _distances(points[counted], true_points[near], true_normals[near], far, PLANE_MM["precision"])
     of_all = {"all": figures_of(recall)}
     return VisibleScore(
         _by_part(recall, truth.part, np.ones(len(recall), bool)) | of_all,
-        _by_part(precision, truth.part[near], told),
+        _by_part(precision, truth.part[near], comparable),
         len(boundary_edges(mesh.faces)) == 0,
     )
 

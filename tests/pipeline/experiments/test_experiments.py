@@ -48,15 +48,15 @@ def test_a_table_shows_three_digits_whole_numbers_and_gaps() -> None:
 
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_scipys_simplex_is_stopped_by_the_relative_spread_and_asks_no_point_twice(adaptive: bool) -> None:
-    asked: list[bytes] = []
+    evaluated: list[bytes] = []
 
     def hill(x: np.ndarray) -> float:
-        asked.append(x.tobytes())
+        evaluated.append(x.tobytes())
         return 1.0 + rosen(x)
 
     counted = peers.Counted(hill)
     found = peers.nelder_mead(counted, np.array([-1.0, 1.0, 0.5]), adaptive=adaptive)
-    assert counted.calls == len(asked) == len(set(asked)) < 1000
+    assert counted.calls == len(evaluated) == len(set(evaluated)) < 1000
     # The spread of 1e-4 about the least value of 1 leaves the valley's floor known to about that.
     assert rosen(found) < 1e-3
 

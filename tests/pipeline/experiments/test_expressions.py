@@ -21,8 +21,8 @@ def test_draws_are_faces_that_people_make() -> None:
 
 
 def test_the_correlation_counts_what_was_found_and_is_not_there() -> None:
-    def row(truth: dict[str, float], told: dict[str, float]) -> dict[str, object]:
-        return {"model": "m", "kind": "posed", "truth": truth, "after": {"weights": told}}
+    def row(truth: dict[str, float], weights: dict[str, float]) -> dict[str, object]:
+        return {"model": "m", "kind": "posed", "truth": truth, "after": {"weights": weights}}
 
     exact = row({"a": 0.2, "b": 0.8}, {"a": 0.2, "b": 0.8})
     assert _correlation([exact], "m") == pytest.approx(1.0)

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from rig.rig import Rig
 
 
-def told(text: str, code: str = "eyes-closed") -> ReportWarning:
+def eyes_closed(text: str, code: str = "eyes-closed") -> ReportWarning:
     return Message(code, {}, text)
 
 
 def test_the_eyes_are_those_that_the_warning_names() -> None:
-    assert told_sides([told("both eyes are closed: no white")]) == {"right", "left"}
-    assert told_sides([told("the left eye is closed: no white")]) == {"left"}
-    assert told_sides([told("the left eye is closed", "view")]) == frozenset()
+    assert told_sides([eyes_closed("both eyes are closed: no white")]) == {"right", "left"}
+    assert told_sides([eyes_closed("the left eye is closed: no white")]) == {"left"}
+    assert told_sides([eyes_closed("the left eye is closed", "view")]) == frozenset()
     assert told_sides([]) == frozenset()
 
 

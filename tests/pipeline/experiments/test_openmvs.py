@@ -45,8 +45,8 @@ def test_the_model_projects_its_points_where_it_says(tmp_path: Path, ball: Scene
     for number, (pose, pixels) in enumerate(zip(rows["images"][::2], rows["images"][1::2], strict=True)):
         words, shown = pose.split(), np.array(pixels.split(), float).reshape(-1, 3)
         w, x, y, z, *translation = (float(word) for word in words[1:8])
-        own = np.stack([places[int(p)] for p in shown[:, 2]])
-        camera = Rotation.from_quat((x, y, z, w)).apply(own) + np.array(translation)
+        observed = np.stack([places[int(p)] for p in shown[:, 2]])
+        camera = Rotation.from_quat((x, y, z, w)).apply(observed) + np.array(translation)
         _, _, fx, fy, cx, cy = lenses[number]
         drawn = np.stack([fx * camera[:, 0] / camera[:, 2] + cx, fy * camera[:, 1] / camera[:, 2] + cy], axis=1)
         assert np.abs(drawn - shown[:, :2]).max() < 0.001

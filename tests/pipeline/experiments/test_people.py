@@ -217,11 +217,11 @@ def test_refusals_and_crashes_are_rows(
 @pytest.mark.gl
 @pytest.mark.timeout(1200)  # two whole jobs, beside another test
 def test_two_rows_are_computed_and_kept(renderer: "Renderer", tmp_path: Path) -> None:
-    asked = partial(
+    run = partial(
         people, load_model(), None, [], renderer=renderer, report=lambda stage, share: None,
         only=("front-11", "studio-plain-0", "plates", "masks"), detail="span", folder=tmp_path,
     )  # fmt: skip
-    found = asked()
+    found = run()
     rows = found["rows"]
     assert isinstance(rows, list)
     assert [row["evidence"] for row in rows] == ["plates", "masks"]
@@ -232,4 +232,4 @@ def test_two_rows_are_computed_and_kept(renderer: "Renderer", tmp_path: Path) ->
     assert found["figures"]["silent_wrong"] == 0
     kept = json.loads((tmp_path / "people-span.json").read_text())["rows"]
     assert len(kept) == 2
-    assert asked()["rows"] == rows, "seconds included: nothing was computed again"
+    assert run()["rows"] == rows, "seconds included: nothing was computed again"

@@ -42,8 +42,8 @@ def test_a_planted_motion_is_told_from_surfaces_of_other_heads(
     """A head whose shape is 0.8 mm off, landmarks 2 mm off: 0.3 degrees and 0.2 mm in the median over such heads, 0.7
     at worst. Of a face alone, a pitch and a longer chin look alike, so that no measure between two shapes is exact."""
     rng, full = np.random.default_rng(3), model.levels["full"]
-    own, different = (0.8 * rng.standard_normal(20) for _ in range(2))
-    true, other = model.vertices(own), model.vertices(own + 0.3 * (different - own))
+    first, different = (0.8 * rng.standard_normal(20) for _ in range(2))
+    true, other = model.vertices(first), model.vertices(first + 0.3 * (different - first))
     laid = pose_error_of_vertices(other[full.face_region], true[full.face_region]).truth_from_result.apply(other)
     motion = turned(turn_deg, (3.0, -2.0, 1.0))
     result = motion.apply(laid)

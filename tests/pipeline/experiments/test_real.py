@@ -57,11 +57,11 @@ def test_views_are_chosen_in_front_and_apart_from_what_judges_them() -> None:
     assert set(views_in_front(rig, "cam13")) >= {"cam13", "cam14"}
     masks = {n: silhouette_from_mask(np.pad(np.ones((20, 20), bool), 8)) for n in rig.names}
     drawn = {"cam00": np.ones((36, 36), bool), "cam01": np.ones((36, 36), bool)}
-    given = RealCapture("all around", Capture({}), rig, drawn)
-    used = choose(given, front, masks)
+    real_capture = RealCapture("all around", Capture({}), rig, drawn)
+    used = choose(real_capture, front, masks)
     assert len(used) == 11
     assert not set(used) & set(drawn)
-    assert len(choose(replace(given, drawn={n: drawn["cam00"] for n in front}), front, masks)) == 11
+    assert len(choose(replace(real_capture, drawn={n: drawn["cam00"] for n in front}), front, masks)) == 11
 
 
 @pytest.mark.slow
@@ -72,8 +72,8 @@ def test_a_studio_subject_is_judged_by_the_views_that_were_held_out(renderer: Re
     model = load_model()
     taken = simulate(drawn_subject(model, rng), rig_from_directions(AROUND).scaled(0.4), CLEAN, rng, renderer=renderer)
     masks = taken.masks
-    given = RealCapture("anna", Capture(taken.capture.images, masks=masks), taken.rig, masks, "cam04")
-    found = real(model, [given], renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
+    real_capture = RealCapture("anna", Capture(taken.capture.images, masks=masks), taken.rig, masks, "cam04")
+    found = real(model, [real_capture], renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
     (row,) = found["rows"]
     assert isinstance(row, dict)
     assert (row["views"], row["held_out"], row["surface"]) == (15, 2, "head")
@@ -82,6 +82,6 @@ def test_a_studio_subject_is_judged_by_the_views_that_were_held_out(renderer: Re
     assert figures["anna_outline_px"] < 3.0
     assert figures["anna_psnr_db"] > 20.0
     assert figures["anna_points_mm"] < 3.0
-    few = replace(given, rig=taken.rig.subset(taken.rig.names[:11]))
+    few = replace(real_capture, rig=taken.rig.subset(taken.rig.names[:11]))
     with pytest.raises(InputError, match="11 views of use on the front side; more than 11 are needed"):
         real(model, [few], renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)

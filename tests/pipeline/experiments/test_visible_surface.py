@@ -72,12 +72,12 @@ def test_figures_are_those_of_the_tool_that_judges_from_outside(capture: str, tm
     write_ply(tmp_path / "head.ply", head, normals=head.normals(), colours=grey, quality=np.zeros(count),
               views=np.zeros(count, np.uint8))  # fmt: skip
     command = [sys.executable, str(tool), str(truth), str(tmp_path / "head.ply"), "--json"]
-    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=200).stdout)
+    expected = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=200).stdout)
     score = score_visible(read_visible(truth), head)
     for kind, ours in (("recall", score.recall), ("precision", score.precision)):
-        assert set(ours) == set(told[kind])
+        assert set(ours) == set(expected[kind])
         for part, figures in ours.items():
             for key, value in figures.items():
-                margin = 0.01 if key.startswith("within") else 0.01 + 0.03 * told[kind][part][key]
-                assert value == pytest.approx(told[kind][part][key], abs=margin), (kind, part, key)
-    assert score.closed == told["closed"]
+                margin = 0.01 if key.startswith("within") else 0.01 + 0.03 * expected[kind][part][key]
+                assert value == pytest.approx(expected[kind][part][key], abs=margin), (kind, part, key)
+    assert score.closed == expected["closed"]
