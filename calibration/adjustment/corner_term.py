@@ -34,13 +34,13 @@ class CornerTerm:
     sigma_px: Float[np.ndarray, " c"]
     loss: Loss = field(default_factory=LeastSquares)
 
-    def at(self, state: BundleState) -> "CornersAt":
+    def at(self, state: BundleState) -> "LinearisedCornerTerm":
         noise = self.sigma_px[self.seen.camera[self.seen.view_of]]
-        return CornersAt(self, state, residuals(state, self.seen) / noise[:, None], noise)
+        return LinearisedCornerTerm(self, state, residuals(state, self.seen) / noise[:, None], noise)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CornersAt:
+class LinearisedCornerTerm:
     """All corners at one state."""
 
     term: CornerTerm

@@ -31,12 +31,12 @@ class LensPrior:
         pull = np.einsum("cij,cj->ci", self.information, self.mean) + np.einsum("cij,cj->ci", information, mean)
         return LensPrior(np.linalg.solve(total, pull[:, :, None])[:, :, 0], total)
 
-    def at(self, state: BundleState) -> "LensPriorAt":
-        return LensPriorAt(self, state.intrinsics - self.mean)
+    def at(self, state: BundleState) -> "LinearisedLensPrior":
+        return LinearisedLensPrior(self, state.intrinsics - self.mean)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LensPriorAt:
+class LinearisedLensPrior:
     """``LensPrior`` at a distance from its mean."""
 
     prior: LensPrior
@@ -56,12 +56,12 @@ class LensPriorAt:
 class AspectTerm:
     """Pixels are square: ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` by camera."""
 
-    def at(self, state: BundleState) -> "AspectsAt":
-        return AspectsAt(*state.intrinsics[:, :2].T)
+    def at(self, state: BundleState) -> "LinearisedAspectPrior":
+        return LinearisedAspectPrior(*state.intrinsics[:, :2].T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AspectsAt:
+class LinearisedAspectPrior:
     """Holds the focal lengths (px) of all cameras."""
 
     fx: Float[np.ndarray, " c"]

@@ -178,7 +178,7 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
     """Computes the scale from the median distance of points from their middle, as in ``head`` (mm)."""
     points = _looked_at(structure)
-    ratio = _spread(head) / _spread(points)
+    ratio = _median_radius(head) / _median_radius(points)
     provenance = compose("scale-by-head")
     return Scale(ratio, HEAD_SHARE, ASSUMED, provenance)
 
@@ -197,5 +197,5 @@ def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:
     return structure.points[near]
 
 
-def _spread(points: Float[np.ndarray, "p 3"]) -> float:
+def _median_radius(points: Float[np.ndarray, "p 3"]) -> float:
     return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))

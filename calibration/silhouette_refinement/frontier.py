@@ -23,8 +23,8 @@ from pipeline.multiview.tangency import (
     LONGEST_SPAN,
     Tangency,
     angle_slopes,
+    epipolar_plane_axes,
     on_contour,
-    pencil,
     rays_about,
     tangency,
 )
@@ -81,7 +81,7 @@ def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: floa
 
 
 def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
-    u, v = pencil(one.camera, two.camera, one.rays.mean(axis=0) + two.rays.mean(axis=0))
+    u, v = epipolar_plane_axes(one.camera, two.camera, one.rays.mean(axis=0) + two.rays.mean(axis=0))
     angles = [np.arctan2(contour.rays @ v, contour.rays @ u) for contour in (one, two)]
     if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
         return []

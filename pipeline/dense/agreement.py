@@ -16,7 +16,7 @@ from rig.camera import Camera
 
 # Views that see past a place, for each that has it too: they may err as well. At 1 a tenth of the hair is lost, without
 # a bound a percent of what is told lies more than 2 mm off.
-MOST_AGAINST = 2
+MAX_CONTRADICTING_VIEWS = 2
 
 
 # Variance along the ray of what the views agree on, by features that say it on two captures rendered by another program
@@ -41,13 +41,13 @@ def depth_maps(
         agreeing, before = np.empty(shape, np.uint8), np.empty(shape, np.uint8)
         apart = np.empty(shape, np.float32)
         count_agreeing(
-            int(stack.offset[view]), stack.ways(view, others), stack.lens[others, :2].copy(), matched, depth,
+            int(stack.offset[view]), stack.homographies(view, others), stack.lens[others, :2].copy(), matched, depth,
             slopes, (settings.agree_mm, settings.agree_deviations), agreeing, before, apart,
         )  # fmt: skip
         deviation = stated_deviation(crops[view].camera, fields[view], agreeing, apart)
         clear = (deviation < settings.worst_mm) & (stack.image(matched, view) < settings.worst_mm)
         inside = stack.image(stack.distance_px, view) < -settings.outline_px
-        known = inside & clear & (agreeing >= 1) & (MOST_AGAINST * agreeing >= before)
+        known = inside & clear & (agreeing >= 1) & (MAX_CONTRADICTING_VIEWS * agreeing >= before)
         return _depth_map(crops[view], fields[view], known, deviation, agreeing)
 
     return tuple(map_in_threads(work, len(crops)))

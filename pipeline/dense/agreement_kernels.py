@@ -18,7 +18,7 @@ def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreei
     Two views agree where the distance from the other's plane is below ``tolerance_mm``, or below ``deviations`` of
     their joint standard deviation, half a ``tolerance_mm`` at least. A view in which something nearer stands before the
     place says nothing. ``depth``, ``slopes`` and ``deviation`` are those of all views in one row, ``ways`` as
-    ``Stack.ways`` has them, ``lenses`` fx and fy of the others, ``limits`` ``tolerance_mm`` and ``deviations``.
+    ``Stack.homographies`` has them, ``lenses`` fx and fy of the others, ``limits`` ``tolerance_mm`` and ``deviations``.
     """
     tolerance_mm, deviations = limits
     far_mm = FAR_TOLERANCES * tolerance_mm

@@ -21,7 +21,7 @@ from pipeline.dense.crops import make_crops
 from pipeline.dense.depth_map import DepthMap
 from pipeline.dense.neighbours import choose_neighbours
 from pipeline.dense.refinement import doubled, refined
-from pipeline.dense.room import find_rooms
+from pipeline.dense.room import find_depth_ranges
 from pipeline.dense.search import find_search_level, first_fields
 from pipeline.dense.stack import stack_crops
 from pipeline.dense.window import square_pattern
@@ -71,9 +71,9 @@ def estimate_depth(
     pattern = square_pattern(2)
     first = find_search_level([crop.camera for crop in crops], extent[0])
     stack = stack_crops(crops, first)
-    rooms = find_rooms(crops, stack_crops(crops, LEAST), stack, head_world, extent, settings)
+    depth_ranges = find_depth_ranges(crops, stack_crops(crops, LEAST), stack, head_world, extent, settings)
     report("dense", 0.1)
-    fields = first_fields(stack, rooms, neighbours, pattern, settings)
+    fields = first_fields(stack, depth_ranges, neighbours, pattern, settings)
     report("dense", 0.3)
     for doublings in range(first + 1):
         level = first - doublings

@@ -3,8 +3,8 @@
 Scores are zero-mean normalised cross-correlations, so that gain and offset of a camera drop out. The noise of both
 views stands in the norms: a window without texture is like nothing, however alike its noise may look.
 
-A view that is compared with is a row of 16 numbers (``Stack.ways``): how a point there comes about, and where its
-pixels lie. Few and small arguments: a call that hands over twenty arrays takes longer than a window.
+A view that is compared with is a row of 16 numbers (``Stack.homographies``): how a point there comes about, and where
+its pixels lie. Few and small arguments: a call that hands over twenty arrays takes longer than a window.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class Sight(NamedTuple):
 
     start: int  # of its first pixel
     noise: float  # shades
-    ways: np.ndarray  # to the views that it is compared with, as ``Stack.ways`` has them
+    ways: np.ndarray  # to the views that it is compared with, as ``Stack.homographies`` has them
     pairs: np.ndarray  # all views' pixels, as ``Stack`` has them
     distance_px: np.ndarray
     pattern: np.ndarray  # samples of a window, across and down from its middle, px

@@ -97,16 +97,16 @@ def classify_parts(
     start, lower = gathered([starts(view) for view in cells]), gathered([lower_face(view) for view in cells])
     by_colour, by_both = unlike_cheeks(appearance, start[:, SKIN_CHANNEL])
     bearded = beard_evidence(by_both, lower)
-    otherwise = by_colour + bearded * lower * (by_both - by_colour)
+    unlikeness = by_colour + bearded * lower * (by_both - by_colour)
     place = gathered([place_prior(view, bearded) for view in cells])
     report("parts", 0.4)
-    share = posterior(learn(appearance, place, start, lower, otherwise, settings), place)
+    share = posterior(fit_appearance(appearance, place, start, lower, unlikeness, settings), place)
     report("parts", 0.6)
     rows = np.split(share, np.cumsum([np.count_nonzero(mask) for mask in inside])[:-1])
 
     def one(view: Cells, mask: Bool[np.ndarray, "r c"], probabilities: Float32[np.ndarray, "n 3"]) -> PartMap:
         name = view.camera.name
-        return PartMap(name, finished(view, mask, probabilities, images[name], masks[name], settings))
+        return PartMap(name, upsample_guided(view, mask, probabilities, images[name], masks[name], settings))
 
     with ThreadPoolExecutor(thread_count()) as pool:  # OpenCV and numpy release the interpreter lock
         found = list(pool.map(one, cells, inside, rows))
@@ -158,10 +158,10 @@ def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
     return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
 
 
-def beard_evidence(otherwise: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
+def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
     """0 for a bare lower face, 1 for a beard, by the share of it that looks otherwise than cheeks and nose: of heads
     without a beard it is below 0.12, of beards above 0.9."""
-    share = float(otherwise[lower].mean()) if lower.any() else 0.0
+    share = float(unlikeness[lower].mean()) if lower.any() else 0.0
     return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
 
 
@@ -202,18 +202,18 @@ def unlike_cheeks(
     everything = np.ones(len(appearance), np.float32)
     colour, detail = (
         (of(which, cheeks) / of(which, everything))[which]
-        for which, of in ((appearance[:, 0], colour_looks), (appearance[:, 1], detail_looks))
+        for which, of in ((appearance[:, 0], colour_histogram), (appearance[:, 1], detail_histogram))
     )
     first, second = ((SKIN_RATIO / (SKIN_RATIO + ratio)) ** 2 for ratio in (colour, colour * detail))
     return first, second
 
 
-def learn(
+def fit_appearance(
     appearance: Int[np.ndarray, "n 2"],
     prior: Float32[np.ndarray, "n 4"],
     start: Float32[np.ndarray, "n 3"],
     lower: Bool[np.ndarray, " n"],
-    otherwise: Float[np.ndarray, " n"],
+    unlikeness: Float[np.ndarray, " n"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "n 4"]:
     """Log likelihood of every cell's looks under skin, hair, clothes and the outlier, and of there being such a part.
@@ -222,27 +222,27 @@ def learn(
     """
     colour, detail = appearance.T
     share = start.copy()
-    share[:, HAIR_CHANNEL] = np.maximum(share[:, HAIR_CHANNEL], lower) * otherwise
-    share[:, CLOTHES_CHANNEL] *= otherwise
-    there = np.log(_there(otherwise, start, lower))
+    share[:, HAIR_CHANNEL] = np.maximum(share[:, HAIR_CHANNEL], lower) * unlikeness
+    share[:, CLOTHES_CHANNEL] *= unlikeness
+    present = np.log(_presence(unlikeness, start, lower))
     logs = np.empty((len(colour), 4), np.float32)
     logs[:, 3] = settings.strength * -np.log(OUTLIER_BINS)
     for step in range(settings.steps):
         for part in (SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL):
-            like = colour_looks(colour, share[:, part])[colour] * detail_looks(detail, share[:, part])[detail]
-            logs[:, part] = settings.strength * np.log(like) + there[part]
+            like = colour_histogram(colour, share[:, part])[colour] * detail_histogram(detail, share[:, part])[detail]
+            logs[:, part] = settings.strength * np.log(like) + present[part]
         if step < settings.steps - 1:
             share = posterior(logs, prior)
             share[share < CONFIDENT] = 0.0
     return logs
 
 
-def _there(
-    otherwise: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], lower: Bool[np.ndarray, " n"]
+def _presence(
+    unlikeness: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], lower: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, " 3"]:
     """Is there hair, are there clothes? The share of their sure places that look otherwise than skin; a beard is hair,
     too."""
-    shares = [float(otherwise[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
+    shares = [float(unlikeness[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
     return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], LEAST_THERE)
 
 
@@ -252,7 +252,7 @@ def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"])
     return share[:, :3] / share.sum(axis=1, keepdims=True)
 
 
-def colour_looks(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " b"]:
+def colour_histogram(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " b"]:
     """Probability of every bin of colour, smoothed, nowhere zero."""
     shape = (RED_BINS, BLUE_BINS, LIGHT_BINS)
     counts = np.bincount(colour, weight, np.prod(shape)).astype(np.float32)
@@ -265,7 +265,7 @@ def colour_looks(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"
     return _proper(((1.0 - SHADE_SHARE) * counts + SHADE_SHARE * shaded).ravel().astype(float))
 
 
-def detail_looks(detail: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
+def detail_histogram(detail: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
     """Probability of every bin of fine structure, smoothed, nowhere zero."""
     counts = np.bincount(detail, weight, DETAIL_BINS).astype(np.float32)[None]
     return _proper(cv2.GaussianBlur(counts, (0, 0), sigmaX=DETAIL_BLUR, sigmaY=0.1).ravel().astype(float))
@@ -276,7 +276,7 @@ def _proper(counts: Float[np.ndarray, " b"]) -> Float[np.ndarray, " b"]:
     return (1.0 - FLOOR) * counts / max(counts.sum(), 1.0) + FLOOR * even
 
 
-def finished(
+def upsample_guided(
     view: Cells,
     inside: Bool[np.ndarray, "r c"],
     share: Float32[np.ndarray, "n 3"],

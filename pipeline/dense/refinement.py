@@ -76,7 +76,7 @@ def _refined(
     rounds: int,
     speck_px: int,
 ) -> Field:
-    sight = stack.sight(view, neighbours, pattern, settings.contrast_levels)
+    sight = stack.match_arguments(view, neighbours, pattern, settings.contrast_levels)
     scratch = make_scratch(sight)
     depth, slopes, live = field.depth.copy(), field.slopes.copy(), field.depth > 0.0
     pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0

@@ -31,7 +31,7 @@ STEEPEST = 3.0  # slope against the image plane: 72 degrees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Room:
+class DepthRange:
     """Depth bounds (mm) of one view's pixels, 0 where there is none, and their slopes by x and y (mm a pixel)."""
 
     near: Float32[np.ndarray, "h w"]
@@ -39,14 +39,14 @@ class Room:
     slopes: Float32[np.ndarray, "h w 4"]  # of near by x and y, of far by x and y
 
 
-def find_rooms(
+def find_depth_ranges(
     crops: Sequence[Crop],
     least: Stack,
     stack: Stack,
     head_world: Mesh | None,
     extent: tuple[Float[np.ndarray, " 3"], float],
     settings: DenseSettings,
-) -> list[Room]:
+) -> list[DepthRange]:
     """The room of every view at the size of ``stack``.
 
     Args:
@@ -55,7 +55,7 @@ def find_rooms(
         extent: middle (world) and edge (mm) of a cube that holds the subject.
     """
 
-    def work(view: int) -> Room:
+    def work(view: int) -> DepthRange:
         near, far = _bounds(crops[view], least, view, head_world, extent, settings)
         return _enlarged(near, far, stack, view)
 
@@ -79,7 +79,7 @@ def _bounds(
     others = np.delete(np.arange(len(least)), view)
     near, far = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     find_room(
-        int(least.offset[view]), least.ways(view, others), least.distance_px, SLACK_PX, max(middle - half, 1.0),
+        int(least.offset[view]), least.homographies(view, others), least.distance_px, SLACK_PX, max(middle - half, 1.0),
         middle + half, step, near, far,
     )  # fmt: skip
     room = near > 0.0
@@ -118,24 +118,24 @@ def _bound_by_head(
     far[seen] = np.minimum(far[seen], head[seen] + settings.behind_head_mm)
 
 
-def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"], stack: Stack, view: int) -> Room:
+def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"], stack: Stack, view: int) -> DepthRange:
     """The bounds, smooth, at the size of ``stack``, over all that its view shows of the subject."""
     room = near > 0.0
     width, height = (int(side) for side in stack.size[view])
     distance = stack.image(stack.distance_px, view)
     live = (distance < 1.0) & (distance > UNSEEN_MOST_PX)
     if not room.any():
-        return Room(np.zeros_like(distance), np.zeros_like(distance), np.zeros((height, width, 4), np.float32))
+        return DepthRange(np.zeros_like(distance), np.zeros_like(distance), np.zeros((height, width, 4), np.float32))
     bounds, slopes = [], []
     for values in (near, far):
-        wide = cv2.resize(_spread(values, room), (width, height), interpolation=cv2.INTER_LINEAR)
+        wide = cv2.resize(_extended(values, room), (width, height), interpolation=cv2.INTER_LINEAR)
         steepest = STEEPEST * float(wide.mean() / stack.lens[view, 0])
         slopes += [np.clip(slope, -steepest, steepest) for slope in np.gradient(wide)[::-1]]
         bounds.append(np.where(live, wide, np.float32(0.0)))
-    return Room(bounds[0], bounds[1], np.stack(slopes, axis=2).astype(np.float32))
+    return DepthRange(bounds[0], bounds[1], np.stack(slopes, axis=2).astype(np.float32))
 
 
-def _spread(values: Float32[np.ndarray, "h w"], room: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+def _extended(values: Float32[np.ndarray, "h w"], room: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     """Blurred within the room, and carried on beyond it."""
     weight = cv2.GaussianBlur(room.astype(np.float32), (0, 0), BOUND_BLUR_PX)
     smooth = cv2.GaussianBlur(np.where(room, values, np.float32(0.0)), (0, 0), BOUND_BLUR_PX) / np.maximum(weight, 1e-3)

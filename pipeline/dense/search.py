@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32, Int, Int32
 
 from pipeline.dense.field import Field
 from pipeline.dense.matching_kernels import make_scratch
-from pipeline.dense.room import Room
+from pipeline.dense.room import DepthRange
 from pipeline.dense.stack import Stack
 from pipeline.dense.sweep_kernels import aggregate, sweep_view
 from pipeline.parallel_for import map_in_threads
@@ -38,7 +38,7 @@ def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3
 
 def first_fields(
     stack: Stack,
-    rooms: Sequence[Room],
+    depth_ranges: Sequence[DepthRange],
     neighbours: Sequence[Int[np.ndarray, " _"]],
     pattern: Float32[np.ndarray, "2 s"],
     settings: DenseSettings,
@@ -51,22 +51,22 @@ def first_fields(
     """
 
     def work(view: int) -> Field:
-        room = rooms[view]
+        room = depth_ranges[view]
         cost, strides = np.empty((*room.near.shape, settings.labels), np.float32), label_strides(room, settings)
-        sight = stack.sight(view, neighbours[view], pattern, settings.contrast_levels)
+        sight = stack.match_arguments(view, neighbours[view], pattern, settings.contrast_levels)
         sweep_view(sight, make_scratch(sight), room.near, room.far, room.slopes, strides, cost)
         return _cheapest(cost, room, strides)
 
     return map_in_threads(work, len(stack))
 
 
-def label_strides(room: Room, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
+def label_strides(room: DepthRange, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
     """One in how many labels is matched: 1, 2, 4 ..., so that places lie no farther apart than in the deepest room."""
     depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
     return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
 
 
-def _cheapest(cost: Float32[np.ndarray, "h w d"], room: Room, strides: Int32[np.ndarray, "h w"]) -> Field:
+def _cheapest(cost: Float32[np.ndarray, "h w d"], room: DepthRange, strides: Int32[np.ndarray, "h w"]) -> Field:
     """The label of the cheapest paths, and within a stride the least of its own costs: paths are no likeness."""
     paths = np.empty_like(cost)
     aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)

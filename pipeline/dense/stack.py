@@ -33,20 +33,20 @@ class Stack:
     turn: Float[np.ndarray, "n n 3 3"]
     shift: Float[np.ndarray, "n n 3"]
 
-    def ways(self, view: int, others: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 16"]:
+    def homographies(self, view: int, others: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 16"]:
         """From one view to others, as compiled loops take it: turn (9), shift (3), width, height, offset, noise."""
         flat = self.turn[view, others].reshape(len(others), 9)
         return np.column_stack(
             [flat, self.shift[view, others], self.size[others], self.offset[others], self.noise[others]]
         )
 
-    def sight(
+    def match_arguments(
         self, view: int, others: Int[np.ndarray, " m"], pattern: Float32[np.ndarray, "2 s"], contrast_levels: float
     ) -> Sight:
         """A view and the others that it is matched with, for compiled loops."""
         return Sight(
-            int(self.offset[view]), float(self.noise[view]), self.ways(view, others), self.pairs, self.distance_px,
-            pattern, contrast_levels * SHADES,
+            int(self.offset[view]), float(self.noise[view]), self.homographies(view, others), self.pairs,
+            self.distance_px, pattern, contrast_levels * SHADES,
         )  # fmt: skip
 
     def __len__(self) -> int:

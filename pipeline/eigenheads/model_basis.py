@@ -5,9 +5,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from pipeline.array_cache import cached_arrays
 from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, with_expressions, with_modes
-from pipeline.kept_arrays import kept_arrays
 from pipeline.settings import Settings
 from rig.mesh import vertex_normals
 
@@ -30,6 +30,6 @@ def basis_of(model: HeadModel, eigenheads: int, *, kernel: bool) -> HeadModel:
         wider = with_kernel(model, eigenheads)
         return {"modes": wider.modes, "sigma": wider.sigma}
 
-    arrays = kept_arrays("kernel-modes", inputs, make, made_by=(with_kernel, vertex_normals, HeadModel))
+    arrays = cached_arrays("kernel-modes", inputs, make, made_by=(with_kernel, vertex_normals, HeadModel))
     wide = replace(with_modes(model, eigenheads), modes=arrays["modes"], sigma=arrays["sigma"], _bases={})
     return with_expressions(wide)

@@ -45,7 +45,7 @@ class Limits:
 class Evidence:
     """How a solution came about; ``predicted_fall``: of the last step tried, in squared standard deviations."""
 
-    stopped_because: Reason
+    termination_reason: Reason
     evaluations: int
     steps: int
     cost: float

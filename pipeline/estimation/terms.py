@@ -94,12 +94,12 @@ class Quadratic:
         """N(mean, information^-1)."""
         return cls(information, mean, np.zeros(len(mean)))
 
-    def at(self, value: Float[np.ndarray, " p"]) -> "QuadraticAt":
-        return QuadraticAt(self, value - self.centre)
+    def at(self, value: Float[np.ndarray, " p"]) -> "LinearisedQuadratic":
+        return LinearisedQuadratic(self, value - self.centre)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class QuadraticAt:
+class LinearisedQuadratic:
     """``Quadratic`` at a distance from its centre."""
 
     term: Quadratic

@@ -33,7 +33,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posable:
+class BlendshapeRig:
     """A neutral head and what it can do. ``missing``: Apple's names that the model has no counterpart for; their morphs
     move nothing."""
 
@@ -73,7 +73,9 @@ def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: C
     return Mesh(mesh_world.vertices - back, mesh_world.faces, mesh_world.colours)
 
 
-def posable_head(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Posable:
+def build_blendshape_rig(
+    model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]
+) -> BlendshapeRig:
     """The neutral head with Apple's 52 morphs, and one of its own for whatever of the found expression they leave out,
     so that the morphs' weights give the head as photographed."""
     operator, names = model.levels["full"].operator, model.expressions.names
@@ -91,4 +93,4 @@ def posable_head(model: HeadModel, place: Similarity, mesh_world: Mesh, found: C
             morphs[name] = place.scale * (operator @ model.expressions.shapes[names.index(name)])
             weights[name] = weight
     missing = tuple(name for name in ARKIT if not parts[name])
-    return Posable(neutral_mesh(model, place, mesh_world, found), morphs, weights, missing)
+    return BlendshapeRig(neutral_mesh(model, place, mesh_world, found), morphs, weights, missing)

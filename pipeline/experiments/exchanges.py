@@ -2,7 +2,7 @@
 
 ``exchanges``: captures of random heads, every other one bare, the rest with hair, strands and a shirt, cameras off
 by what a calibration leaves. In each, the files of two cameras are exchanged, those of three moved round in a ring,
-and one camera's files copied over another's. They go through ``own_pictures`` as a job's do, with ready masks. An
+and one camera's files copied over another's. They go through ``assign_images`` as a job's do, with ready masks. An
 exchange is repaired where the fit ends within ``WORST_RATIO`` of the error of the same capture unexchanged; where every
 silhouette is the same again, so is the fit. What was copied over is lost, and nothing can bring it back: beside the
 ratio stands whether the capture ended as the unexchanged one without that view (``lost_view_only``).
@@ -35,8 +35,8 @@ from pipeline.multiview.camera_assignment import find_assignment
 from pipeline.multiview.camera_drift import find_drift
 from pipeline.multiview.rig_agreement import wrong_rig
 from pipeline.settings import FittingSettings, Settings
-from pipeline.silhouettes import own_pictures as own_pictures_module
-from pipeline.silhouettes.own_pictures import ExchangedPictures, OwnPictures, own_pictures
+from pipeline.silhouettes import image_assignment
+from pipeline.silhouettes.image_assignment import ExchangedPictures, ImageAssignment, assign_images
 from pipeline.silhouettes.segment import segment
 from rig.capture import Capture, reassign_images
 from rig.render.renderer import Renderer
@@ -48,7 +48,7 @@ CALIBRATION_PX = 0.11  # prior of ``off_by``: a head moves by 0.2 px (2D RMS) in
 WORST_RATIO = 1.1  # of the fit's error after an exchange to that without
 GOOD_CODES = ("cameras-exchanged", "camera-moved", "mask-loose", "wrong-rig")  # the last is a refusal
 KINDS = ("pair", "triple", "duplicate")
-ASKED = (camera_assignment, rig_agreement, own_pictures_module, tangency)
+ASKED = (camera_assignment, rig_agreement, image_assignment, tangency)
 
 
 def exchanges(
@@ -99,14 +99,14 @@ def _exchanged_row(
     true_rig = default_layout()
     capture = _filed(_seen(model, subject, true_rig, renderer, rng, worn=worn))
     rig = off_by(true_rig, CALIBRATION_PX, rng)
-    good = _asked(capture, rig)
+    good = _assigned(capture, rig)
     base_mm = _error_mm(model, subject, good.silhouettes, rig)
     row: Row = {"worn": worn, "good_codes": [warning.code for warning in good.warnings], "error_mm": base_mm}
     for kind in KINDS:
         filed = _planted(kind, rig, rng)
         plates_follow = reassign_images(capture, pictures=filed, plates=filed)
         try:
-            found = _asked(plates_follow, rig)
+            found = _assigned(plates_follow, rig)
         except ExchangedPictures as refusal:
             named = all(name in str(refusal) for name in filed)
             row[kind] = {"filed": filed, "named": named, "repaired": False, "ratio": 0.0, "told": [str(refusal)]}
@@ -137,11 +137,11 @@ def _filed(silhouettes: Mapping[str, Silhouette]) -> Capture:
     return Capture(pictures, {}, masks)
 
 
-def _asked(capture: Capture, rig: Rig) -> OwnPictures:
+def _assigned(capture: Capture, rig: Rig) -> ImageAssignment:
     def segmented(shot: Capture) -> dict[str, Silhouette]:
         return segment(shot, rig, Settings().segmentation, report=lambda stage, fraction: None)
 
-    return own_pictures(capture, rig, segmented, exchanged="repair")
+    return assign_images(capture, rig, segmented, exchanged="repair")
 
 
 def _planted(kind: str, rig: Rig, rng: np.random.Generator) -> dict[str, str]:
@@ -154,7 +154,7 @@ def _planted(kind: str, rig: Rig, rng: np.random.Generator) -> dict[str, str]:
     }[kind]
 
 
-def _is_named(kind: str, filed: Mapping[str, str], found: OwnPictures) -> bool:
+def _is_named(kind: str, filed: Mapping[str, str], found: ImageAssignment) -> bool:
     """Whether the cameras of an exchange are named, and no others; of a duplicate, the one that lost its picture."""
     if kind == "duplicate":
         (lost,) = filed

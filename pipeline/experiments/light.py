@@ -32,9 +32,9 @@ from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.texture import chart_colours, decision, delight
+from pipeline.texture import albedo, chart_colours, decision
 from pipeline.texture import light as fitted_light
-from pipeline.texture.delight import Albedo
+from pipeline.texture.albedo import Albedo
 from pipeline.texture.uv_unwrap import Layout
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -88,7 +88,7 @@ def light(
         folder: keeps rows, so that a stopped run goes on, and a picture of every subject.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", delight=True, texture_size=2048))
-    code = (fitted_light, delight, decision, chart_colours, colour_chart)
+    code = (fitted_light, albedo, decision, chart_colours, colour_chart)
     records = Records(folder, "light", key_of(model.sha256, settings, LIGHTS, *code))
     rows = []
     for number in range(subjects):

@@ -21,7 +21,7 @@ from pipeline.experiments import markdown
 from pipeline.experiments.outcome import Outcome, Row
 from pipeline.experiments.records import Records, key_of
 from pipeline.templates import carrying, likeness, placement, registration
-from pipeline.templates.carrying import attach
+from pipeline.templates.carrying import bind_vertices
 from pipeline.templates.registration import Registration, register
 from rig.formats.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
@@ -86,11 +86,11 @@ def _round_trips(model: HeadModel, facekit: HeadModel, drawn: bool, marked: bool
         truth = facekit.vertices(rng.standard_normal(len(facekit.modes)))[order]
         head = _on_model(model, facekit, found, mesh, truth, order)
         began = time.perf_counter()
-        written = found.carrier.on(head, model.levels["full"].faces)
+        written = found.surface_binding.on(head, model.levels["full"].faces)
         applied += time.perf_counter() - began
         off.append(np.linalg.norm(written - truth, axis=1))
     apart = np.array(off)
-    skin = apart[:, found.carrier.skin]
+    skin = apart[:, found.surface_binding.skin]
     return {
         "median_mm": float(np.median(apart)),
         "worst_median_mm": float(np.median(apart, axis=1).max()),
@@ -115,15 +115,15 @@ def _on_model(
     """The draw on the model's vertices."""
     if model is facekit:
         return truth[np.argsort(order)]
-    rest, faces = found.carrier.rest, mesh.triangles()
-    bound, _, _ = attach(found.head, vertex_normals(found.head, model.levels["full"].faces), rest, faces)
+    rest, faces = found.surface_binding.rest, mesh.triangles()
+    bound, _, _ = bind_vertices(found.head, vertex_normals(found.head, model.levels["full"].faces), rest, faces)
     return bound.on(truth, faces)
 
 
 def _landmarks(model: HeadModel, facekit: HeadModel, found: Registration, order: Int[np.ndarray, " t"]) -> float:
     """Mean distance (mm) on the model's mean between its landmarks and where the mesh's own are put."""
     mean = model.vertices(np.zeros(0))
-    put = found.carrier.on(mean, model.levels["full"].faces)[np.argsort(order)]
+    put = found.surface_binding.on(mean, model.levels["full"].faces)[np.argsort(order)]
     pairs = [(model.landmarks[name], facekit.landmarks[name]) for name in MULTI_PIE]
     return float(np.mean([np.linalg.norm(mean[ours] - put[theirs]) for ours, theirs in pairs]))
 

@@ -49,7 +49,9 @@ def views(
     records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
     heads = random_subjects(CHOSEN_ON + subjects, seed=33)
     candidates = rig_from_directions(CANDIDATES_DEG)
-    information = [_told(span, head, candidates, report, i / len(heads)) for i, head in enumerate(heads[:CHOSEN_ON])]
+    information = [
+        _information(span, head, candidates, report, i / len(heads)) for i, head in enumerate(heads[:CHOSEN_ON])
+    ]
     chosen = a_optimal(information, VIEWS, prior(span))
     directions = [CANDIDATES_DEG[k] for k in chosen]
     rigs = {"planned": rig_from_directions(tuple(directions))}
@@ -85,7 +87,7 @@ def _outcome(rows: list[Row], names: tuple[str, ...], directions: list[tuple[int
     }
 
 
-def _told(
+def _information(
     model: HeadModel, head: Planted, rig: Rig, report: Callable[[str, float], None], done: float
 ) -> tuple[Information, Float[np.ndarray, "p p"]]:
     report(f"information of {len(rig)} views of {head.name}", done)

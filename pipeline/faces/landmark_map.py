@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline.array_cache import cached_arrays
 from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.eigenheads.correspondence.warp import landmark_warp
 from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.kept_arrays import kept_arrays
 from rig.errors import EigenheadError
 
 BUILT_IN = ("makehuman", "ict-facekit")
@@ -133,7 +133,7 @@ def _carried(model: HeadModel) -> Mapping[str, np.ndarray]:
         table["makehuman_rows"],
         table["makehuman_weights"],
     )
-    return kept_arrays("landmark-map", inputs, make, made_by=(SurfaceIndex, landmark_warp))
+    return cached_arrays("landmark-map", inputs, make, made_by=(SurfaceIndex, landmark_warp))
 
 
 @cache

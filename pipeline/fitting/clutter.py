@@ -14,7 +14,7 @@ OUTSIDE_SHARE = 0.3  # weight of a rim outside the face that sticks out: a model
 CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found: its border slides with the fit
 
 
-def held_inside(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
+def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
     """The rim where cranium, ears and neck only count as far as they stick out of the input."""
     face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)

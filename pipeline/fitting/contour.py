@@ -17,7 +17,7 @@ from pipeline.estimation.positive_definite import inverse
 from pipeline.estimation.terms import NormalEquations
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.head_problem import started_problem
-from pipeline.fitting.noise_model import is_bare, with_clutter_of_start, with_misfit
+from pipeline.fitting.noise_model import is_hairless, with_clutter_of_start, with_misfit
 from pipeline.fitting.problem import (
     FIRST_CORRELATION_PX,
     POSE,
@@ -42,7 +42,7 @@ NON_MONOTONE = 4  # costs that a step may climb back to
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solved:
+class ContourSolution:
     """A problem with its solution, from which others may go on."""
 
     problem: ContourProblem
@@ -50,7 +50,7 @@ class Solved:
     state: State
     stage: Stage  # the last one
     evaluations: int
-    stopped_because: str
+    termination_reason: str
     misfit_mm: Float[np.ndarray, " v0"] | None = None  # of ``Fit``
 
 
@@ -81,7 +81,7 @@ def solve_contour(
     features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
     landmarks: LandmarkObservations | None = None,
     report: Progress = lambda stage, fraction: None,
-) -> Solved:
+) -> ContourSolution:
     """``fit_contour`` without its covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
@@ -92,7 +92,7 @@ def solve_contour(
     state, used, reason = run_stage(problem, evidence, state, span, lambda f: report("fit", 0.2 + 0.2 * f))
     tried, more, _ = run_stage(problem, evidence, state, whole, lambda f: report("fit", 0.4 + 0.1 * f))
     spent += used + more
-    bare = is_bare(problem, evidence, tried, whole, state)
+    bare = is_hairless(problem, evidence, tried, whole, state)
     if bare:
         state, span = tried, whole
     evidence = with_misfit(problem, evidence, state, span)
@@ -104,7 +104,7 @@ def solve_contour(
         )
         spent += used
         evidence = with_misfit(problem, evidence, state, stage)
-    return Solved(problem, evidence, state, stage, spent, reason)
+    return ContourSolution(problem, evidence, state, stage, spent, reason)
 
 
 def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
@@ -139,7 +139,7 @@ def run_stage(
         seen = coarsened(evidence, scale) if scale > problem.settings.robust_px else evidence
         whole, at_start = started_problem(problem, seen, stage, max(scale, evidence.noise.floor_px), state)
         found = minimise(whole, state, limits, at_start=at_start)
-        state, reason = found.value, found.evidence.stopped_because
+        state, reason = found.value, found.evidence.termination_reason
         evaluations += found.evidence.evaluations
     return state, evaluations, reason
 
@@ -157,14 +157,14 @@ def coarse_unit(scale_px: float) -> float:
     return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
 
 
-def normal_equations(solved: Solved) -> NormalEquations:
+def normal_equations(solved: ContourSolution) -> NormalEquations:
     """Of the last stage, at the solution."""
     scale = max(solved.stage.scales_px[-1], solved.evidence.noise.floor_px)
     whole, there = started_problem(solved.problem, solved.evidence, solved.stage, scale, solved.state)
     return whole.equations(there)
 
 
-def finish(solved: Solved) -> Fit:
+def finish(solved: ContourSolution) -> Fit:
     """The fit with its Laplace covariance: the inverse of the last normal matrix, cameras marginalised."""
     problem, state, stage = solved.problem, solved.state, solved.stage
     kept = stage.modes + POSE
@@ -182,7 +182,7 @@ def finish(solved: Solved) -> Fit:
         coefficients=state.coefficients,
         world_from_head=state.world_from_head,
         evaluations=solved.evaluations,
-        stopped_because=solved.stopped_because,
+        termination_reason=solved.termination_reason,
         covariance=covariance,
         misfit_mm=solved.misfit_mm,
         used={name: bool((rim.view == k).any()) for k, name in enumerate(names)},

@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 
 from pipeline.estimation.bounded import least_within
 from pipeline.estimation.positive_definite import inverse_diagonal
-from pipeline.fitting.contour import Solved, normal_equations
-from pipeline.fitting.head_problem import apply_step, weight_room
+from pipeline.fitting.contour import ContourSolution, normal_equations
+from pipeline.fitting.head_problem import apply_step, weight_bounds
 from pipeline.fitting.prior_term import weight_slope
 
 ROUNDS = 6
@@ -23,7 +23,7 @@ NEUTRAL = 0.2  # sum of weights below which a head makes no face: neutral ones h
 VARIANCE_RANGE = (0.02, 4.0)
 
 
-def with_expression_evidence(solved: Solved, eigenheads: int) -> Solved:
+def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
     """The solution moved to where the estimated variances put it; a neutral one as it is.
 
     Args:
@@ -43,7 +43,7 @@ def with_expression_evidence(solved: Solved, eigenheads: int) -> Solved:
     gradient[weights] -= weight_slope(np.maximum(state.coefficients[weights], 0.0), median)
     groups = (diagonal[:eigenheads], diagonal[eigenheads : posed.start], diagonal[posed.stop :])
     variance, now, step = np.ones(count), state.coefficients, np.zeros(unknowns)
-    room = weight_room(state, posed, unknowns)
+    room = weight_bounds(state, posed, unknowns)
     for _ in range(ROUNDS):
         whole, slope = matrix.copy(), gradient.copy()
         whole[diagonal, diagonal] += 1.0 / variance

@@ -21,7 +21,7 @@ class Fit:
     coefficients: Float[np.ndarray, " m"]
     world_from_head: Similarity
     evaluations: int
-    stopped_because: str
+    termination_reason: str
     covariance: Float[np.ndarray, "p p"] | None = None
     misfit_mm: Float[np.ndarray, " v0"] | None = None  # by cage vertex: relief that no mode follows
     sliding_mm: float = 0.0  # standard deviation of a place along the surface, beyond what the covariance says

@@ -8,7 +8,7 @@ from pipeline.fitting.feature_term import FeatureTerm
 from pipeline.fitting.landmark_term import LandmarkTerm
 from pipeline.fitting.prior_term import PriorTerm
 from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State
-from pipeline.fitting.rim_term import RimAt, RimTerm
+from pipeline.fitting.rim_term import LinearisedRimTerm, RimTerm
 from pipeline.fitting.surface_term import SurfaceTerm
 from rig.geometry import Similarity, rotation_from_vector
 
@@ -31,11 +31,11 @@ def head_problem(
         terms,
         stage.modes + POSE + cameras,
         lambda state, step: apply_step(state, step, stage),
-        room=(lambda state: weight_room(state, posed, stage.modes + POSE + cameras)) if poses else None,
+        room=(lambda state: weight_bounds(state, posed, stage.modes + POSE + cameras)) if poses else None,
     )
 
 
-def weight_room(state: State, posed: range, unknowns: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+def weight_bounds(state: State, posed: range, unknowns: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Steps that keep the weights of expressions between 0 and 1."""
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]
@@ -52,7 +52,7 @@ def started_problem(
     whole = head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
     rim, *others = whole.terms
     assert isinstance(rim, RimTerm)
-    return whole, Sum((RimAt(rim, start, seen.rim), *(term.at(start) for term in others)))
+    return whole, Sum((LinearisedRimTerm(rim, start, seen.rim), *(term.at(start) for term in others)))
 
 
 def _other_terms(problem: ContourProblem, evidence: StageEvidence, stage: Stage) -> list[Term[State]]:

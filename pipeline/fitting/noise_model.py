@@ -74,7 +74,7 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
     return float(np.clip(BLOCK_PX * variance, *UNIT_RANGE))
 
 
-def is_bare(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
+def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
     """Does a fit to the whole head explain cranium and ears, and the face as well as ``from_face``, the fit to the face
     alone? An outline of hair is mostly no head's; where it is, that head has another face."""
     rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
@@ -86,9 +86,12 @@ def is_bare(problem: ContourProblem, evidence: StageEvidence, state: State, stag
         return False
     alone = observed_rim(problem, evidence, from_face, replace(stage, whole_head=False))
     face_alone = np.flatnonzero(region[alone.corner].all(axis=1))
-    return _spread(rim, face) < problem.settings.bare_loss * _spread(alone, face_alone) + BARE_SLACK_PX
+    return (
+        _robust_deviation_px(rim, face)
+        < problem.settings.bare_loss * _robust_deviation_px(alone, face_alone) + BARE_SLACK_PX
+    )
 
 
-def _spread(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:
+def _robust_deviation_px(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:
     """Robust standard deviation (px) of the residuals: hair on the forehead must not hide what the rest loses."""
     return 1.4826 * float(np.median(np.abs(rim.residual[chosen]))) if len(chosen) else 0.0

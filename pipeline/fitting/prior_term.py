@@ -41,12 +41,12 @@ class PriorTerm:
     problem: ContourProblem
     stage: Stage
 
-    def at(self, state: State) -> "PriorAt":
-        return PriorAt(self, state)
+    def at(self, state: State) -> "LinearisedPriorTerm":
+        return LinearisedPriorTerm(self, state)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PriorAt:
+class LinearisedPriorTerm:
     """The priors at one state."""
 
     term: PriorTerm

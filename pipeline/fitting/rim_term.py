@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32
 
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import NormalEquations
-from pipeline.fitting.clutter import held_inside, without_clutter
+from pipeline.fitting.clutter import downweight_outside_contour, without_clutter
 from pipeline.fitting.problem import PER_CAMERA, POSE, ContourProblem, Stage, StageEvidence, State, moved_views
 from pipeline.fitting.rim import Rim, find_rim
 from pipeline.fitting.rim_jacobian_kernels import Level, RimSamples, fill_rows
@@ -41,7 +41,7 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
     rim = find_rim(problem.topologies[stage.level], vertices, views, whole_head=whole, averaged=fine)
     rim = without_clutter(evidence, rim)
     if stage.contained and not stage.whole_head:
-        rim = held_inside(problem, evidence, rim, stage.level)
+        rim = downweight_outside_contour(problem, evidence, rim, stage.level)
     return rim
 
 
@@ -56,12 +56,12 @@ class RimTerm:
     scale_px: float
     reference_px: float | None = None
 
-    def at(self, state: State) -> "RimAt":
-        return RimAt(self, state, observed_rim(self.problem, self.evidence, state, self.stage))
+    def at(self, state: State) -> "LinearisedRimTerm":
+        return LinearisedRimTerm(self, state, observed_rim(self.problem, self.evidence, state, self.stage))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RimAt:
+class LinearisedRimTerm:
     """The rim's part of the cost at one state."""
 
     term: RimTerm

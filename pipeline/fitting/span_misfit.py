@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.contour import Solved, finish, run_stage
+from pipeline.fitting.contour import ContourSolution, finish, run_stage
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import cage_variance, with_estimated_prior
 from pipeline.fitting.problem import Stage, widened
@@ -19,7 +19,7 @@ from rig.mesh import vertex_normals
 LEVEL, STEPS = "p95", 4  # as the contour solver's own stage with more modes
 
 
-def with_span_misfit(solved: Solved, wider_model: HeadModel, *, relief_mm: float) -> Fit:
+def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
     """The fit of a solution, with the misfit of its span.
 
     Args:
@@ -32,7 +32,7 @@ def with_span_misfit(solved: Solved, wider_model: HeadModel, *, relief_mm: float
     last = solved.problem.settings.robust_px
     stage = Stage(LEVEL, len(wider_model.modes), True, (2.0 * last, last), solved.stage.whole_head, True, STEPS)
     state, evaluations, reason = run_stage(problem, solved.evidence, solved.state, stage, lambda fraction: None)
-    wider = finish(Solved(problem, solved.evidence, state, stage, evaluations, reason))
+    wider = finish(ContourSolution(problem, solved.evidence, state, stage, evaluations, reason))
     return judged_by(
         wider_model,
         with_estimated_prior(wider_model, wider, eigenheads, relief_mm=relief_mm),

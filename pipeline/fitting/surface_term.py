@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from pipeline.estimation.robust import GemanMcClure
-from pipeline.estimation.terms import NormalEquations, Quadratic, QuadraticAt
+from pipeline.estimation.terms import LinearisedQuadratic, NormalEquations, Quadratic
 from pipeline.fitting.problem import Stage, State, SurfaceObservations
 from rig.geometry import Similarity
 
@@ -48,13 +48,13 @@ class SurfaceTerm:
     seen: SurfaceObservations
     stage: Stage
 
-    def at(self, state: State) -> "SurfaceAt":
+    def at(self, state: State) -> "LinearisedSurfaceTerm":
         residual, points = surface_residual(self.seen, state.coefficients, state.world_from_head, state.camera_shift)
-        return SurfaceAt(self, state, residual, points)
+        return LinearisedSurfaceTerm(self, state, residual, points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SurfaceAt:
+class LinearisedSurfaceTerm:
     """The observations at one state: e (mm), and where the vertices are now (world)."""
 
     term: SurfaceTerm
@@ -67,7 +67,7 @@ class SurfaceAt:
         return self.term.seen.information * self.residual**2
 
     @property
-    def cameras(self) -> QuadraticAt:
+    def cameras(self) -> LinearisedQuadratic:
         """What the images say of the cameras alone."""
         seen = self.term.seen
         form = Quadratic(seen.camera_matrix, seen.camera_shift.ravel(), seen.camera_gradient)

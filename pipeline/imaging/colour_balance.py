@@ -48,14 +48,14 @@ def _solve(
         mean = (weights * corrected).sum(axis=0) / total
         scale = RELATIVE * mean + ABSOLUTE
         robust = weights / (1 + ((corrected - mean) / scale) ** 2) / scale**2
-        gain, offset = _step(values, robust, gain, offset)
+        gain, offset = _gauss_newton_step(values, robust, gain, offset)
         # The scale of all gains is free, and least squares would shrink it: hold their product at one.
         level = np.exp(np.log(gain[seen]).mean()) if seen.any() else 1.0
         gain, offset = gain / level, offset / level
     return gain, offset
 
 
-def _step(
+def _gauss_newton_step(
     values: Float[np.ndarray, "k n"],
     weights: Float[np.ndarray, "k n"],
     gain: Float[np.ndarray, " k"],

@@ -22,8 +22,8 @@ from pipeline.multiview.tangency import (
     LEAST_SLOPE,
     LONGEST_SPAN,
     angle_slopes,
+    epipolar_plane_axes,
     outer_hull,
-    pencil,
     rays_about,
 )
 from rig.camera import Camera
@@ -96,8 +96,8 @@ def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, flo
     seen = with_masks(silhouettes, rig)
     if len(seen) < CAMERAS_LEAST:
         return dict.fromkeys(seen.names, CUT_OFF_MISFIT)
-    misses = own_misses([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
-    return dict(zip(seen.names, mean_misfit(misses, CUT_OFF_MISFIT).tolist(), strict=True))
+    errors_px = tangency_errors_px([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
+    return dict(zip(seen.names, mean_misfit(errors_px, CUT_OFF_MISFIT).tolist(), strict=True))
 
 
 def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
@@ -138,10 +138,10 @@ def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
 
 def _any_suspect(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> bool:
     """Whether any camera's planes contradict the others more than good masks do."""
-    return bool((mean_misfit(own_misses(hulls, rig)) > SUSPECT_MISFIT).any())
+    return bool((mean_misfit(tangency_errors_px(hulls, rig)) > SUSPECT_MISFIT).any())
 
 
-def own_misses(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
+def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
     """Misses (px of both images together) while every camera holds the picture that is filed under it."""
     cameras = list(rig)
     touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
@@ -154,11 +154,11 @@ def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Flo
     return np.divide(gap, step, out=np.full(gap.shape, np.nan), where=step > LEAST_SLOPE)
 
 
-def mean_misfit(misses: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
+def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
     """Robust misfit of each camera, the mean of its planes; of those that the border hides ``cut_off``, or nothing."""
-    there = np.isfinite(misses)
-    of_each = np.where(there, _robust(misses, ROBUST_SIGMAS * _noise_px(misses[there])), cut_off or 0.0)
-    count = there.sum(axis=(1, 2)) if cut_off is None else 2 * (len(misses) - 1)
+    there = np.isfinite(errors_px)
+    of_each = np.where(there, _robust(errors_px, ROBUST_SIGMAS * _noise_px(errors_px[there])), cut_off or 0.0)
+    count = there.sum(axis=(1, 2)) if cut_off is None else 2 * (len(errors_px) - 1)
     return (of_each.sum(axis=(1, 2)) - (0 if cut_off is None else 2 * cut_off)) / np.maximum(count, 1)
 
 
@@ -177,9 +177,9 @@ def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"],
     return Assignment(pictures, gain, gain >= REPAIRED_GAIN)
 
 
-def _noise_px(misses: Float[np.ndarray, " n"]) -> float:
+def _noise_px(errors_px: Float[np.ndarray, " n"]) -> float:
     """Standard deviation (px) of a plane's miss by the best quarter: half of them may be of exchanged pictures."""
-    quarter = float(np.quantile(np.abs(misses), 0.25)) if len(misses) else 0.0
+    quarter = float(np.quantile(np.abs(errors_px), 0.25)) if len(errors_px) else 0.0
     return float(np.clip(quarter / 0.3186, NOISE_LEAST_PX, NOISE_MOST_PX))
 
 
@@ -198,8 +198,8 @@ def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float
     for i, camera in enumerate(cameras):
         held = [a for a in range(count) if _size(cameras[a]) == _size(camera)]
         angle[i, held], step[i, held] = _touches(camera, [hulls[a] for a in held], i, cameras)
-    misses = own_misses(hulls, rig)
-    scale = ROBUST_SIGMAS * _noise_px(misses[np.isfinite(misses)])
+    errors_px = tangency_errors_px(hulls, rig)
+    scale = ROBUST_SIGMAS * _noise_px(errors_px[np.isfinite(errors_px)])
     misfit = np.zeros((count,) * 4, np.float32)
     for i, j in permutations(range(count), 2):
         gap = angle[i, :, j, None, :] - angle[j, None, :, i, :]
@@ -236,9 +236,9 @@ def _touches(
 
 
 def _pencil(cameras: Sequence[Camera], i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """``pencil`` of two cameras from where both look; the same for (i, j) and (j, i)."""
+    """``epipolar_plane_axes`` of two cameras from where both look; the same for (i, j) and (j, i)."""
     one, two = cameras[min(i, j)], cameras[max(i, j)]
-    return pencil(one, two, one.axis_world + two.axis_world)
+    return epipolar_plane_axes(one, two, one.axis_world + two.axis_world)
 
 
 def _size(camera: Camera) -> tuple[int, int]:

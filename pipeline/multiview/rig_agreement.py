@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, own_misses, with_masks
+from pipeline.multiview.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
 from pipeline.multiview.tangency import outer_hull
 from rig.camera import Intrinsics
 from rig.messages.message import Message, compose
@@ -54,8 +54,8 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
     if not _median_misfit(hulls, seen) >= WRONG_LEAST:
         return None
     square = all(camera.intrinsics.width == camera.intrinsics.height for camera in seen)
-    readings = (*_READINGS, *(_SQUARE_READINGS if square else ()))
-    found = [(_median_misfit(_read(hulls, seen, turn), seen), message) for message, turn in readings]
+    conventions = (*_CONVENTIONS, *(_SQUARE_CONVENTIONS if square else ()))
+    found = [(_median_misfit(_read(hulls, seen, turn), seen), message) for message, turn in conventions]
     for other, read, remedy in alternative_conventions(seen):
         message = compose("other-convention", convention=other, remedy=remedy)
         found.append((_median_misfit(hulls, read), message))
@@ -79,28 +79,28 @@ def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | N
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MISPLACED_AMONG:
         return None
-    misses = own_misses([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
-    misfit, planes = mean_misfit(misses), np.isfinite(misses).sum(axis=(1, 2))
+    errors_px = tangency_errors_px([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
+    misfit, planes = mean_misfit(errors_px), np.isfinite(errors_px).sum(axis=(1, 2))
     worst = int(np.argmax(misfit))
     if misfit[worst] < MISPLACED_LEAST or planes[worst] < PLANES_LEAST:
         return None
     others = np.delete(np.arange(len(seen)), worst)
-    agree = mean_misfit(misses[np.ix_(others, others)]).max() <= FITTING_MISFIT
+    agree = mean_misfit(errors_px[np.ix_(others, others)]).max() <= FITTING_MISFIT
     return seen.names[worst] if agree else None
 
 
 def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
     """Median over the cameras of the mean robust misfit of their planes (0 to 1); NaN where too few planes speak."""
-    misses = own_misses(hulls, rig)
-    speaking = np.isfinite(misses).sum(axis=(1, 2)) >= PLANES_LEAST
-    return float(np.median(mean_misfit(misses)[speaking])) if speaking.sum() >= CAMERAS_LEAST else np.nan
+    errors_px = tangency_errors_px(hulls, rig)
+    speaking = np.isfinite(errors_px).sum(axis=(1, 2)) >= PLANES_LEAST
+    return float(np.median(mean_misfit(errors_px)[speaking])) if speaking.sum() >= CAMERAS_LEAST else np.nan
 
 
 def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
     """Whether so many planes meet closely as they do in the rig that took the pictures alone, whatever the masks."""
-    misses = own_misses(hulls, rig)
+    errors_px = tangency_errors_px(hulls, rig)
     widths = np.array([camera.intrinsics.width for camera in rig], float)
-    shares = np.abs(misses) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
+    shares = np.abs(errors_px) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
     quarter, half = np.nanquantile(shares, (0.25, 0.5))
     return bool(quarter <= LOOSE_QUARTER or quarter <= min(LOOSE_BIMODAL * half, LOOSE_QUARTER_MOST))
 
@@ -135,13 +135,13 @@ def _turned_on(pixels: Pixels, k: Intrinsics) -> Pixels:
     return np.stack([pixels[:, 1], k.width - 1.0 - pixels[:, 0]], axis=1)
 
 
-_READINGS: tuple[tuple[Message, Turn], ...] = (
+_CONVENTIONS: tuple[tuple[Message, Turn], ...] = (
     (compose("rig-mirrored"), _mirrored_across),
     (compose("rig-mirrored"), _mirrored_down),
     (compose("pictures-flipped"), _flipped_across),
     (compose("pictures-turned", turn=compose("turn-180")), _turned_round),
 )
-_SQUARE_READINGS: tuple[tuple[Message, Turn], ...] = (
+_SQUARE_CONVENTIONS: tuple[tuple[Message, Turn], ...] = (
     (compose("pictures-turned", turn=compose("turn-90-anticlockwise")), _turned_back),
     (compose("pictures-turned", turn=compose("turn-90-clockwise")), _turned_on),
 )

@@ -93,7 +93,7 @@ def on_contour(pixels: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, "h 
 
 
 def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[Tangency]:
-    u, v = pencil(one, two, first.rays.mean(axis=0) + second.rays.mean(axis=0))
+    u, v = epipolar_plane_axes(one, two, first.rays.mean(axis=0) + second.rays.mean(axis=0))
     angles = [np.arctan2(outline.rays @ v, outline.rays @ u) for outline in (first, second)]
     if max(np.ptp(angle) for angle in angles) > LONGEST_SPAN:
         return []
@@ -112,7 +112,7 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
     return found
 
 
-def pencil(
+def epipolar_plane_axes(
     one: Camera, two: Camera, towards: Float[np.ndarray, " 3"]
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
     """Two unit vectors (world) across the line through both centres: its planes are told apart by their angle

@@ -114,7 +114,7 @@ def _field(
     active = np.zeros((blocks,) * 3, bool)
     for offset in np.ndindex(2, 2, 2):
         active |= near[tuple(slice(o, o + blocks) for o in offset)]
-    fine = _spread(coarse)
+    fine = _nearest_coarse(coarse)
     votes = np.zeros(fine.shape, np.int32)
     exact = np.full(fine.shape, -np.inf, np.float32)
     step = wide / COARSE
@@ -129,7 +129,7 @@ def _field(
     return fine, step
 
 
-def _spread(coarse: Float32[np.ndarray, "b b b"]) -> Float32[np.ndarray, "n n n"]:
+def _nearest_coarse(coarse: Float32[np.ndarray, "b b b"]) -> Float32[np.ndarray, "n n n"]:
     """The nearest coarse value at every fine point: only its sign is used."""
     index = np.arange(COARSE * (coarse.shape[0] - 1) + 1) // COARSE
     return coarse[np.ix_(index, index, index)]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from pipeline.dense.part_votes import PART_NAMES
 from pipeline.evidence.camera_metrics import CameraFigures
-from pipeline.evidence.expression import Found, Posable
+from pipeline.evidence.expression import BlendshapeRig, Found
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.subject import SubjectFaces
@@ -70,7 +70,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "pictures": dict(result.views.assignment),
         "coefficients": _shape_coefficients(head),
         "expression": [_expression(found) for found in evidence.expression],
-        "morphs": None if evidence.posable is None else _morphs(evidence.posable),
+        "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
         "template": None if template is None else _template(template),
         "world_from_head": similarity_document(head.fit.world_from_head),
         "landmarks": {
@@ -85,7 +85,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "texture": _texture(result.texturing),
         "bust": None if result.bust is None else _bust(result.bust),
         "evaluations": head.fit.evaluations,
-        "stopped_because": head.fit.stopped_because,
+        "stopped_because": head.fit.termination_reason,
         "seconds": {"total": sum(result.seconds.values())} | dict(result.seconds),
         "settings": document_from_settings(result.settings),
         "inputs": dict(result.digests),
@@ -157,9 +157,9 @@ def _expression(found: Found) -> ExpressionReport:
     return {"name": found.name, "words": found.words, "weight": found.weight, "std": _finite(found.std)}
 
 
-def _morphs(posable: Posable) -> MorphsReport:
-    used = {name: weight for name, weight in posable.weights.items() if weight}
-    return {"weights": used, "without_counterpart": list(posable.missing)}
+def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
+    used = {name: weight for name, weight in blendshape_rig.weights.items() if weight}
+    return {"weights": used, "without_counterpart": list(blendshape_rig.missing)}
 
 
 def _template(template: TemplateHeader) -> TemplateReport:

@@ -19,14 +19,14 @@ def template_picture(template: Template, found: Registration, model: HeadModel) 
     the skin about it; green: moves as a whole), the mesh on the model's mean head, and that head."""
     faces, triangles = model.levels["full"].faces, template.mesh.triangles()
     mean = model.vertices(np.zeros(0))
-    kinds = np.tile(np.array(DEEP), (len(found.carrier.rest), 1))
-    kinds[found.carrier.skin] = SKIN
-    kinds[found.carrier.wholes >= 0] = WHOLE
+    kinds = np.tile(np.array(DEEP), (len(found.surface_binding.rest), 1))
+    kinds[found.surface_binding.skin] = SKIN
+    kinds[found.surface_binding.wholes >= 0] = WHOLE
     panels = (
         ("as it came", Mesh(found.placed, triangles), None),
         ("the model like it", Mesh(found.head, faces), None),
-        ("registered", Mesh(found.carrier.rest, triangles), kinds.astype(np.uint8)),
-        ("on the mean head", Mesh(found.carrier.on(mean, faces), triangles), None),
+        ("registered", Mesh(found.surface_binding.rest, triangles), kinds.astype(np.uint8)),
+        ("on the mean head", Mesh(found.surface_binding.on(mean, faces), triangles), None),
         ("the mean head", Mesh(mean, faces), None),
     )
     low = np.min([mesh.vertices.min(axis=0) for _, mesh, _ in panels[1:2]] + [mean.min(axis=0)], axis=0)

@@ -42,12 +42,12 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
     """Writes every file of the result of ``capture``, as it was read, and in the order of ``template``; each under a
     temporary name first. Raises OSError where the disk is full."""
     capture = reassign_images(capture, pictures=result.views.assignment)
-    head, posable = head_mesh(result), result.evidence.posable
+    head, blendshape_rig = head_mesh(result), result.evidence.blendshape_rig
     with ThreadPoolExecutor(max_workers=THREADS) as pool:
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
-            *([] if posable is None else [pool.submit(write_expression, folder, result, posable)]),
+            *([] if blendshape_rig is None else [pool.submit(write_expression, folder, result, blendshape_rig)]),
             *([] if template is None else [pool.submit(write_template, folder, result, template)]),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.evidence.expression import Posable
+from pipeline.evidence.expression import BlendshapeRig
 from pipeline.results.reconstruction import Reconstruction
 from rig.atomic_write import write_atomically
 from rig.formats.glb import glb_bytes
@@ -13,18 +13,18 @@ from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
 
-def write_expression(folder: Path, result: Reconstruction, posable: Posable) -> None:
+def write_expression(folder: Path, result: Reconstruction, blendshape_rig: BlendshapeRig) -> None:
     """The files that the settings ask for; colours are the photographed head's, vertex by vertex."""
     place, outputs = result.head.fit.world_from_head, result.settings.outputs
     head_from_world = RigidTransform(place.rotation, place.translation).inverse()
     neutral = Mesh(
-        head_from_world.apply(posable.neutral_world.vertices),
-        posable.neutral_world.faces,
+        head_from_world.apply(blendshape_rig.neutral_world.vertices),
+        blendshape_rig.neutral_world.faces,
         result.texturing.vertices.colours,
     )
     glb = glb_bytes(neutral, normals=neutral.normals(), colours=np.asarray(result.texturing.vertices.colours))
     if outputs.neutral:
         write_atomically(folder / "neutral.glb", glb)
     if outputs.morphs:
-        morphed = with_morphs(glb, neutral.vertices, neutral.faces, posable.morphs, posable.weights)
+        morphed = with_morphs(glb, neutral.vertices, neutral.faces, blendshape_rig.morphs, blendshape_rig.weights)
         write_atomically(folder / "posed.glb", morphed)

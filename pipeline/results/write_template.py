@@ -26,10 +26,12 @@ SKIN_SHARE = 0.1  # of a material's polygons on the skin, beyond which it shows 
 
 def write_template(folder: Path, result: Reconstruction, template: Template) -> None:
     """Writes the files. Raises OSError."""
-    head, carrier, name = result.mesh_world, template.carrier, f"head-{template.name}"
-    vertices = carrier.on(head.vertices, head.faces)
+    head, surface_binding, name = result.mesh_world, template.surface_binding, f"head-{template.name}"
+    vertices = surface_binding.on(head.vertices, head.faces)
     textures = (
-        {} if result.texturing.atlas is None else template_textures(result.texturing.atlas, template.mesh, carrier)
+        {}
+        if result.texturing.atlas is None
+        else template_textures(result.texturing.atlas, template.mesh, surface_binding)
     )
     suffix, _, options = ENCODINGS["png" if result.settings.outputs.image == "png" else "jpeg"]
     files = {tile: f"{name}{_tile_suffix(tile)}{suffix}" for tile in textures}
@@ -62,10 +64,10 @@ def _tile_suffix(tile: Tile) -> str:
 
 
 def _colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
-    attached = template.carrier.attachment
+    attached = template.surface_binding.attachment
     corners = result.texturing.vertices.colours[result.mesh_world.faces[attached.triangles]].astype(float)
-    out = np.full((len(template.carrier.rest), 3), NO_SKIN, np.uint8)
-    out[template.carrier.skin] = np.clip(np.rint(np.einsum("nk,nkc->nc", attached.weights, corners)), 0, 255)
+    out = np.full((len(template.surface_binding.rest), 3), NO_SKIN, np.uint8)
+    out[template.surface_binding.skin] = np.clip(np.rint(np.einsum("nk,nkc->nc", attached.weights, corners)), 0, 255)
     return out
 
 
@@ -73,7 +75,7 @@ def _materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh,
     """The mesh with a material wherever its file had one, or one in all where it had none; and the library: materials
     of the skin show the image of the tile in which they lie."""
     mesh = template.mesh
-    tiles, skin = corner_tiles(mesh), skin_polygons(mesh, template.carrier)
+    tiles, skin = corner_tiles(mesh), skin_polygons(mesh, template.surface_binding)
     used = [(before, line.partition(" ")[2]) for before, line in mesh.statements if line.startswith("usemtl ")]
     if not used or used[0][0] > 0:
         used.insert(0, (0, MATERIAL))

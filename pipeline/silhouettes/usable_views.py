@@ -14,7 +14,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_drift import find_drift
 from pipeline.multiview.head_size import judge_head_size
 from pipeline.multiview.rig_agreement import misplaced_camera
-from pipeline.silhouettes.own_pictures import own_pictures
+from pipeline.silhouettes.image_assignment import assign_images
 from rig.capture import Capture
 from rig.errors import EigenheadError
 from rig.messages.message import compose
@@ -71,11 +71,11 @@ def usable_views(
         exchanged: what to do about an exchange of pictures that is beyond doubt.
 
     Raises:
-        ExchangedPictures, WrongRig: of ``own_pictures``.
+        ExchangedPictures, WrongRig: of ``assign_images``.
         WrongScale: of ``judge_head_size``.
         TooFewViews: fewer than ``VIEWS_LEAST`` silhouettes are of use.
     """
-    assigned = own_pictures(capture, rig, segmented, exchanged=exchanged)
+    assigned = assign_images(capture, rig, segmented, exchanged=exchanged)
     if sum(silhouette.quality.usable for silhouette in assigned.silhouettes.values()) < VIEWS_LEAST:
         raise TooFewViews(assigned.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(assigned.silhouettes, rig)

@@ -11,10 +11,10 @@ from pipeline.evidence.camera_metrics import CameraFigures, camera_figures, star
 from pipeline.evidence.expression import (
     LEAST_SIGMA,
     READ_SIGMA,
+    BlendshapeRig,
     Found,
-    Posable,
+    build_blendshape_rig,
     found_expressions,
-    posable_head,
     shut_eyes,
 )
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
@@ -24,7 +24,7 @@ from pipeline.fitting.expression_evidence import makes_face
 from pipeline.fitting.fine.blink import blinks_of, with_lids
 from pipeline.fitting.fine.expression_reading import with_read_expression
 from pipeline.fitting.fine.eyelids import MAX_CLOSED_OPENING, MIN_HALF_OPENING
-from pipeline.fitting.fine.refine import Displaced
+from pipeline.fitting.fine.refine import DeformedSurface
 from pipeline.fitting.fit import Fit
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
@@ -50,7 +50,7 @@ class Evidence:
     landmarks: Mapping[str, Landmark]  # world frame
     measurements: Mapping[str, Measurement]
     expression: tuple[Found, ...]  # the face that the head makes, the strongest part first
-    posable: Posable | None  # where the settings ask for it
+    blendshape_rig: BlendshapeRig | None  # where the settings ask for it
 
 
 @stage("evidence")
@@ -86,7 +86,7 @@ def judge_head(
         landmarks(model, fit, refined.mesh_world.vertices),
         measurements(model, fit, refined.mesh_world.vertices),
         expression,
-        posable_head(model, fit.world_from_head, refined.mesh_world, expression) if posed else None,
+        build_blendshape_rig(model, fit.world_from_head, refined.mesh_world, expression) if posed else None,
     )
     warnings = plausibility_warnings(fit, model, cameras, widths_px)
     pixels_mm = {camera.name: pixel_mm(camera, fit.world_from_head.translation) for camera in rig}
@@ -98,7 +98,7 @@ def judge_head(
     return Staged(evidence, [*warnings, *eye_warnings(closed_eyes)])
 
 
-def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced: Displaced) -> tuple[Fit, float]:
+def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced: DeformedSurface) -> tuple[Fit, float]:
     """Returns the fit with the expression that the deformed head makes, and of how many deviations a weight must be.
 
     The surface is read where the fit found a made face at all; lids wherever points about the eye decided them.

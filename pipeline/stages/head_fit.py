@@ -9,7 +9,7 @@ from pipeline.dense.highlights import without_highlights
 from pipeline.diagnostics import Detail
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.model_basis import basis_of, model_basis
-from pipeline.fitting.contour import Solved, finish, solve_contour
+from pipeline.fitting.contour import ContourSolution, finish, solve_contour
 from pipeline.fitting.expression_evidence import with_expression_evidence
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.refine import refine_with_photographs
@@ -30,7 +30,7 @@ from rig.messages.message import compose
 class OutlineFit:
     """A head fitted to the outlines alone: the simplex's fit, or the contour solver's state, from which it goes on."""
 
-    solution: Solved | Fit
+    solution: ContourSolution | Fit
     model: HeadModel  # with the modes that the solution has
     mesh_world: Mesh
 

@@ -7,9 +7,9 @@ from jaxtyping import Float
 
 from pipeline.diagnostics import Detail
 from pipeline.fitting.fine.depth_bias import without_window_bias
-from pipeline.fitting.fine.eyelids import look_at_eyes
+from pipeline.fitting.fine.eyelids import measure_eye_appearance
 from pipeline.fitting.fine.patch_points import patch_search
-from pipeline.fitting.fine.refine import Displaced, refine_to_surface
+from pipeline.fitting.fine.refine import DeformedSurface, refine_to_surface
 from pipeline.fitting.posterior import vertex_deviation_mm
 from pipeline.fitting.untangling import untangled_head
 from pipeline.stages.context import ReconstructionContext
@@ -33,7 +33,7 @@ class RefinedHead:
     mesh_world: Mesh  # full level, mm
     deviation_mm: Float[np.ndarray, " v"]
     detail: Detail
-    displaced: Displaced | None = None
+    displaced: DeformedSurface | None = None
 
 
 @stage("fine")
@@ -54,7 +54,7 @@ def refine_head(
         settings.fine,
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,
-        eyes=look_at_eyes(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
+        eyes=measure_eye_appearance(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
         patches=patch_search(model, fit, depth.images, distances, hair, context.rig, settings.photo),
         report=context.progress,
     )

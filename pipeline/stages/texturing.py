@@ -12,8 +12,8 @@ from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
+from pipeline.texture.albedo import DIM_SHARE, Albedo, estimate_albedo
 from pipeline.texture.chart_colours import ChartColours, chart_colours, with_true_colours
-from pipeline.texture.delight import DIM_SHARE, Albedo, delight
 from pipeline.texture.head_texture import find_layout, paint_head
 from pipeline.texture.reduced_layout import ReducedLayout, reduced_layout
 from pipeline.texture.uv_unwrap import Atlas
@@ -61,6 +61,6 @@ def texture_head(
     reduced = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo, albedo_warnings = None, []
     if settings.outputs.delit:
-        albedo, albedo_warnings = delight(mesh, normals, vertices, atlas, face, around, chart)
+        albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart)
     warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings)
     return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo), warnings)

@@ -37,7 +37,7 @@ class Attachment:
         return np.einsum("nk,nkx->nx", self.weights, corners) + off
 
 
-def attach(
+def bind_vertices(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     vertices: Float[np.ndarray, "v 3"],
@@ -61,7 +61,7 @@ def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Carrier:
+class SurfaceBinding:
     """All vertices of a mesh as a model's surface carries them. Rows are the mesh's vertices."""
 
     rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
@@ -85,12 +85,12 @@ class Carrier:
         return out
 
 
-def carrier(
+def surface_binding(
     rest: Float[np.ndarray, "t 3"],
     skin: Int[np.ndarray, " n"],
     attachment: Attachment,
     wholes: Int[np.ndarray, " t"],
-) -> Carrier:
+) -> SurfaceBinding:
     """A Carrier with its anchors chosen: the skin nearest to what lies deeper, and some of all of it."""
     tree = KDTree(rest[skin])
     deep = wholes < 0
@@ -101,7 +101,7 @@ def carrier(
     count = int(wholes.max(initial=-1)) + 1
     wanted = min(WHOLE_ANCHORS, len(skin))
     leads = [skin[_nearest(tree, rest[wholes == number], wanted)] for number in range(count)]
-    return Carrier(
+    return SurfaceBinding(
         rest=rest,
         skin=skin,
         attachment=attachment,

@@ -61,7 +61,7 @@ class Likeness:
     deviation: float  # root mean square of the eigenheads' coefficients, standard deviations
 
 
-def likeness(
+def fit_model_to_mesh(
     model: HeadModel, mesh: Surface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] = MappingProxyType({})
 ) -> Likeness:
     """The model fitted to a mesh that lies about where the model does (mm), and to landmarks of the mesh."""
@@ -86,7 +86,7 @@ def likeness(
             )
             met = np.concatenate([met, np.repeat(marks, 3, axis=0)])
             planes = np.concatenate([planes, np.tile(np.eye(3), (len(marked), 1))])  # a landmark is three planes
-            z, place = _step(modes[:, :, :active], head[every], met, planes, information, z, place)
+            z, place = _gauss_newton_step(modes[:, :, :active], head[every], met, planes, information, z, place)
     head = place.apply(wide.vertices(z))
     normals = vertex_normals(head, full.faces)[rows]
     _, _, off, weight = target.meet(head[rows], normals, replace(STAGES[-1], reach_mm=MET_MM))
@@ -138,7 +138,7 @@ class _Mesh:
         return hits.points - BULGE * bulge, planes
 
 
-def _step(
+def _gauss_newton_step(
     modes: Float[np.ndarray, "s 3 m"],
     points: Float[np.ndarray, "s 3"],
     met: Float[np.ndarray, "s 3"],

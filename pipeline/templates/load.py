@@ -39,7 +39,7 @@ def make_template(
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     found = register(mesh, model, name=path.name, landmarks=landmarks, report=report)
-    kept = PolygonMesh(found.carrier.rest, mesh.sizes, mesh.corners, mesh.uv, mesh.corner_uv, mesh.statements)
+    kept = PolygonMesh(found.surface_binding.rest, mesh.sizes, mesh.corners, mesh.uv, mesh.corner_uv, mesh.statements)
     template = Template(
         name=name,
         source=path.name,
@@ -47,7 +47,7 @@ def make_template(
         model_name=model.name,
         model_sha256=model.sha256,
         mesh=kept,
-        carrier=found.carrier,
+        surface_binding=found.surface_binding,
         figures=found.figures(),
     )
     return template, found

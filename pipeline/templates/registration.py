@@ -1,7 +1,7 @@
 """A foreign mesh registered to a head model, once (section 3.2, the other way round).
 
-The model is made as like the mesh as it can be (``likeness``), then the mesh's skin is drawn onto that head by the
-non-rigid refinement of ``correspondence``: what the two differ in is not carried on to results. Every vertex of the
+The model is made as like the mesh as it can be (``fit_model_to_mesh``), then the mesh's skin is drawn onto that head by
+the non-rigid refinement of ``correspondence``: what the two differ in is not carried on to results. Every vertex of the
 skin then has its place on the model's surface, everything deeper follows (``carrying``).
 """
 
@@ -19,8 +19,8 @@ from pipeline.eigenheads.correspondence.warp import landmark_warp
 from pipeline.eigenheads.gaussian_process import spread_nodes
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.subdivision import vertex_areas
-from pipeline.templates.carrying import Attachment, Carrier, attach, carrier
-from pipeline.templates.likeness import CANDIDATES, Likeness, likeness
+from pipeline.templates.carrying import Attachment, SurfaceBinding, bind_vertices, surface_binding
+from pipeline.templates.likeness import CANDIDATES, Likeness, fit_model_to_mesh
 from pipeline.templates.placement import Surface, find_place, outward, place_by_landmarks
 from rig.errors import InputError
 from rig.formats.polygon_obj import PolygonMesh
@@ -53,7 +53,7 @@ class NotRegistered(InputError):
 class Registration:
     """A mesh on a model's surface, and how well it lies there."""
 
-    carrier: Carrier
+    surface_binding: SurfaceBinding
     place: Similarity  # head_from_template, from the start
     placed: Float[np.ndarray, "t 3"]  # the mesh there, in its own shape, mm
     head: Float[np.ndarray, "v 3"]  # the model as like it as it can be, full level, mm
@@ -64,8 +64,8 @@ class Registration:
     def figures(self) -> dict[str, float]:
         """What is printed of it."""
         return {
-            "vertices": float(len(self.carrier.rest)),
-            "skin_share": len(self.carrier.skin) / len(self.carrier.rest),
+            "vertices": float(len(self.surface_binding.rest)),
+            "skin_share": len(self.surface_binding.skin) / len(self.surface_binding.rest),
             "off_median_mm": float(np.median(self.off_mm)),
             "off_p95_mm": float(np.percentile(self.off_mm, 95)),
             "unlike_median_mm": float(np.median(self.unlike_mm)),
@@ -94,13 +94,13 @@ def register(
     skin = skin_parts(welded, parts, _head(model, model.vertices(np.zeros(0))))
     report("likeness", 0.2)
     marks = {mark: place.apply(point) for mark, point in (landmarks or {}).items() if mark in model.landmarks}
-    like = likeness(model, welded, marks)
+    like = fit_model_to_mesh(model, welded, marks)
     covered = _check(like, name, marked=bool(landmarks))
     head, faces = _head(model, like.vertices), model.levels["full"].faces
     report("drawing", 0.7)
     pairs = {mark: (point, head.vertices[model.landmarks[mark]]) for mark, point in marks.items()}
     rest = _drawn(welded, skin[parts], head, list(pairs.values()))
-    attachment, off, facing = attach(rest, vertex_normals(rest, welded.faces), head.vertices, faces)
+    attachment, off, facing = bind_vertices(rest, vertex_normals(rest, welded.faces), head.vertices, faces)
     on_skin = skin[parts] & (off < OFF_MM) & (facing > FACING) & _used(welded)
     on_skin &= ~parting(attachment, rest, on_skin, welded.faces, model)
     on_skin = without_specks(without_edge(on_skin, welded.faces), welded.faces)
@@ -108,7 +108,7 @@ def register(
         raise NotRegistered(name, [compose("template-off-skin")])
     rest = _followed(welded.vertices, rest, on_skin)
     rows = np.flatnonzero(on_skin[joined])
-    carried = carrier(
+    carried = surface_binding(
         rest[joined], rows, _rows_of(attachment, joined[rows]), balls(welded, parts, ~skin)[joined]
     )  # fmt: skip
     unlike = SurfaceIndex(head.vertices, faces).closest(placed.vertices[rows], CANDIDATES).distances

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.templates.carrying import Attachment, Carrier
+from pipeline.templates.carrying import Attachment, SurfaceBinding
 from pipeline.templates.header import DAMAGE, FORMAT, WORDS, BadTemplate, TemplateHeader, header_words, read_meta
 from rig.atomic_write import write_atomically
 from rig.formats.polygon_obj import PolygonMesh
@@ -22,10 +22,10 @@ CARRIER = {"rest": "f", "skin": "i", "anchors": "i", "wholes": "i", "whole_ancho
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Template(TemplateHeader):
-    """A mesh registered to a head model. ``mesh.vertices`` is ``carrier.rest``."""
+    """A mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``."""
 
     mesh: PolygonMesh
-    carrier: Carrier
+    surface_binding: SurfaceBinding
 
 
 def save_template(path: Path, template: Template) -> None:
@@ -37,7 +37,11 @@ def save_template(path: Path, template: Template) -> None:
         "figures": dict(template.figures),
     }
     arrays: dict[str, Any] = {"meta": np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8)}
-    parts = ((template.mesh, MESH), (template.carrier.attachment, ATTACHMENT), (template.carrier, CARRIER))
+    parts = (
+        (template.mesh, MESH),
+        (template.surface_binding.attachment, ATTACHMENT),
+        (template.surface_binding, CARRIER),
+    )
     for part, kinds in parts:
         arrays |= {name: np.asarray(getattr(part, name), _stored(kind)) for name, kind in kinds.items()}
     packed = io.BytesIO()
@@ -70,7 +74,7 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray]) -> Template:
     mesh = PolygonMesh(
         arrays["rest"], arrays["sizes"], arrays["corners"], arrays["uv"], arrays["corner_uv"], statements
     )
-    carrier = Carrier(
+    surface_binding = SurfaceBinding(
         rest=arrays["rest"],
         skin=arrays["skin"],
         attachment=Attachment(*(arrays[name] for name in ATTACHMENT)),
@@ -78,19 +82,23 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray]) -> Template:
         wholes=arrays["wholes"],
         whole_anchors=arrays["whole_anchors"],
     )
-    return Template(**header_words(meta), mesh=mesh, carrier=carrier, figures=meta["figures"])
+    return Template(**header_words(meta), mesh=mesh, surface_binding=surface_binding, figures=meta["figures"])
 
 
 def _check(path: Path, template: Template) -> None:
     """Rows that lie outside what they index would fail a job at its end."""
-    mesh, carrier = template.mesh, template.carrier
-    count = len(carrier.rest)
-    rows = (mesh.corners, carrier.skin, carrier.anchors, carrier.whole_anchors)
+    mesh, surface_binding = template.mesh, template.surface_binding
+    count = len(surface_binding.rest)
+    rows = (mesh.corners, surface_binding.skin, surface_binding.anchors, surface_binding.whole_anchors)
     if any(part.size and (part.min() < 0 or part.max() >= count) for part in rows):
         raise BadTemplate(path, compose("template-vertices-missing"))
-    same = len(carrier.skin) == len(carrier.attachment.triangles) == len(carrier.attachment.weights)
-    if not same or len(carrier.wholes) != count or mesh.sizes.sum() != len(mesh.corners) != len(mesh.corner_uv):
+    same = (
+        len(surface_binding.skin)
+        == len(surface_binding.attachment.triangles)
+        == len(surface_binding.attachment.weights)
+    )
+    if not same or len(surface_binding.wholes) != count or mesh.sizes.sum() != len(mesh.corners) != len(mesh.corner_uv):
         raise BadTemplate(path, compose("template-arrays-unfit"))
-    numbers = (carrier.rest, carrier.attachment.weights, carrier.attachment.offsets, mesh.uv)
+    numbers = (surface_binding.rest, surface_binding.attachment.weights, surface_binding.attachment.offsets, mesh.uv)
     if not all(np.isfinite(part).all() for part in numbers):
         raise BadTemplate(path, compose("template-not-finite"))

@@ -27,7 +27,7 @@ MOST_KNOWN = 0.5  # of the corners of its triangles, by area, that some view see
 BARELY = np.float32(1e-9)  # weight of a view at a corner that it does not see
 
 
-def see_blind_patches(
+def fill_unobserved_patches(
     decision: Decision,
     mesh_world: Mesh,
     silhouettes: Mapping[str, Silhouette],

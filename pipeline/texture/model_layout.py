@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.array_cache import cached_arrays
 from pipeline.eigenheads.model import HeadModel
-from pipeline.kept_arrays import kept_arrays
 from pipeline.texture.inpaint import neighbours
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.uv_unwrap import Layout, unwrap
@@ -37,6 +37,6 @@ def model_layout(model: HeadModel) -> ModelLayout:
             "opposite": around.opposite,
         }
 
-    kept = kept_arrays("uv-layout", (model.mean, faces), make, made_by=(unwrap, neighbours, Neighbourhood))
+    kept = cached_arrays("uv-layout", (model.mean, faces), make, made_by=(unwrap, neighbours, Neighbourhood))
     layout = Layout(kept["uv"], kept["faces"], kept["source"])
     return ModelLayout(layout, Neighbourhood(kept["starts"], kept["indices"], kept["opposite"]))

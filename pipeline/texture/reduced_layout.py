@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.array_cache import cached_arrays
 from pipeline.eigenheads.decimation import decimate
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.subdivision import boundary_vertices
-from pipeline.kept_arrays import kept_arrays
 from pipeline.texture.uv_unwrap import Layout, unwrap
 
 FACES = 10_000  # what games give a head; 1,100 of a model of 22,000 left lids too few
@@ -36,7 +36,7 @@ def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
         return {"rows": found.rows.astype(np.int32), "faces": found.faces.astype(np.int32)}
 
     inputs = (model.mean, layout.faces, region, FACES)
-    kept = kept_arrays("reduced-layout", inputs, make, made_by=(reduce, decimate, boundary_vertices, unwrap))
+    kept = cached_arrays("reduced-layout", inputs, make, made_by=(reduce, decimate, boundary_vertices, unwrap))
     return ReducedLayout(kept["rows"], kept["faces"])
 
 

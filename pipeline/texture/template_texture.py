@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
-from pipeline.templates.carrying import Carrier
+from pipeline.templates.carrying import SurfaceBinding
 from pipeline.texture.uv_unwrap import Atlas, Layout
 from rig.formats.polygon_obj import PolygonMesh, fan
 
@@ -34,20 +34,22 @@ def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
     return np.where((named & (tiles >= 0).all(axis=1))[:, None], tiles, -1)
 
 
-def skin_polygons(mesh: PolygonMesh, carrier: Carrier) -> Bool[np.ndarray, " p"]:
+def skin_polygons(mesh: PolygonMesh, surface_binding: SurfaceBinding) -> Bool[np.ndarray, " p"]:
     """Polygons whose corners all lie on the skin."""
-    skin = np.zeros(len(carrier.rest), bool)
-    skin[carrier.skin] = True
+    skin = np.zeros(len(surface_binding.rest), bool)
+    skin[surface_binding.skin] = True
     return np.logical_and.reduceat(skin[mesh.corners], np.cumsum(mesh.sizes) - mesh.sizes)
 
 
-def template_textures(atlas: Atlas, mesh: PolygonMesh, carrier: Carrier) -> dict[Tile, UInt8[np.ndarray, "s s 3"]]:
+def template_textures(
+    atlas: Atlas, mesh: PolygonMesh, surface_binding: SurfaceBinding
+) -> dict[Tile, UInt8[np.ndarray, "s s 3"]]:
     """The images of the tiles that the template's skin lies in, sRGB; none where it has no texture coordinates."""
-    tiles, on_skin = corner_tiles(mesh), skin_polygons(mesh, carrier)
+    tiles, on_skin = corner_tiles(mesh), skin_polygons(mesh, surface_binding)
     found = np.unique(tiles[on_skin & (tiles[:, 0] >= 0)], axis=0)
     if not 0 < len(found) <= MOST_TILES:
         return {}
-    places = _places(atlas.layout, carrier)
+    places = _places(atlas.layout, surface_binding)
     of_polygon = np.repeat(np.arange(len(mesh.sizes)), mesh.sizes - 2)
     rows = fan(mesh.sizes)
     spread = np.ptp(places[mesh.corners[rows]], axis=1).max(axis=1)
@@ -60,11 +62,11 @@ def template_textures(atlas: Atlas, mesh: PolygonMesh, carrier: Carrier) -> dict
     return out
 
 
-def _places(layout: Layout, carrier: Carrier) -> Float[np.ndarray, "t 2"]:
+def _places(layout: Layout, surface_binding: SurfaceBinding) -> Float[np.ndarray, "t 2"]:
     """Where each vertex of the skin lies in the model's layout; the others at its corner."""
-    attached = carrier.attachment
-    out = np.zeros((len(carrier.rest), 2))
-    out[carrier.skin] = np.einsum("nk,nkx->nx", attached.weights, layout.uv[layout.faces[attached.triangles]])
+    attached = surface_binding.attachment
+    out = np.zeros((len(surface_binding.rest), 2))
+    out[surface_binding.skin] = np.einsum("nk,nkx->nx", attached.weights, layout.uv[layout.faces[attached.triangles]])
     return out
 
 
@@ -96,13 +98,13 @@ def _filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -
     step = max(1, len(image) // COARSE)
     if not known[::step, ::step].any():
         return image
-    beside = np.ascontiguousarray(_spread(image[::step, ::step], known[::step, ::step]))
+    beside = np.ascontiguousarray(_extended(image[::step, ::step], known[::step, ::step]))
     out = np.asarray(cv2.resize(beside, known.shape[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
     cv2.copyTo(image, known.view(np.uint8), out)
     return out
 
 
-def _spread(image: UInt8[np.ndarray, "c c 3"], known: Bool[np.ndarray, "c c"]) -> UInt8[np.ndarray, "c c 3"]:
+def _extended(image: UInt8[np.ndarray, "c c 3"], known: Bool[np.ndarray, "c c"]) -> UInt8[np.ndarray, "c c 3"]:
     empty = (~known).view(np.uint8)
     away, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL)
     nearest = np.asarray(labels).astype(np.int32)

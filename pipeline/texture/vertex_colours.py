@@ -24,14 +24,14 @@ from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.parallel_for import thread_count
 from pipeline.settings import TextureSettings
-from pipeline.texture.blind_patches import see_blind_patches
+from pipeline.texture.blind_patches import fill_unobserved_patches
 from pipeline.texture.decision import Decision, pack_pictures
 from pipeline.texture.inpaint import fill_unknown
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.paint_kernels import Pictures
 from pipeline.texture.seam_levelling import level_views
 from pipeline.texture.vertex_colours_kernels import blend_views
-from pipeline.texture.view_selection import add_alike, select_views
+from pipeline.texture.view_selection import add_similar_views, select_views
 from pipeline.texture.visibility import Sight, see_points, sharpened
 from rig.camera import Camera
 from rig.capture import Capture
@@ -97,7 +97,7 @@ def texture(
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
         gains, offsets = balance(weights, colours)
-    weights *= believed(gains)[:, None]
+    weights *= gain_confidence(gains)[:, None]
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
     agreed, seen = blend_views(weights, balanced, settings.outlier)
     if not seen.any():
@@ -108,16 +108,16 @@ def texture(
         masks = {name: silhouettes[name].mask for name in views.names}
         pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world, settings.footprint_px)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around, settings)
-        decision = see_blind_patches(decision, mesh_world, silhouettes, depths, settings)
+        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, settings)
     shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
     warnings = _gain_warnings(by_camera)
-    dim = None if dim_share is None else dim_views(weights, balanced, dim_share)
+    dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
     return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
 
 
-def dim_views(
+def underexposed_views(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"], share: float
 ) -> Float32[np.ndarray, "v 3"]:
     """The colour of the view that is as bright as ``share`` of each vertex' weight; black where no view sees it."""
@@ -129,7 +129,7 @@ def dim_views(
     return np.where((passed[-1] > 0)[:, None], found, np.float32(0.0))
 
 
-def believed(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
+def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
     """Share that a camera's word has left: what had to be made much brighter brings its noise along, and a dim view is
     often a shadowed one."""
     return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
@@ -152,7 +152,7 @@ def decide(
     fields = level_views(weights, codes, level_to, around, chosen.levelling)
     detail = codes + fields[:, :, :3]
     labels, options, quality = select_views(weights, codes, detail, level_to, gains, around, chosen)
-    slots, shares = add_alike(labels, options, quality, detail, weights, around, chosen)
+    slots, shares = add_similar_views(labels, options, quality, detail, weights, around, chosen)
     corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
     return Decision(views, slots, shares, corrections, weights, pictures)
 

@@ -77,7 +77,7 @@ def _disagreement(
     return np.sqrt(np.einsum("kvc,kvc->vk", off, off) / 3.0)
 
 
-def add_alike(
+def add_similar_views(
     labels: Int32[np.ndarray, " v"],
     views: Int32[np.ndarray, "v c"],
     quality: Float32[np.ndarray, "v c"],

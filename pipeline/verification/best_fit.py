@@ -111,7 +111,7 @@ def _refined(
         if used.sum() < 6 * 7:
             return place, np.inf, 0
         robust = (1.0 + (hits.distances / reach) ** 2) ** -2 if reach > 1.0 else np.ones(len(points))
-        delta = _step(there[used], hits, used, (weights * robust)[used], free_scale)
+        delta = _gauss_newton_step(there[used], hits, used, (weights * robust)[used], free_scale)
         centre = there[used].mean(axis=0)
         turn, scale = rotation_from_vector(delta[:3]), float(np.exp(delta[6])) if free_scale else 1.0
         moved = Similarity(scale, turn, centre + delta[3:6] - scale * turn @ centre)
@@ -128,7 +128,7 @@ def _refined(
     return place, float(np.sqrt(np.average(off**2, weights=weights[covered]))), int(counted(hits, reference).sum())
 
 
-def _step(
+def _gauss_newton_step(
     points: Float[np.ndarray, "n 3"], hits: Hits, used: Bool[np.ndarray, " m"], weights: Float[np.ndarray, " n"],
     free_scale: bool,
 ) -> Float[np.ndarray, " p"]:  # fmt: skip
@@ -151,7 +151,7 @@ def _searched(measured: Measured, reference: Reference, rng: np.random.Generator
     vertices = measured.mesh_world.vertices
     middle = vertices[chosen].mean(axis=0)
     points, normals = vertices[chosen] - middle, measured.mesh_world.normals()[chosen]
-    surface, facing = _spread(reference, rng)
+    surface, facing = _surface_points(reference, rng)
     tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
     parts = np.asarray(kmeans2(surface, PARTS, minit="++", rng=rng)[0])
     places = np.stack([surface.mean(axis=0), (surface.min(axis=0) + surface.max(axis=0)) / 2, *parts])
@@ -193,7 +193,7 @@ def _closest_points(
     return means, rotations, translations
 
 
-def _spread(
+def _surface_points(
     reference: Reference, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Points spread over the reference by area, and their normals: middles of triangles."""

@@ -178,13 +178,13 @@ def _find(here: Grey, there: Grey, point: tuple[int, int]) -> tuple[float, float
     half, reach = _PATCH_PX // 2, _PATCH_PX // 2 + _REACH_PX
     patch = here[y - half : y + half + 1, x - half : x + half + 1]
     window = there[y - reach : y + reach + 1, x - reach : x + reach + 1]
-    likeness = cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)
-    _, best, _, (column, row) = cv2.minMaxLoc(likeness)
+    ncc_score = cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED)
+    _, best, _, (column, row) = cv2.minMaxLoc(ncc_score)
     if best < _ALIKE:
         return None
     return (
-        x + column - _REACH_PX + _peak(likeness[row, :], column),
-        y + row - _REACH_PX + _peak(likeness[:, column], row),
+        x + column - _REACH_PX + _peak(ncc_score[row, :], column),
+        y + row - _REACH_PX + _peak(ncc_score[:, column], row),
     )
 
 

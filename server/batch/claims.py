@@ -2,11 +2,12 @@
 
 Making a link is atomic and refused where one is, on local disks and on NFS and Lustre, where ``flock`` may not reach
 other machines; and it says at once whose it is. An owner is one process. Its file is touched every ``BEAT_S`` seconds;
-whoever is silent for ``SILENT_S``, whose process is gone (same machine), or whose file is gone, has lost its claims.
+whoever is silent for ``HEARTBEAT_TIMEOUT_S``, whose process is gone (same machine), or whose file is gone, has lost its
+claims.
 
 A lost claim is taken away by one process alone: that which claims the claim (its name and the loser's token) first.
 Nobody else removes the link, so that what is removed is never a newer one. A process that was stopped for longer than
-``SILENT_S`` and goes on asks ``Claims.holds`` before it lays a result down.
+``HEARTBEAT_TIMEOUT_S`` and goes on asks ``Claims.holds`` before it lays a result down.
 """
 
 import json
@@ -20,14 +21,14 @@ from pathlib import Path
 from server.processes import process_identity, process_started
 
 BEAT_S = 10.0
-SILENT_S = 180.0  # NFS tells of a touch up to 60 s late (acregmax of nfs(5)); then a beat, and as much again
+HEARTBEAT_TIMEOUT_S = 180.0  # NFS tells of a touch up to 60 s late (acregmax of nfs(5)); then a beat, and as much again
 SUFFIX = ".json"
 
 
 class Claims:
     """This process's claims in a folder that all who share the work see. Its methods are for any thread."""
 
-    def __init__(self, folder: Path, *, silent_s: float = SILENT_S) -> None:
+    def __init__(self, folder: Path, *, silent_s: float = HEARTBEAT_TIMEOUT_S) -> None:
         self.token = secrets.token_hex(8)
         self._folder, self._silent_s = folder, silent_s
         self._machine, self._host, self._pid, self._started = process_identity()

@@ -25,7 +25,7 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     columns = columns_of(_expressions(tasks))
     rows, cards = [], []
     for task in tasks:
-        row, card = _told(folder, task, columns)
+        row, card = _row_and_card(folder, task, columns)
         rows.append(row)
         cards.append(card)
     files = write_table(folder.out, columns, rows)
@@ -33,7 +33,7 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     return [*files, folder.out / SHEET]
 
 
-def _told(folder: BatchFolder, task: BatchTask, columns: Sequence[Column]) -> tuple[Row, Card]:
+def _row_and_card(folder: BatchFolder, task: BatchTask, columns: Sequence[Column]) -> tuple[Row, Card]:
     name, capture = task.capture.name, task.capture
     origin, report = _result(folder, task)
     failure = None if report is not None else folder.failure(name)

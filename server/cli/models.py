@@ -30,13 +30,13 @@ def model_info(
     from pipeline.eigenheads.model import load_model
 
     document = describe(load_model(name))
-    answer(document, json_out, [f"{key:<18} {_told(value)}" for key, value in document.items() if key != "figures"])
+    answer(document, json_out, [f"{key:<18} {_as_text(value)}" for key, value in document.items() if key != "figures"])
 
 
-def _told(value: object) -> str:
+def _as_text(value: object) -> str:
     """A value of the description, for people."""
     if isinstance(value, dict):
-        return "; ".join(f"{key}: {_told(inner)}" for key, inner in value.items())
+        return "; ".join(f"{key}: {_as_text(inner)}" for key, inner in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 

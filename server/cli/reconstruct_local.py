@@ -54,7 +54,7 @@ def _reconstruct_folder(
 
     with closing(WorkerContext()) as context:
         reconstruct_folder(
-            context, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, ahead=report
+            context, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, preparation=report
         )  # fmt: skip
     durations.learn(chosen, progress.finish())
 

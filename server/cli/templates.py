@@ -60,11 +60,11 @@ def template_add(
     answer(
         document | {"figures": template.figures},
         json_out,
-        [f"{path.stem}  {path}", *_told(template.figures), str(picture)],
+        [f"{path.stem}  {path}", *_registration_lines(template.figures), str(picture)],
     )
 
 
-def _told(figures: Mapping[str, float]) -> list[str]:
+def _registration_lines(figures: Mapping[str, float]) -> list[str]:
     count, unlike = figures["vertices"], figures["unlike_median_mm"]
     return [
         f"{count:.0f} vertices, {figures['skin_share']:.0%} of them on the model's skin; the others follow it",

@@ -256,7 +256,9 @@ class JobOut(Answer):
     restart_of: str | None
     queue: str | None
     priority: int
-    ahead: int | None = Field(None, description="jobs of its queue that go before a queued one")
+    ahead: int | None = Field(
+        None, validation_alias="queue_position", description="jobs of its queue that go before a queued one"
+    )
     created: Moment | None
     started: Moment | None
     finished: Moment | None

@@ -62,7 +62,7 @@ class JobLine(TypedDict):
     restart_of: str | None
     queue: str | None
     priority: int
-    ahead: int | None
+    queue_position: int | None
     created: str | None
     started: str | None
     finished: str | None

@@ -347,7 +347,7 @@ class Jobs:
             restart_of=None if request is None else request.get("restart_of"),
             queue=row.queue_name,
             priority=row.priority or 0,
-            ahead=places.get(row.workflow_id) if state == "queued" else None,
+            queue_position=places.get(row.workflow_id) if state == "queued" else None,
             created=_moment(row.created_at),
             started=_moment(row.dequeued_at),
             finished=_moment(row.completed_at) if state in FINISHED else None,

@@ -31,8 +31,9 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Holds a job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone; ``ahead`` is
-    how many jobs of its queue go before a queued one; ``files`` are those of a result, by name."""
+    """Holds a job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone;
+    ``queue_position`` is how many jobs of its queue go before a queued one; ``files`` are those of a result, by
+    name."""
 
     id: str
     name: str
@@ -49,7 +50,7 @@ class Job:
     restart_of: str | None
     queue: str | None
     priority: int
-    ahead: int | None
+    queue_position: int | None
     created: str | None
     started: str | None
     finished: str | None

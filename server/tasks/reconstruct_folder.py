@@ -39,18 +39,18 @@ def reconstruct_folder(
     kept: Path,
     model: str | None,
     chosen: "Settings",
-    ahead: Progress,
+    preparation: Progress,
 ) -> None:
     """Reconstructs a capture folder into ``out``. ``kept`` is where cameras and masks that had to be found stay,
-    whatever comes after; ``ahead`` is told of what comes before the first stage: cameras, loops.
+    whatever comes after; ``preparation`` is told of what comes before the first stage: cameras, loops.
 
     Raises what the pipeline raises, and OSError for a full disk."""
     from server.tasks.photographs import keep_masks, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
 
-    prepared = read_or_calibrate(folder, kept, front=chosen.front, report=ahead)
+    prepared = read_or_calibrate(folder, kept, front=chosen.front, report=preparation)
     kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
-    context.keep(f"loops {kind}", lambda: prepare_kernels(ahead, chosen))
+    context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
     from pipeline.eigenheads.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
@@ -94,5 +94,5 @@ def reconstruct_beside(
     chosen, out = settings_from_document(settings), Path(result)
     with folder_of(Path(capture)) as folder:
         reconstruct_folder(
-            context, report, folder=folder, out=out, kept=out, model=model, chosen=chosen, ahead=report
+            context, report, folder=folder, out=out, kept=out, model=model, chosen=chosen, preparation=report
         )  # fmt: skip

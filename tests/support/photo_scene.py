@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.eigenheads.gaussian_process import with_kernel
 from pipeline.eigenheads.model import HeadModel, assemble
 from pipeline.eigenheads.model_file import ModelParts
-from pipeline.fitting.contour import Solved
+from pipeline.fitting.contour import ContourSolution
 from pipeline.fitting.problem import Stage, State, first_evidence, make_problem
 from pipeline.imaging.cpu_raster import camera_depths
 from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
@@ -74,15 +74,17 @@ class Scene:
     images: dict[str, np.ndarray]
     silhouettes: dict[str, Silhouette]
 
-    def start(self) -> Solved:
+    def start(self) -> ContourSolution:
         """The mean head in its true place, as a fit to contours that miss the bump would leave it."""
         problem = make_problem(self.model, Similarity.identity(), self.silhouettes, self.rig, FittingSettings(), {})
         modes = len(self.model.modes)
         state = State(np.zeros(modes), Similarity.identity(), np.zeros((len(self.rig), 6)))
         evidence = first_evidence(FittingSettings())
-        return Solved(problem, evidence, state, Stage("p95", modes, True, (1.5,), False, True, 3), 0, "planted")
+        return ContourSolution(
+            problem, evidence, state, Stage("p95", modes, True, (1.5,), False, True, 3), 0, "planted"
+        )
 
-    def error(self, solved: Solved) -> np.ndarray:
+    def error(self, solved: ContourSolution) -> np.ndarray:
         """Along the true normals, of the whole face region."""
         found = solved.state.world_from_head.apply(solved.problem.model.vertices(solved.state.coefficients))
         level = self.model.levels["full"]

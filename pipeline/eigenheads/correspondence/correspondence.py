@@ -211,8 +211,8 @@ def _most_probable(
 ) -> Float[np.ndarray, "V 3"]:
     scan, frame = placed_scan
     target = prepared(scan, frame)
-    likeness = statistical(prior, faces, index, target, matching)
-    return refined(likeness, faces, target, matching.fine, matching.stiffness)
+    fitted = statistical(prior, faces, index, target, matching)
+    return refined(fitted, faces, target, matching.fine, matching.stiffness)
 
 
 def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
@@ -244,11 +244,11 @@ def statistical(
         for _ in range(search.steps):
             near, weight = _matched(shape, faces, target, tree, search)
             information = weight * areas / 100.0 / search.plane_mm**2
-            shape = _step(prior.mean, modes, index, target, near, information, matching.mark_mm)
+            shape = _posterior_mean(prior.mean, modes, index, target, near, information, matching.mark_mm)
     return shape
 
 
-def _step(
+def _posterior_mean(
     mean: Float[np.ndarray, "V 3"],
     modes: Float32[np.ndarray, "V 3 K"],
     index: Int[np.ndarray, " L"],

@@ -73,7 +73,7 @@ def _check_complete(scan: Scan) -> None:
 
 def _in_millimetres(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
     """Size by landmarks decides the unit: heads differ by a third, units by a factor of ten."""
-    ratio = _spread(stacked(scan.landmarks)) / _spread(_mean_marks(template))
+    ratio = _radius_of_gyration(stacked(scan.landmarks)) / _radius_of_gyration(_mean_marks(template))
     for unit, factor in UNITS.items():
         if SIZE_RANGE[0] < ratio * factor < SIZE_RANGE[1]:
             if unit == "mm":
@@ -182,5 +182,5 @@ def _misfit(marks: Float[np.ndarray, "26 3"], mean: Float[np.ndarray, "26 3"]) -
     return float(np.linalg.norm(rigid_fit(marks, mean).apply(marks) - mean))
 
 
-def _spread(marks: Float[np.ndarray, "26 3"]) -> float:
+def _radius_of_gyration(marks: Float[np.ndarray, "26 3"]) -> float:
     return float(np.linalg.norm(marks - marks.mean(0)))

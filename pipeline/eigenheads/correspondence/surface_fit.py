@@ -64,7 +64,9 @@ def fit_surface(
         hits = _closest(model, z, pose, level, faces, points)
         scale = max(3.0 * float(np.median(hits.distances)), 3.0 * sigma_mm) if step < 12 else np.inf
         robust = (1 + (hits.distances / scale) ** 2) ** -2
-        moved, z, pose = _step(basis[: min(active, count)], faces, hits, points, information * robust, z, pose)
+        moved, z, pose = _gauss_newton_step(
+            basis[: min(active, count)], faces, hits, points, information * robust, z, pose
+        )
         used = step + 1
         if step > 12 and moved < _STEP_MM:
             break
@@ -82,7 +84,7 @@ def _closest(
     return SurfaceIndex(pose.apply(model.vertices(z, level)), faces).closest(points)
 
 
-def _step(
+def _gauss_newton_step(
     basis: Float[np.ndarray, "m V 3"],
     faces: Int[np.ndarray, "F 3"],
     hits: Hits,

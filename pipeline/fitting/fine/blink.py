@@ -42,7 +42,7 @@ def blinks_of(model: HeadModel) -> dict[str, int]:
     return found
 
 
-def judged_lids(
+def estimate_eyelid_closure(
     fit: Fit,
     model: HeadModel,
     base: Float[np.ndarray, "v 3"],
@@ -59,18 +59,18 @@ def judged_lids(
         surface: the dense points, world frame.
         eyes: what shows between the lids; an eye that shows none is closed unless the points say that it is open.
     """
-    found, otherwise = {}, set[str]()
+    found, unexplained = {}, set[str]()
     for side, place in blinks_of(model).items():
         fitted, moved = float(fit.coefficients[place]), _moved(fit, model, place)
-        share, half = _told(base - fitted * moved, moved, fitted, model, surface, eye_fissure(model, side))
+        share, half = _nearest_closure(base - fitted * moved, moved, fitted, model, surface, eye_fissure(model, side))
         shown = eyes.get(side)
         shut = shown is not None and shown.closed
         found[side] = 1.0 if shut and share >= SHUT else share
         if shown is not None and shown.is_surely_open:
             found[side] = min(share, HALF)
         if shown is not None and shut and share < SHUT and (half < OPEN or shown.is_surely_closed):
-            otherwise.add(side)
-    return found, frozenset(otherwise)
+            unexplained.add(side)
+    return found, frozenset(unexplained)
 
 
 def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
@@ -103,7 +103,7 @@ def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray
     return fit.world_from_head.apply(model.vertices(plain))
 
 
-def _told(
+def _nearest_closure(
     open_lids: Float[np.ndarray, "v 3"],
     moved: Float[np.ndarray, "v 3"],
     fitted: float,

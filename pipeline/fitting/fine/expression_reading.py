@@ -20,13 +20,13 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from pipeline.array_cache import cached_arrays
 from pipeline.eigenheads.model import HeadModel
 from pipeline.estimation.bounded import least_within
 from pipeline.fitting.fine.association import associate, interpolated
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.patches import thinned
 from pipeline.fitting.prior_term import weight_slope
-from pipeline.kept_arrays import kept_arrays
 from rig.mesh import vertex_normals
 
 SPACING_MM = 2.5  # of the places that are asked
@@ -67,7 +67,7 @@ def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> R
         fitted = model.basis("full", model.posed.stop, vertex)[eigenheads:]
         return {"vertex": vertex, "mean": mean[vertex], "modes": np.concatenate([population_modes, fitted])}
 
-    kept = kept_arrays("expression-places", inputs, make, made_by=(thinned, HeadModel))
+    kept = cached_arrays("expression-places", inputs, make, made_by=(thinned, HeadModel))
     faces = full.faces[full.face_region[full.faces].any(axis=1)]
     faces.setflags(write=False)  # as the head's own faces are: loops are compiled for those
     return ReadingBasis(kept["vertex"], kept["mean"], kept["modes"], len(population.modes), faces)
@@ -116,7 +116,7 @@ def with_read_expression(
             place[found.row] = interpolated(head[corner], found.blend)
             normal[found.row] = interpolated(normals[corner], found.blend)
             there[found.row] = 1.0
-    return _told(fit, model, weights, deviation)
+    return _with_weights(fit, model, weights, deviation)
 
 
 def _solved(
@@ -168,7 +168,9 @@ def _solved(
     return now, deviation, basis.mean + moved + np.cross(turn, arm) + shift + grown * arm, variance
 
 
-def _told(fit: Fit, model: HeadModel, weights: Float[np.ndarray, " e"], deviation: Float[np.ndarray, " e"]) -> Fit:
+def _with_weights(
+    fit: Fit, model: HeadModel, weights: Float[np.ndarray, " e"], deviation: Float[np.ndarray, " e"]
+) -> Fit:
     """The fit with other weights; its covariance scaled to their deviations."""
     coefficients, posed = fit.coefficients.copy(), np.asarray(model.posed)
     coefficients[posed] = weights

@@ -90,7 +90,7 @@ def eye_fissure(model: HeadModel, side: str) -> Fissure:
     return Fissure(float(np.linalg.norm(chord)), off @ along, off @ above, front)
 
 
-def look_at_eyes(
+def measure_eye_appearance(
     model: HeadModel,
     vertices: Float[np.ndarray, "v 3"],
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
@@ -192,7 +192,9 @@ def with_plain_lids(
     return shape + moved
 
 
-def bridged(vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]) -> Float[np.ndarray, "v 3"]:
+def bridge_eyelids(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]
+) -> Float[np.ndarray, "v 3"]:
     """The head with the lids of the named eyes closed.
 
     Args:

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from pipeline.array_cache import cached_arrays
 from pipeline.eigenheads.model import HeadModel
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.photo.depth_search import DEPTH_LEVEL, Round, find_places, pixels_per_mm, visibility_of
@@ -21,7 +22,6 @@ from pipeline.fitting.photo.images import Photographs, load_photographs
 from pipeline.fitting.photo.patches import Patches, arrays_of, make_patches
 from pipeline.fitting.photo.refine import RADIUS_WINDOWS
 from pipeline.fitting.rim import Views, pack_views
-from pipeline.kept_arrays import kept_arrays
 from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.geometry import RigidTransform, rotation_from_vector
@@ -103,7 +103,7 @@ def _moved(camera: Camera, shift: Float[np.ndarray, " 6"]) -> Camera:
 def _patches(model: HeadModel) -> Patches:
     level, mean = model.levels["full"], model.vertices(np.zeros(0))
     sizes = {"sample_mm": SAMPLE_MM, "centre_mm": CENTRE_MM, "radius_mm": RADIUS_WINDOWS * SEARCH.window_mm}
-    kept = kept_arrays(
+    kept = cached_arrays(
         "fine-patches",
         (mean, level.faces, level.face_region, sizes),
         lambda: arrays_of(make_patches(model, **sizes)),

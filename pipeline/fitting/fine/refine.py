@@ -21,9 +21,9 @@ from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.regions import head_regions
 from pipeline.fitting.fine.association import Associated, associate, interpolated
-from pipeline.fitting.fine.blink import blink_shift, judged_lids, plain_shape
+from pipeline.fitting.fine.blink import blink_shift, estimate_eyelid_closure, plain_shape
 from pipeline.fitting.fine.ears import with_ears_in_place
-from pipeline.fitting.fine.eyelids import EyeEvidence, bridged, with_plain_lids
+from pipeline.fitting.fine.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
 from pipeline.fitting.fine.folds import unfolded
 from pipeline.fitting.fine.nodes import NodeMesh, Nodes, solving_nodes
 from pipeline.fitting.fine.patch_points import PatchPlaces, PatchSearch
@@ -62,7 +62,7 @@ PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Displaced:
+class DeformedSurface:
     """The head in the world frame, mm, and what is known of it."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -83,7 +83,7 @@ def refine_to_surface(
     eyes: Mapping[str, EyeEvidence] | None = None,
     patches: PatchSearch | None = None,
     report: Progress = lambda stage, fraction: None,
-) -> Displaced:
+) -> DeformedSurface:
     """A fit's head drawn to the dense surface.
 
     Args:
@@ -94,7 +94,8 @@ def refine_to_surface(
         eigenheads: how many of the modes are a population's; the rest, expressions apart, are smooth deformations along
             the normals.
         deviation_mm: what the fit says of every vertex (``vertex_deviation_mm``).
-        eyes: what photographs show between the lids (``look_at_eyes``); without it they stay as the model has them.
+        eyes: what photographs show between the lids (``measure_eye_appearance``); without it they stay as the model has
+            them.
         patches: the photographs, to be asked once more on the displaced head.
         report: told the share done.
 
@@ -105,15 +106,15 @@ def refine_to_surface(
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
     shape = plain_shape(fit, model, eigenheads)
     base = with_plain_lids(fitted, shape, model)
-    lids, otherwise = judged_lids(fit, model, base, surface, eyes or {})
+    lids, unexplained = estimate_eyelid_closure(fit, model, base, surface, eyes or {})
     closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed and lids.get(side, 1.0) == 1.0)
     blink = blink_shift(fit, model, lids)
     base = unfolded(shape + blink, base + blink, faces)
-    base = bridged(base, model, closed.difference(lids) | otherwise)
+    base = bridge_eyelids(base, model, closed.difference(lids) | unexplained)
     surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
     base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))
     regions = head_regions(model)
-    head = draw_to_surface(
+    head = deform_to_points(
         base,
         deviation_mm,
         faces,
@@ -126,10 +127,10 @@ def refine_to_surface(
     )
     clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
     observed = head.observed & (clean_deviation_mm < 2.0 * head.deviation_mm)  # what was moved farther is not as seen
-    return Displaced(clean.vertices, clean_deviation_mm, observed, closed | otherwise, lids)
+    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids)
 
 
-def draw_to_surface(
+def deform_to_points(
     vertices: Float[np.ndarray, "v 3"],
     deviation_mm: Float[np.ndarray, " v"],
     faces: Int[np.ndarray, "f 3"],
@@ -140,7 +141,7 @@ def draw_to_surface(
     loose: Bool[np.ndarray, " v"],
     look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
     report: Progress = lambda stage, fraction: None,
-) -> Displaced:
+) -> DeformedSurface:
     """A surface displaced to points of another, as far as those speak.
 
     Args:
@@ -183,7 +184,7 @@ def draw_to_surface(
         posterior = solve_field(field, directions, both)
         now = base + directions.moved(posterior.mean)
     deviation = field_deviation(posterior, base, normals, amplitude, seen, settings)
-    return Displaced(unfolded(base, now, faces), deviation, seen)
+    return DeformedSurface(unfolded(base, now, faces), deviation, seen)
 
 
 def _laid_out(mesh: NodeMesh, vertices: Float[np.ndarray, "v 3"], length_mm: float) -> SmoothField:
@@ -225,7 +226,7 @@ def observe(
     speaks = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair speaks where skin stands out of it
     variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
     robust = np.where(skin, 1.0 / (1.0 + (off / each.robust_mm) ** 2) ** 2, 1.0)
-    shared = _crowd(found, corner, now, faces, settings.correlation_mm)
+    shared = _local_density(found, corner, now, faces, settings.correlation_mm)
     offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
     kept = np.flatnonzero(speaks)
     seen = np.zeros(len(now), bool)
@@ -261,7 +262,7 @@ def with_patches(
     )
 
 
-def _crowd(
+def _local_density(
     found: Associated,
     corner: Int[np.ndarray, "n 3"],
     vertices: Float[np.ndarray, "v 3"],

@@ -17,17 +17,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.spatial import KDTree
 
+from pipeline.array_cache import cached_arrays
 from pipeline.diagnostics import Detail
 from pipeline.eigenheads.gaussian_process import with_fine_kernel
 from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.contour import Solved, run_stage
+from pipeline.fitting.contour import ContourSolution, run_stage
 from pipeline.fitting.photo.depth_search import Round, observe, sample_visibility
 from pipeline.fitting.photo.hair_mask import HairProbability, under_hair
 from pipeline.fitting.photo.images import load_photographs
 from pipeline.fitting.photo.patches import Patches, arrays_of, make_patches
 from pipeline.fitting.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
 from pipeline.fitting.surface_term import surface_residual
-from pipeline.kept_arrays import kept_arrays
 from pipeline.settings import PhotoSettings
 from rig.mesh import vertex_normals
 from rig.messages.message import compose
@@ -44,12 +44,12 @@ MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's o
 
 
 def refine_with_photographs(
-    solved: Solved,
+    solved: ContourSolution,
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
     settings: PhotoSettings,
     *,
     hair: HairProbability | None = None,
-) -> tuple[Solved, Detail]:
+) -> tuple[ContourSolution, Detail]:
     """Goes on from the contours' solution with what the photographs show inside the outline, in a finer basis.
 
     Args:
@@ -72,7 +72,7 @@ def refine_with_photographs(
     model, patches, basis = finer(problem.model, settings)
     problem = widened(problem, model, (LEVEL,))
     stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
-    state, evaluations, reason, share = solved.state, solved.evaluations, solved.stopped_because, 0.0
+    state, evaluations, reason, share = solved.state, solved.evaluations, solved.termination_reason, 0.0
     evidence = solved.evidence
     centres = model.vertices(np.zeros(0))[patches.centre]
     lost, surface = np.zeros(0, int), None
@@ -90,9 +90,9 @@ def refine_with_photographs(
         state, used, reason = run_stage(problem, evidence, state, stage, lambda fraction: None)
         evaluations += used
     assert surface is not None
-    misfit = unfollowed(model, surface, state, lost)
+    misfit = local_misfit_mm(model, surface, state, lost)
     why = compose("level-alike", share=share, photographs=speaking)
-    return Solved(problem, evidence, state, stage, evaluations, reason, misfit), Detail("photo", why)
+    return ContourSolution(problem, evidence, state, stage, evaluations, reason, misfit), Detail("photo", why)
 
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
@@ -114,7 +114,7 @@ def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches
     full, cage = model.levels["full"], model.levels["cage"]
     operator = (full.operator.data, full.operator.indices, full.operator.indptr)
     faces = (full.faces, full.face_region, cage.faces, cage.face_region)
-    kept = kept_arrays(
+    kept = cached_arrays(
         "fine-modes",
         (model.mean, model.modes, model.sigma, *operator, *faces, length, amplitude, sizes),
         make,
@@ -134,7 +134,7 @@ def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray,
     return KDTree(mean[hair]).query(mean[model.levels[LEVEL].rows])[0] < HAIR_REACH_MM
 
 
-def unfollowed(
+def local_misfit_mm(
     model: HeadModel, seen: SurfaceObservations, state: State, lost: Int[np.ndarray, " u"]
 ) -> Float[np.ndarray, " v0"]:
     """How far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).

@@ -87,6 +87,6 @@ def fit_simplex(
         coefficients=coefficients,
         world_from_head=world_from_head,
         evaluations=evaluations,
-        stopped_because="; ".join(reasons),
+        termination_reason="; ".join(reasons),
         used={name: name in rig for name in silhouettes},
     )

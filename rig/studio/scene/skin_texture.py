@@ -63,7 +63,7 @@ def _mix(paint: Float[np.ndarray, "v 4"], share: Float[np.ndarray, " v"], colour
     paint[:, :3] += share[:, None] * (colour - paint[:, :3])
 
 
-def _step(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+def _smoothstep(low: float, high: float, x: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -82,8 +82,8 @@ def _beard(
 ) -> None:
     x, y, z = vertices.T
     mouth, chin = marks["stomion"], marks["gnathion"]
-    share = _step(14, 2, y - mouth[1] - 0.004 * (x - mouth[0]) ** 2) * _step(-75, -45, z - chin[2])
-    share *= _step(-38, -14, y - chin[1]) * stubble
+    share = _smoothstep(14, 2, y - mouth[1] - 0.004 * (x - mouth[0]) ** 2) * _smoothstep(-75, -45, z - chin[2])
+    share *= _smoothstep(-38, -14, y - chin[1]) * stubble
     paint[:, :3] *= 1 - 0.42 * share[:, None]
     paint[:, 3] += 1.6 * share
 
@@ -98,7 +98,7 @@ def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], 
     bottom = line[1] + (marks["labiale_inferius"][1] - line[1]) * bow - 3.0 * bow
     inside = np.minimum(np.minimum(top - y, y - bottom), half * (1 - np.abs(across)))
     front = z > min(right[2], left[2]) - 12
-    _mix(paint, 0.75 * front * _step(-0.9, 0.9, inside), LIP)
+    _mix(paint, 0.75 * front * _smoothstep(-0.9, 0.9, inside), LIP)
     seam = np.exp(-(((y - line[1]) / 1.2) ** 2)) * (np.abs(across) < 0.95) * front
     paint[:, :3] *= 1 - 0.55 * seam[:, None]
 
@@ -116,8 +116,8 @@ def _eye(
     )  # 0 at the inner end of the brow, 1 outside
     arch = outer[1] + lift * (1.0 + 1.2 * along * (1 - along) * 1.25 - 0.2 * along)
     width = 4.4 - 2.8 * np.clip(along, 0, 1)
-    there = _step(-0.06, 0.06, along) * _step(1.06, 0.94, along) * (z > outer[2] - 18)
-    brow = there * _step(1.0, 0.4, np.abs(y - arch) / width)
+    there = _smoothstep(-0.06, 0.06, along) * _smoothstep(1.06, 0.94, along) * (z > outer[2] - 18)
+    brow = there * _smoothstep(1.0, 0.4, np.abs(y - arch) / width)
     _mix(paint, 0.85 * brow, BROW)
     paint[:, 3] += 3.0 * brow
     _open_eye(paint, vertices, inner, outer, closed)
@@ -137,12 +137,17 @@ def _open_eye(
     height = 4.0 * bow * (1.0 - closed)
     off = y - (inner[1] + t * (outer[1] - inner[1]) + 1.4 * bow) + 4.0 * bow * closed
     here = (t > 0.02) & (t < 0.98) & (z > outer[2] - 14)
-    opening = here * _step(0.6, -0.6, np.abs(off) - height) * (closed < 1.0)
+    opening = here * _smoothstep(0.6, -0.6, np.abs(off) - height) * (closed < 1.0)
     _mix(paint, opening, np.array([0.44, 0.40, 0.38]))
     paint[:, 3] *= 1 - 0.8 * opening
     middle = (inner + outer) / 2 + (0, 1.8, 0)
     radius = np.hypot(x - middle[0], y - middle[1])
-    _mix(paint, opening * _step(6.0, 5.0, radius), np.array([0.09, 0.06, 0.035]))
-    _mix(paint, opening * _step(2.6, 1.8, radius), np.array([0.008, 0.008, 0.008]))
-    lash = here * _step(1.5, 0.5, np.abs(off - height - 0.2 * bow)) * _step(0.0, 0.15, t) * _step(1.0, 0.9, t)
+    _mix(paint, opening * _smoothstep(6.0, 5.0, radius), np.array([0.09, 0.06, 0.035]))
+    _mix(paint, opening * _smoothstep(2.6, 1.8, radius), np.array([0.008, 0.008, 0.008]))
+    lash = (
+        here
+        * _smoothstep(1.5, 0.5, np.abs(off - height - 0.2 * bow))
+        * _smoothstep(0.0, 0.15, t)
+        * _smoothstep(1.0, 0.9, t)
+    )
     paint[:, :3] *= 1 - 0.75 * lash[:, None]

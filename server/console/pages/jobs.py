@@ -159,7 +159,7 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsSta
 def active_jobs(service: Service, sought: str, *, running: bool = True) -> tuple[list[Job], int]:
     """What runs and what is taken next, and how many more wait."""
     found = service.jobs.page(JobQuery(sought, ACTIVE if running else STATUSES["queued"]), SOUGHT_MOST)
-    jobs = sorted(found.items, key=lambda job: (job.state != "running", job.ahead or 0, job.id))
+    jobs = sorted(found.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
     return jobs[:SHOWN], found.total - min(SHOWN, len(jobs))
 
 

@@ -68,7 +68,7 @@ def tus_create(
 def tus_head(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
     """How many bytes are here; with the capture's ``Location`` once it was made."""
     _check_version(tus_resumable)
-    record = _own(service, caller, upload_id)
+    record = _owned_upload(service, caller, upload_id)
     headers = {"Upload-Offset": str(service.uploads.offset(record)), "Upload-Length": str(record.length)}
     return Response(status_code=200, headers=COMMON | headers | _expires(record) | _location(record))
 
@@ -96,10 +96,10 @@ async def tus_patch(
     _check_version(tus_resumable)
     if request.headers.get("content-type") != "application/offset+octet-stream":
         raise Problem(415, "unsupported-media-type", compose("offset-stream-wanted"))
-    record = await service.threads.disk(_own, service, caller, upload_id)
+    record = await service.threads.disk(_owned_upload, service, caller, upload_id)
     with service.uploads.lock(record.id):
         # read again: the request that held the lock before may have made the capture
-        record = await service.threads.disk(_own, service, caller, upload_id)
+        record = await service.threads.disk(_owned_upload, service, caller, upload_id)
         return await _append(service, record, upload_offset, request.stream(), upload_checksum)
 
 
@@ -121,7 +121,7 @@ async def _append(
 def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
     """Gives an upload up; a capture that was made from it stays. 409 while bytes of it come in."""
     _check_version(tus_resumable)
-    record = _own(service, caller, upload_id)
+    record = _owned_upload(service, caller, upload_id)
     with service.uploads.lock(record.id):
         service.uploads.remove(record.id)
     return Response(status_code=204, headers=COMMON)
@@ -144,7 +144,7 @@ def _finish(service: Service, record: UploadRecord) -> UploadRecord:
     return record
 
 
-def _own(service: Service, caller: Caller, upload_id: str) -> UploadRecord:
+def _owned_upload(service: Service, caller: Caller, upload_id: str) -> UploadRecord:
     record = service.uploads.get(upload_id)
     if record.key != caller.key and not caller.may("admin"):
         raise NotFound(compose("thing-upload"), upload_id)

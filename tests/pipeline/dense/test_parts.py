@@ -13,8 +13,8 @@ from pipeline.dense.part_codes import CHANNELS, Part
 from pipeline.dense.part_kernels import spread_parts
 from pipeline.dense.parts import (
     classify_parts,
-    colour_looks,
-    detail_looks,
+    colour_histogram,
+    detail_histogram,
     guided,
     posterior,
     starts,
@@ -229,7 +229,11 @@ def test_guide_measures_from_the_border_of_the_face_and_the_chin():
 def test_looks_are_probabilities():
     rng = np.random.default_rng(3)
     colour, detail, weight = rng.integers(0, 20_000, 500), rng.integers(0, 20, 500), rng.random(500).astype(np.float32)
-    for histogram in (colour_looks(colour, weight), detail_looks(detail, weight), colour_looks(colour, 0 * weight)):
+    for histogram in (
+        colour_histogram(colour, weight),
+        detail_histogram(detail, weight),
+        colour_histogram(colour, 0 * weight),
+    ):
         assert histogram.min() > 0
         assert histogram.sum() <= 1 + 1e-6
 

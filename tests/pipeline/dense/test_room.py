@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from pipeline.dense.crops import make_crops
-from pipeline.dense.room import Room, find_rooms
+from pipeline.dense.room import DepthRange, find_depth_ranges
 from pipeline.dense.stack import stack_crops
 from pipeline.imaging.cpu_raster import depth_map
 from pipeline.multiview.visual_hull import hull_extent
@@ -21,13 +21,13 @@ BORDER_PX = 10  # of the lower edge: the hull of what it cuts off has a crease t
 NARROW_DEG = 8.0  # between cameras: their hull of a ball reaches several radii before it
 
 
-def rooms_of(rig: Rig, balls: tuple[Ball, ...], head: Mesh | None) -> list[tuple[Room, Camera, np.ndarray]]:
+def rooms_of(rig: Rig, balls: tuple[Ball, ...], head: Mesh | None) -> list[tuple[DepthRange, Camera, np.ndarray]]:
     """Of each view its room, the camera of that size, and the signed distance (px) to the outline."""
     images, silhouettes = shoot(rig, balls)
     extent = hull_extent(silhouettes, rig)
     crops = make_crops(images, silhouettes, rig, pixel_mm=SETTINGS.pixel_mm, at_world=extent[0])
     stack = stack_crops(crops, 2)
-    rooms = find_rooms(crops, stack_crops(crops, 3), stack, head, extent, SETTINGS)
+    rooms = find_depth_ranges(crops, stack_crops(crops, 3), stack, head, extent, SETTINGS)
     return [
         (room, crop.levels[2].camera, stack.image(stack.distance_px, view))
         for view, (room, crop) in enumerate(zip(rooms, crops, strict=True))

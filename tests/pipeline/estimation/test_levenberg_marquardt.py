@@ -49,7 +49,7 @@ def line(loss: Loss) -> Line:
 def test_the_valley_of_rosenbrock_is_followed_to_its_end() -> None:
     found = minimise(Problem((Rosenbrock(),), 2, np.add), np.array([-1.2, 1.0]), TIGHT)
     np.testing.assert_allclose(found.value, [1.0, 1.0], atol=1e-8)
-    assert found.evidence.stopped_because == "converged"
+    assert found.evidence.termination_reason == "converged"
     assert found.evidence.evaluations < 60
 
 
@@ -101,11 +101,11 @@ def test_an_unknown_that_nothing_determines_stays() -> None:
 def test_the_evidence_says_why_it_ended() -> None:
     problem, start = Problem((Rosenbrock(),), 2, np.add), np.array([-1.2, 1.0])
     short = minimise(problem, start, Limits(steps=2))
-    assert short.evidence.stopped_because == "step limit"
+    assert short.evidence.termination_reason == "step limit"
     assert short.evidence.steps == 2
     assert short.evidence.cost == problem.at(short.value).cost < problem.at(start).cost
     stuck = minimise(Problem((Nonsense(),), 1, np.add), np.zeros(1), Limits())
-    assert stuck.evidence.stopped_because == "no step lowers the cost"
+    assert stuck.evidence.termination_reason == "no step lowers the cost"
     np.testing.assert_array_equal(stuck.value, [0.0])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
-from pipeline.evidence.expression import READ_SIGMA, found_expressions, neutral_mesh, posable_head, shut_eyes
+from pipeline.evidence.expression import READ_SIGMA, build_blendshape_rig, found_expressions, neutral_mesh, shut_eyes
 from pipeline.fitting.fine.blink import with_lids
 from pipeline.fitting.fit import Fit
 from rig.geometry import Similarity, rotation_from_vector
@@ -65,7 +65,7 @@ def test_without_its_expression_a_head_is_neutral(posed: tuple[HeadModel, Fit, M
 
 def test_the_morphs_give_the_photographed_head_back(posed: tuple[HeadModel, Fit, Mesh]) -> None:
     model, fit, mesh = posed
-    head = posable_head(model, PLACE, mesh, found_expressions(model, fit))
+    head = build_blendshape_rig(model, PLACE, mesh, found_expressions(model, fit))
     assert len(head.morphs) == 53  # Apple's, and the puller that has no counterpart among them
     assert head.missing == ("tongueOut",)
     moved = sum(weight * head.morphs[name] for name, weight in head.weights.items())

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from pipeline.eigenheads.model import load_model
-from pipeline.evidence.expression import posable_head
+from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.results.head_files import write_head
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
@@ -21,7 +21,7 @@ from pipeline.results.report import report_document
 from pipeline.results.write import head_mesh
 from pipeline.results.write_expression import write_expression
 from pipeline.settings import OutputSettings, Settings, settings_from_document
-from pipeline.texture.delight import Albedo
+from pipeline.texture.albedo import Albedo
 from pipeline.texture.light import Light
 from pipeline.texture.model_layout import model_layout
 from pipeline.texture.reduced_layout import reduced_layout
@@ -183,9 +183,9 @@ def test_the_khronos_validator_has_nothing_to_say(
         written(with_reduced_layout(result), tmp_path, image="webp")
     elif kind == "morphs":
         model, name = load_model(), "posed.glb"
-        posable = posable_head(model, result.head.fit.world_from_head, result.mesh_world, ())
+        blendshape_rig = build_blendshape_rig(model, result.head.fit.world_from_head, result.mesh_world, ())
         chosen = replace(result, settings=Settings(outputs=OutputSettings(morphs=True, neutral=True)))
-        write_expression(tmp_path, chosen, posable)
+        write_expression(tmp_path, chosen, blendshape_rig)
         assert validated(tmp_path / "neutral.glb", gltf_validator) == (0, 0, [])
     else:
         written(result, tmp_path, image=kind)

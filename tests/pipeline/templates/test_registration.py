@@ -118,7 +118,7 @@ def test_a_mesh_in_another_order_unit_and_frame_lies_on_the_model_again() -> Non
     mesh = polygons(shape, np.argsort(order)[level.faces])
     found = register(mesh, model, name="level.obj", report=quiet)
     head = model.vertices(rng.standard_normal(len(model.modes)))
-    off = np.linalg.norm(found.carrier.on(head, model.levels["full"].faces) - head[level.rows[order]], axis=1)
+    off = np.linalg.norm(found.surface_binding.on(head, model.levels["full"].faces) - head[level.rows[order]], axis=1)
     # chords of 9 mm sag by 0.1 mm on a head, and the model is made like the chords
     assert np.median(off) < 0.15
     assert found.covered > 0.95

@@ -11,7 +11,7 @@ from pipeline.eigenheads.data_folder import DATA
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.results.write_template import write_template
 from pipeline.settings import Settings, settings_from_document
-from pipeline.templates.carrying import attach, carrier
+from pipeline.templates.carrying import bind_vertices, surface_binding
 from pipeline.templates.header import BadTemplate, OtherModel
 from pipeline.templates.load import load_template
 from pipeline.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
@@ -36,8 +36,8 @@ def template(model: HeadModel) -> Template:
     mean = model.vertices(np.zeros(0))
     rest = mean[level.rows]
     normals = Mesh(mean, full.faces).normals()[level.rows]
-    attachment, _, _ = attach(rest, normals, mean, full.faces)
-    carried = carrier(rest, np.arange(level.count), attachment, np.full(level.count, -1))
+    attachment, _, _ = bind_vertices(rest, normals, mean, full.faces)
+    carried = surface_binding(rest, np.arange(level.count), attachment, np.full(level.count, -1))
     uv = (rest[:, :2] - rest[:, :2].min(axis=0)) / np.ptp(rest[:, :2], axis=0) * (2.0, 1.0)
     corners = level.faces.ravel().astype(np.int32)
     front = np.repeat((rest[level.faces, 2] > 20).all(axis=1), 3)
@@ -50,7 +50,7 @@ def template(model: HeadModel) -> Template:
         model_name=model.name,
         model_sha256=model.sha256,
         mesh=mesh,
-        carrier=carried,
+        surface_binding=carried,
         figures={"vertices": float(level.count)},
     )
 
@@ -62,7 +62,9 @@ def test_a_template_comes_back_and_a_damaged_file_is_told(template: Template, tm
     assert (again.name, again.model_sha256, again.figures) == ("low", template.model_sha256, dict(template.figures))
     assert again.mesh.statements == template.mesh.statements
     np.testing.assert_array_equal(again.mesh.corners, template.mesh.corners)
-    np.testing.assert_allclose(again.carrier.attachment.weights, template.carrier.attachment.weights, atol=1e-7)
+    np.testing.assert_allclose(
+        again.surface_binding.attachment.weights, template.surface_binding.attachment.weights, atol=1e-7
+    )
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(BadTemplate, match=r"template add FILE.obj --name low --overwrite"):
@@ -70,8 +72,8 @@ def test_a_template_comes_back_and_a_damaged_file_is_told(template: Template, tm
     np.savez(path, other=np.zeros(3))
     with pytest.raises(BadTemplate, match="does not carry"):
         read_template(path)
-    wrong = replace(template.carrier, skin=template.carrier.skin + 1)
-    save_template(path, replace(template, carrier=wrong))
+    wrong = replace(template.surface_binding, skin=template.surface_binding.skin + 1)
+    save_template(path, replace(template, surface_binding=wrong))
     with pytest.raises(BadTemplate, match="vertices that it does not have"):
         read_template(path)
 
@@ -124,7 +126,7 @@ def test_a_result_has_the_templates_order_and_its_texture_at_the_same_places(
     assert "map_Kd head-low" in materials
     tiles = [np.asarray(cv2.imread(str(tmp_path / name))) for name in ("head-low.jpg", "head-low-1002.jpg")]
     # a vertex of the template shows what the model's texture has at that vertex
-    front = np.flatnonzero(template.carrier.rest[:, 2] > 40)
+    front = np.flatnonzero(template.surface_binding.rest[:, 2] > 40)
     off = []
     u, v = template.mesh.uv[front].T
     place = {int(row): k for k, row in enumerate(layout.source)}

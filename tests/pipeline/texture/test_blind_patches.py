@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.eigenheads.subdivision import boundary_loops, close_loop
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.settings import TextureSettings
-from pipeline.texture.blind_patches import see_blind_patches
+from pipeline.texture.blind_patches import fill_unobserved_patches
 from pipeline.texture.inpaint import neighbours
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.paint import paint_texture
@@ -52,7 +52,7 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
     skin = found.colours.copy()
     skin[rim] = (150, 110, 90)
     layout = unwrap(mesh.vertices, mesh.faces)
-    seen = see_blind_patches(hidden, mesh, shot.silhouettes, depths, settings)
+    seen = fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths, settings)
     assert len(np.unique(seen.slots[rim, 0])) == 1  # no seams in it
     others = np.setdiff1d(np.arange(len(mesh.vertices)), rim)
     np.testing.assert_array_equal(seen.slots[others], hidden.slots[others])
@@ -76,5 +76,5 @@ def test_what_views_see_by_its_vertices_stays() -> None:
     )
     decision = coloured.decision
     assert decision is not None
-    again = see_blind_patches(decision, shot.mesh, shot.silhouettes, depths, settings)
+    again = fill_unobserved_patches(decision, shot.mesh, shot.silhouettes, depths, settings)
     np.testing.assert_array_equal(again.slots, decision.slots)

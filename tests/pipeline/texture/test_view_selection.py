@@ -11,7 +11,7 @@ from pipeline.settings import SelectionSettings
 from pipeline.texture.inpaint import neighbours
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.seam_levelling import level_views
-from pipeline.texture.view_selection import add_alike, select_views
+from pipeline.texture.view_selection import add_similar_views, select_views
 from pipeline.texture.view_selection_kernels import RING_SHARE, differences, fill_slots, propagate
 from tests.support.scenes import ellipsoid
 
@@ -166,7 +166,7 @@ def test_shares_fall_with_quality_and_with_what_is_more_than_noise(seed: int) ->
             past = max(off[v, c] / (4.0 * noise) - 1.0, 0.0)
             shares[v, c] = quality[v, c] / quality[v].max() * np.exp(-past)
     wanted = fill_slots(labels, views, shares, 4)
-    found = add_alike(labels, views, quality, detail, weights, around, SETTINGS)
+    found = add_similar_views(labels, views, quality, detail, weights, around, SETTINGS)
     np.testing.assert_array_equal(found[0], wanted[0])
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-4)
 
@@ -193,7 +193,7 @@ def test_views_are_averaged_where_they_differ_by_noise_alone() -> None:
     views = np.tile(np.array([0, 1, 2], np.int32), (count, 1))
     quality = np.ones((count, 3), np.float32)
     weights = np.ones((3, count), np.float32)
-    slots, shares = add_alike(labels, views, quality, detail, weights, around, SETTINGS)
+    slots, shares = add_similar_views(labels, views, quality, detail, weights, around, SETTINGS)
     np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-5)
     assert (slots[:, 0] == 0).all()
     assert (shares[eye, 0] > 0.99).all()

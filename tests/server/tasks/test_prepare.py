@@ -86,13 +86,13 @@ import sys
 import numpy as np
 from pipeline import kernel_list
 from pipeline.dense.surface.grid_kernels import grown
-from pipeline.kept_arrays import kept_arrays
+from pipeline.array_cache import cached_arrays
 from pipeline.kernel_list import Kernel
 from server.tasks.prepare import prepare_kernels
 
 kernel_list.listed_kernels = lambda dense: [Kernel.from_line(line) for line in sys.argv[1:]]
 print(*prepare_kernels(lambda stage, share: None), flush=True)
-kept_arrays("some", [1], lambda: {"a": np.arange(99999)}, made_by=[])
+cached_arrays("some", [1], lambda: {"a": np.arange(99999)}, made_by=[])
 cells = np.zeros((3, 3, 3), bool)
 cells[1, 1, 1] = True
 print(grown(cells).sum())

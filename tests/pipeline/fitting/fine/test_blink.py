@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
-from pipeline.fitting.fine.blink import blink_shift, blinks_of, judged_lids, with_lids
+from pipeline.fitting.fine.blink import blink_shift, blinks_of, estimate_eyelid_closure, with_lids
 from pipeline.fitting.fine.eyelids import EyeEvidence
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from pipeline.fitting.fit import Fit
@@ -39,7 +39,7 @@ def test_one_closed_eye_and_one_open_are_told_from_each_other(model: HeadModel) 
     fit = fit_of(model)
     surface = points_of(model, with_lids(fit, model, {"right": 1.0}))
     open_eyes = {side: EyeEvidence(0.2, 0.3, 5) for side in ("right", "left")}
-    lids, _ = judged_lids(fit, model, head_of(model, fit), surface, open_eyes)
+    lids, _ = estimate_eyelid_closure(fit, model, head_of(model, fit), surface, open_eyes)
     assert lids == {"right": 1.0, "left": 0.0}
     shut = head_of(model, with_lids(fit, model, lids))
     np.testing.assert_allclose(head_of(model, fit) + blink_shift(fit, model, lids), shut, atol=1e-3)
@@ -48,30 +48,30 @@ def test_one_closed_eye_and_one_open_are_told_from_each_other(model: HeadModel) 
 def test_an_open_eye_without_a_white_is_not_closed(model: HeadModel) -> None:
     fit = fit_of(model)
     nothing = {side: EyeEvidence(0.0, 0.01, 5) for side in ("right", "left")}
-    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), nothing) == (
+    assert estimate_eyelid_closure(fit, model, head_of(model, fit), points_of(model, fit), nothing) == (
         {"right": 0.0, "left": 0.0},
         frozenset(),
     )
     half = points_of(model, with_lids(fit, model, {"left": 0.75}))
-    assert judged_lids(fit, model, head_of(model, fit), half, nothing)[0]["left"] == 1.0
+    assert estimate_eyelid_closure(fit, model, head_of(model, fit), half, nothing)[0]["left"] == 1.0
 
 
 def test_lids_that_close_another_way_than_the_model_are_bridged(model: HeadModel) -> None:
     fit = fit_of(model)
     vague = points_of(model, fit, noise_mm=3.0)  # half closed lids lie 1.1 times as far from them as open ones
     nothing = {side: EyeEvidence(0.0, 0.01, 5) for side in ("right", "left")}
-    lids, otherwise = judged_lids(fit, model, head_of(model, fit), vague, nothing)
+    lids, unexplained = estimate_eyelid_closure(fit, model, head_of(model, fit), vague, nothing)
     assert lids == {"right": 0.0, "left": 0.0}
-    assert otherwise == {"right", "left"}
+    assert unexplained == {"right", "left"}
     shown = {side: EyeEvidence(0.1, 0.3, 5) for side in ("right", "left")}
-    assert not judged_lids(fit, model, head_of(model, fit), vague, shown)[1]
+    assert not estimate_eyelid_closure(fit, model, head_of(model, fit), vague, shown)[1]
 
 
 def test_a_model_that_does_not_blink_says_nothing_of_lids() -> None:
     model = with_modes(load_model(), 2)
     assert blinks_of(model) == {}
     fit = fit_of(model)
-    assert judged_lids(fit, model, head_of(model, fit), points_of(model, fit), {}) == ({}, frozenset())
+    assert estimate_eyelid_closure(fit, model, head_of(model, fit), points_of(model, fit), {}) == ({}, frozenset())
     assert not blink_shift(fit, model, {}).any()
 
 
@@ -80,14 +80,14 @@ def test_lids_that_the_found_face_shows_apart_are_not_closed(model: HeadModel) -
     fit = fit_of(model)
     surface = points_of(model, with_lids(fit, model, {"left": 1.0}))
     apart = {"left": EyeEvidence(0.0, 0.01, 5, opening=0.2)}
-    lids, otherwise = judged_lids(fit, model, head_of(model, fit), surface, apart)
+    lids, unexplained = estimate_eyelid_closure(fit, model, head_of(model, fit), surface, apart)
     assert lids["left"] == 0.5
-    assert not otherwise
+    assert not unexplained
 
 
 def test_lids_that_the_found_face_shows_together_are_closed(model: HeadModel) -> None:
     """Dark lashes, and points that say that the model's blink does not fit."""
     fit = fit_of(model)
     together = {"left": EyeEvidence(0.1, 0.3, 5, opening=0.04)}
-    _, otherwise = judged_lids(fit, model, head_of(model, fit), points_of(model, fit), together)
-    assert otherwise == {"left"}
+    _, unexplained = estimate_eyelid_closure(fit, model, head_of(model, fit), points_of(model, fit), together)
+    assert unexplained == {"left"}

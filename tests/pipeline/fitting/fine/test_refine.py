@@ -6,9 +6,9 @@ import pytest
 from pipeline.dense.part_codes import Part
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.eigenheads.regions import head_regions
-from pipeline.fitting.fine.eyelids import EyeEvidence, bridged
+from pipeline.fitting.fine.eyelids import EyeEvidence, bridge_eyelids
 from pipeline.fitting.fine.folds import folded
-from pipeline.fitting.fine.refine import Displaced, draw_to_surface, refine_to_surface
+from pipeline.fitting.fine.refine import DeformedSurface, deform_to_points, refine_to_surface
 from pipeline.fitting.fine.surface_points import SurfacePoints, thinned
 from pipeline.fitting.fit import Fit
 from pipeline.fitting.posterior import vertex_deviation_mm
@@ -22,11 +22,11 @@ AXES_MM = np.array([82.0, 79.0, 81.0])
 NOISE_MM = 0.2
 
 
-def drawn(surface: SurfacePoints, deviation_mm: float = 1.5) -> tuple[np.ndarray, np.ndarray, Displaced]:
+def drawn(surface: SurfacePoints, deviation_mm: float = 1.5) -> tuple[np.ndarray, np.ndarray, DeformedSurface]:
     """The sphere, its faces, and what the points make of it."""
     vertices, faces, nodes = subdivided_sphere()
     loose = np.zeros(len(vertices), bool)
-    found = draw_to_surface(
+    found = deform_to_points(
         vertices, np.full(len(vertices), deviation_mm), faces, nodes, surface, FineSettings(), loose=loose
     )
     return vertices, faces, found
@@ -150,7 +150,7 @@ def test_a_planted_head_is_found_within_its_intervals(model: HeadModel) -> None:
 def test_closed_lids_bridge_the_opening(model: HeadModel) -> None:
     faces = model.levels["full"].faces
     open_head = model.vertices(np.zeros(0))
-    truth = bridged(open_head, model, frozenset({"right", "left"}))
+    truth = bridge_eyelids(open_head, model, frozenset({"right", "left"}))
     fit = Fit("contour", np.zeros(0), Similarity(1.0, np.eye(3), np.zeros(3)), 1, "planted", np.diag([1e-8] * 7))
     surface = head_points(truth, faces, np.random.default_rng(12))
     shown = {"right": EyeEvidence(0.0, 0.01, 5), "left": EyeEvidence(0.0, 0.01, 5)}

@@ -8,12 +8,12 @@ import pytest
 from pipeline.diagnostics import Detail
 from pipeline.eigenheads.model import HeadModel
 from pipeline.estimation.terms import NormalEquations
-from pipeline.fitting.contour import Solved
+from pipeline.fitting.contour import ContourSolution
 from pipeline.fitting.head_problem import apply_step
 from pipeline.fitting.photo.correlation import choose_views, correlate
 from pipeline.fitting.photo.depth_search import facing_of, pixels_per_mm, sample_visibility
 from pipeline.fitting.photo.patches import Patches, spread_samples
-from pipeline.fitting.photo.refine import LOST_MM, finer, refine_with_photographs, unfollowed
+from pipeline.fitting.photo.refine import LOST_MM, finer, local_misfit_mm, refine_with_photographs
 from pipeline.fitting.problem import Stage, State, SurfaceObservations
 from pipeline.fitting.surface_term import SurfaceTerm
 from pipeline.imaging.grey import noise_level
@@ -37,11 +37,11 @@ def bump(model: HeadModel) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def refined(bump: Scene) -> tuple[Solved, Detail]:
+def refined(bump: Scene) -> tuple[ContourSolution, Detail]:
     return refine_with_photographs(bump.start(), bump.images, SETTINGS)
 
 
-def test_a_bump_inside_the_outline_is_found(bump: Scene, refined: tuple[Solved, Detail]) -> None:
+def test_a_bump_inside_the_outline_is_found(bump: Scene, refined: tuple[ContourSolution, Detail]) -> None:
     """A pixel is 0.9 mm; views 25 degrees apart see 1 mm of depth as 0.5 px. Matched to 0.1 px, by 30 independent
     samples a patch and ten views, that is 0.05 mm; the basis (9 mm) follows a bump of 14 mm almost wholly."""
     solved, detail = refined
@@ -54,7 +54,7 @@ def test_a_bump_inside_the_outline_is_found(bump: Scene, refined: tuple[Solved, 
 
 
 def test_gains_and_offsets_of_cameras_do_not_matter(
-    model: HeadModel, bump: Scene, refined: tuple[Solved, Detail]
+    model: HeadModel, bump: Scene, refined: tuple[ContourSolution, Detail]
 ) -> None:
     """The same noise at another gain moves an observation by a part of its own noise, no more."""
     gains = np.random.default_rng(0).uniform(0.7, 1.3, len(bump.rig))
@@ -87,7 +87,7 @@ def test_pictures_that_show_nothing_leave_the_fit_as_it_was(model: HeadModel, ki
 
 
 def test_a_camera_that_was_moved_does_not_move_the_surface(
-    model: HeadModel, bump: Scene, refined: tuple[Solved, Detail]
+    model: HeadModel, bump: Scene, refined: tuple[ContourSolution, Detail]
 ) -> None:
     """One camera turned by 0.4 px (twice the calibration's prior), another by -0.3: they are found to 0.15 px, and the
     surface is no worse than 1.3 times that of exact cameras, plus 0.02 mm for chance."""
@@ -284,7 +284,7 @@ def test_a_place_that_no_photograph_finds_again_is_misfit_there_and_nowhere_else
         np.zeros((1, 6)), np.eye(6), np.zeros(6),
     )  # fmt: skip
     state = State(np.zeros(len(model.modes)), Similarity.identity(), np.zeros((1, 6)))
-    misfit, cage = unfollowed(model, observed, state, lost), model.mean
+    misfit, cage = local_misfit_mm(model, observed, state, lost), model.mean
     front = cage[:, 2] > 10.0
     assert misfit[front & (cage[:, 1] > 20.0)].max() < 1.5 * off_mm
     assert misfit[front & (cage[:, 1] < -70.0)].max() > 0.7 * LOST_MM

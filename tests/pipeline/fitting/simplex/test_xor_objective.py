@@ -230,7 +230,7 @@ def test_the_fit_reports_uses_what_is_usable_and_may_be_cancelled(
     assert fractions == sorted(fractions)
     assert fractions[-1] <= 1.0
     assert fit.used == {"cam00": True, "cam02": False, "cam07": True, "cam08": True}
-    assert fit.stopped_because.count("converged") == len(HIERARCHY)
+    assert fit.termination_reason.count("converged") == len(HIERARCHY)
     assert fit.evaluations < len(HIERARCHY) * LIMIT
     assert fit.world_from_head is POSE
     # Two modes of some millimetres against masks of 1.2 mm a pixel: a tenth of a standard deviation is seen.

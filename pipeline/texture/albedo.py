@@ -43,7 +43,7 @@ class Albedo:
     light: Light
 
 
-def delight(
+def estimate_albedo(
     mesh_world: Mesh,
     normals: Float[np.ndarray, "v 3"],
     coloured: Texture,

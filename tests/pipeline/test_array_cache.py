@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import compiled, kept_arrays
-from pipeline.kept_arrays import UNUSED_S
+from pipeline import array_cache, compiled
+from pipeline.array_cache import UNUSED_S
 from rig.mesh import vertex_normals
 from server.processes import python_environment
 
@@ -44,7 +44,7 @@ class Maker:
             self.times += 1
             return MADE
 
-        return kept_arrays.kept_arrays("modes", inputs or GIVEN, make, made_by=(vertex_normals,))
+        return array_cache.cached_arrays("modes", inputs or GIVEN, make, made_by=(vertex_normals,))
 
 
 def equal(found: dict[str, np.ndarray]) -> bool:
@@ -79,7 +79,7 @@ def test_another_input_another_thread_count_and_another_source_are_another_file(
         maker(*inputs)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     maker()
-    monkeypatch.setattr(kept_arrays, "_source", lambda module: module.encode())
+    monkeypatch.setattr(array_cache, "_source", lambda module: module.encode())
     maker()
     assert maker.times == len(list(folder.iterdir())) == 6
 
@@ -114,7 +114,7 @@ def test_a_full_disk_leaves_nothing_half(folder: Path, monkeypatch: pytest.Monke
     def full(path: Path, data: bytes) -> None:
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(kept_arrays, "write_atomically", full)
+    monkeypatch.setattr(array_cache, "write_atomically", full)
     assert equal(Maker()())
     assert not folder.exists()
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import Settings
-from pipeline.silhouettes.own_pictures import ExchangedPictures, WrongRig, misplaced_plates, own_pictures
+from pipeline.silhouettes.image_assignment import ExchangedPictures, WrongRig, assign_images, misplaced_plates
 from pipeline.silhouettes.segment import segment
 from rig.capture import Capture, reassign_images
 from rig.studio.scene.layout import arrangement
@@ -17,13 +17,14 @@ EXCHANGE = {"cam04": "cam06", "cam06": "cam04"}
 
 
 def judged(shot, capture, exchanged: Literal["repair", "refuse"] = "repair", rig=None):
-    """``own_pictures`` with the studio's true masks, filed as the pictures are: nothing here depends on their noise."""
+    """``assign_images`` with the studio's true masks, filed as the pictures are: nothing here depends on their
+    noise."""
     truth = {id(shot.capture.images[name]): mask for name, mask in shot.masks.items()}
 
     def segmented(filed: Capture):
         return {name: silhouette_from_mask(truth[id(image)]) for name, image in filed.images.items()}
 
-    return own_pictures(capture, rig or shot.rig, segmented, exchanged=exchanged)
+    return assign_images(capture, rig or shot.rig, segmented, exchanged=exchanged)
 
 
 def filed_right(shot, found):
@@ -96,6 +97,6 @@ def test_segmentation_of_exchanged_cables_ends_where_that_of_good_ones_does(half
         return segment(capture, shot.rig, settings, report=lambda stage, share: None)
 
     exchanged = reassign_images(shot.capture, pictures=EXCHANGE, plates=EXCHANGE)
-    found = own_pictures(exchanged, shot.rig, segmented, exchanged="repair")
+    found = assign_images(exchanged, shot.rig, segmented, exchanged="repair")
     good = segmented(shot.capture)
     assert all(np.array_equal(found.silhouettes[name].mask, good[name].mask) for name in shot.rig.names)

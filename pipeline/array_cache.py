@@ -34,7 +34,7 @@ BLAS_VARIABLES = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS",
 USED_AFTER_S, UNUSED_S = 86400.0, 30 * 86400.0  # a use is noted once a day; a file that nobody used for a month goes
 
 
-def kept_arrays(
+def cached_arrays(
     name: str,
     inputs: Sequence[Any],
     make: Callable[[], Mapping[str, np.ndarray]],

@@ -43,7 +43,7 @@ Segmentation = Callable[[Capture], dict[str, Silhouette]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OwnPictures:
+class ImageAssignment:
     """A capture and its silhouettes with every picture under its own camera; ``pictures`` and ``plates`` say, for each
     camera that was given another's, the name under which its own is filed."""
 
@@ -66,9 +66,9 @@ class WrongRig(EigenheadError):
     """Pictures that these cameras cannot have taken."""
 
 
-def own_pictures(
+def assign_images(
     capture: Capture, rig: Rig, segmented: Segmentation, *, exchanged: Literal["repair", "refuse"]
-) -> OwnPictures:
+) -> ImageAssignment:
     """Segments a capture, and files exchanged pictures and plates back.
 
     Args:
@@ -101,7 +101,7 @@ def own_pictures(
     warnings = _warnings(assignment, plates, duplicates)
     if not assignment.pictures and loose_outlines(distinct, rig):
         warnings = (*warnings, compose("outlines-loose"))
-    return OwnPictures(capture, _left_out(silhouettes, duplicates), assignment.pictures, plates, warnings)
+    return ImageAssignment(capture, _left_out(silhouettes, duplicates), assignment.pictures, plates, warnings)
 
 
 def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:

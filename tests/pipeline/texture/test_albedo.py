@@ -8,12 +8,12 @@ from pipeline.experiments.light import face_texels, texels
 from pipeline.imaging.cpu_raster import depth_maps
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import TextureSettings
-from pipeline.texture.delight import DIM_SHARE, Albedo, delight, shine_left
+from pipeline.texture.albedo import DIM_SHARE, Albedo, estimate_albedo, shine_left
 from pipeline.texture.inpaint import neighbours
 from pipeline.texture.neighbourhood import Neighbourhood
 from pipeline.texture.paint import paint_texture
 from pipeline.texture.uv_unwrap import Atlas, Layout, unwrap
-from pipeline.texture.vertex_colours import Texture, dim_views, texture
+from pipeline.texture.vertex_colours import Texture, texture, underexposed_views
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -81,7 +81,7 @@ def found(mesh: Mesh, layout: Layout) -> dict[str, tuple[Atlas, Albedo, np.ndarr
         )
         assert coloured.decision is not None
         atlas = paint_texture(layout, mesh, coloured.colours, coloured.decision, 1024)
-        albedo, warnings = delight(mesh, normals, coloured, atlas, np.ones(len(normals), bool), around)
+        albedo, warnings = estimate_albedo(mesh, normals, coloured, atlas, np.ones(len(normals), bool), around)
         assert albedo is not None
         assert not warnings
         out[name] = (atlas, albedo, coloured.views > 0)
@@ -139,14 +139,14 @@ def test_a_wide_highlight_is_taken_off_and_noise_is_not(mesh: Mesh) -> None:
 def test_a_dim_view_is_the_one_at_its_share_of_the_weight() -> None:
     colours = np.array([0.9, 0.2, 0.5, 0.1], np.float32)[:, None, None] * np.ones((1, 2, 3), np.float32)
     weights = np.array([[1, 0], [1, 0], [1, 0], [0, 0]], np.float32)
-    found = dim_views(weights, colours, 0.3)
+    found = underexposed_views(weights, colours, 0.3)
     np.testing.assert_allclose(found, [[0.2] * 3, [0.0] * 3])  # the unseen view is dimmer, and does not count
 
 
 def test_without_a_texture_there_is_a_warning(mesh: Mesh) -> None:
     count = len(mesh.vertices)
     coloured = Texture(np.full((count, 3), 120, np.uint8), np.ones(count, np.uint8))
-    albedo, warnings = delight(mesh, mesh.normals(), coloured, None, np.ones(count, bool), None)
+    albedo, warnings = estimate_albedo(mesh, mesh.normals(), coloured, None, np.ones(count, bool), None)
     assert albedo is None
     assert [warning.code for warning in warnings] == ["no-albedo"]
 
@@ -156,6 +156,6 @@ def test_a_black_face_has_no_albedo_and_a_warning(mesh: Mesh, layout: Layout) ->
     coloured = Texture(np.zeros((count, 3), np.uint8), np.ones(count, np.uint8), dim=np.zeros((count, 3), np.float32))
     atlas = Atlas(layout, np.zeros((64, 64, 3), np.uint8))
     around = Neighbourhood.of(*neighbours(mesh.faces, count))
-    albedo, warnings = delight(mesh, mesh.normals(), coloured, atlas, np.ones(count, bool), around)
+    albedo, warnings = estimate_albedo(mesh, mesh.normals(), coloured, atlas, np.ones(count, bool), around)
     assert albedo is None
     assert [warning.code for warning in warnings] == ["no-albedo"]
