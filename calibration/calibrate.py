@@ -92,7 +92,9 @@ def calibrate_detections(
     graph = build_graph(detections, lenses)
     report("bundle", 0.0)
     fit = _adjust(graph, detections, lenses, report)
-    return _judged(fit, detections, lenses, [*dropped, *fit.dropped], detected, front, previous, report)
+    return _judged(
+        fit, detections, lenses, [*dropped, *fit.dropped], detected, front=front, previous=previous, report=report
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,7 +157,7 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
         dropped += found
         gone = {(d.shot, d.camera) for d in found}
         views = tuple(v for v in views if not {(v.shot, v.camera), (v.shot, None)} & gone)
-    return _finish(state, views, graph, detections, lenses, weak, noise, tuple(dropped), report)
+    return _finish(state, views, graph, detections, lenses, weak, noise=noise, dropped=tuple(dropped), report=report)
 
 
 def _finish(
@@ -165,6 +167,7 @@ def _finish(
     detections: Detections,
     lenses: dict[str, Lens],
     weak: LensPrior,
+    *,
     noise: Float[np.ndarray, " c"],
     dropped: tuple[Dropped, ...],
     report: Progress,
@@ -235,7 +238,9 @@ def _explain(
     for shot in sorted({view.shot for view in strange}):
         inside = [view for view in (*graph.views, *graph.strays) if view.shot == shot]
         bad = [view for view in strange if view.shot == shot]
-        yield from explain_shot(shot, inside, bad, detections, state, graph.names, boards, noise_px)
+        yield from explain_shot(
+            shot, inside, bad, detections, state, names=graph.names, boards=boards, noise_px=noise_px
+        )
 
 
 def _judged(
@@ -244,6 +249,7 @@ def _judged(
     lenses: dict[str, Lens],
     dropped: Sequence[Dropped],
     detected: int,
+    *,
     front: str | None,
     previous: Rig | None,
     report: Progress,

@@ -41,7 +41,7 @@ def cached_arrays(
     *,
     made_by: Iterable[Callable[..., Any]],
 ) -> dict[str, np.ndarray]:
-    """What ``make()`` returns, or what it returned to an earlier process.
+    """Returns what ``make()`` returns, or what it returned to an earlier process.
 
     Args:
         name: what the arrays are, for the file's name.

@@ -64,7 +64,7 @@ _choose_processor()
 
 
 def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.njit`` that keeps what it compiles in ``cache_folder()``.
+    """Compiles as ``numba.njit`` does, and keeps what it compiles in ``cache_folder()``.
 
     Args:
         cache: whether to keep it.
@@ -87,7 +87,7 @@ def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Calla
 
 
 class KeptFunction:
-    """What Numba asks for a function that it is to compile, and tells of one that it did."""
+    """Holds what Numba asks for a function that it is to compile, and tells of one that it did."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
@@ -98,7 +98,7 @@ class KeptFunction:
         return str(cache_folder() / "kernels")
 
     def file(self, signature: Any) -> Path:
-        """Where the function compiled for these argument types is or would be."""
+        """Returns where the function compiled for these argument types is or would be."""
         if not self._digest:  # late: a function may call one that its module defines further down
             self._digest = function_digest(self._dispatcher)
         key = f"{self._digest} {signature!r} {machine()}"
@@ -107,7 +107,7 @@ class KeptFunction:
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(key.encode()).hexdigest()}"
 
     def is_kept(self, signature: Any) -> bool:
-        """Whether there is a file for these argument types."""
+        """Tells whether there is a file for these argument types."""
         file = self.file(signature)
         try:
             return (CARRIED / file.name).is_file() or file.is_file()
@@ -115,7 +115,7 @@ class KeptFunction:
             return False
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """The compiled function, or None where none is kept, or a damaged one."""
+        """Returns the compiled function, or None where none is kept, or a damaged one."""
         target_context.refresh()
         file = self.file(signature)
         for path in (CARRIED / file.name, file):
@@ -138,7 +138,7 @@ class KeptFunction:
             say_not_kept(error)
 
     def flush(self) -> None:
-        """Nothing: a file that the code no longer leads to is not found."""
+        """Does nothing: a file that the code no longer leads to is not found."""
 
 
 @cache
@@ -147,7 +147,7 @@ def _warned() -> set[str]:
 
 
 def say_not_kept(error: OSError) -> None:
-    """One line a process where the cache folder cannot be written."""
+    """Writes one line a process where the cache folder cannot be written."""
     folder = str(cache_folder())
     if folder not in _warned():
         _warned().add(folder)
@@ -161,7 +161,7 @@ def say_not_kept(error: OSError) -> None:
 
 @cache
 def machine() -> str:
-    """What a compiled function follows from besides its source: versions and the processor's features."""
+    """Returns what a compiled function follows from besides its source: versions and the processor's features."""
     options: Any = config
     target: Any = cpu_target.target_context
     versions = (numba.__version__, llvmlite.__version__, sys.implementation.cache_tag)
@@ -169,7 +169,7 @@ def machine() -> str:
 
 
 def function_digest(dispatcher: Dispatcher) -> str:
-    """Sha256 of all that the compiled function follows from in the sources."""
+    """Returns the SHA-256 of all that the compiled function follows from in the sources."""
     digest = hashlib.sha256()
     for part in _function_parts(dispatcher, set()):
         digest.update(part)

@@ -51,7 +51,7 @@ ReportWarning = Message
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """How deep the fit went, and why no deeper or why so deep."""
+    """Says how deep the fit went, and why no deeper or why so deep."""
 
     level: Literal["span", "kernel", "photo", "fine"]
     reason: Message

@@ -32,7 +32,7 @@ _NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """One compiled loop for one set of argument types."""
+    """Holds one compiled loop for one set of argument types."""
 
     place: str  # "fitting.rim_kernels:see", relative to this package
     arguments: tuple[str, ...]
@@ -44,7 +44,7 @@ class Kernel:
 
     @property
     def line(self) -> str:
-        """As the list has it."""
+        """Returns it as the list has it."""
         return " ".join((self.place, *self.arguments))
 
     @property
@@ -52,7 +52,7 @@ class Kernel:
         return self.place.partition(":")[0]
 
     def dispatcher(self) -> Dispatcher | None:
-        """The function, or None where loops are not compiled (NUMBA_DISABLE_JIT)."""
+        """Returns the function, or None where loops are not compiled (NUMBA_DISABLE_JIT)."""
         module, _, name = self.place.partition(":")
         function = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
         return function if isinstance(function, Dispatcher) else None
@@ -61,14 +61,14 @@ class Kernel:
         return tuple(type_from_text(text) for text in self.arguments)
 
     def is_kept(self) -> bool:
-        """Whether the wheel brought it, or an earlier process left it in the cache folder."""
+        """Tells whether the wheel brought it, or an earlier process left it in the cache folder."""
         dispatcher = self.dispatcher()
         kept = None if dispatcher is None else getattr(dispatcher, "_cache", None)
         return not isinstance(kept, KeptFunction) or kept.is_kept(self.signature())
 
     def size(self) -> int:
-        """Of the code that is compiled, the loops that it calls included, in bytes of the interpreter's: what takes
-        longest is begun first."""
+        """Returns the size of the code that is compiled, the loops that it calls included, in bytes of the
+        interpreter's: what takes longest is begun first."""
         dispatcher = self.dispatcher()
         return 0 if dispatcher is None else code_size(dispatcher)
 
@@ -80,7 +80,7 @@ class Kernel:
 
 
 def listed_kernels(*, dense: bool = True) -> list[Kernel]:
-    """All of the list, or without those that only the dense stage calls."""
+    """Returns all of the list, or without those that only the dense stage calls."""
     plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
     return [Kernel.from_line(line) for line in (*plain.splitlines(), *(added.splitlines() if dense else ()))]
 
@@ -122,7 +122,7 @@ def _members(text: str) -> Iterator[str]:
 
 
 def text_from_type(kind: Any) -> str:
-    """The list's notation. Raises ValueError where it has none."""
+    """Returns the list's notation. Raises ValueError where it has none."""
     if isinstance(kind, types.Array):
         text = f"{kind.dtype}[{kind.ndim}{kind.layout}]" + "r" * (not kind.mutable)
     elif isinstance(kind, types.NamedTuple | types.NamedUniTuple):

@@ -21,7 +21,7 @@ SLICES = 8  # of a loop: enough that threads end together
 
 
 def thread_count() -> int:
-    """How many threads share a loop: EIGENHEAD_THREADS, else the CPUs that this process may use. Raises
+    """Tells how many threads share a loop: EIGENHEAD_THREADS, else the CPUs that this process may use. Raises
     WrongVariable."""
     requested = os.environ.get(THREADS, "").strip()
     if not requested:
@@ -32,7 +32,7 @@ def thread_count() -> int:
 
 
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:
-    """``work(first, last)`` over slices of ``range(count)``; for compiled loops that let go of the interpreter.
+    """Runs ``work(first, last)`` over slices of ``range(count)``; for compiled loops that let go of the interpreter.
 
     The caller takes slices like everyone else. A helper that has not begun when they are gone (all busy, or left behind
     by a fork) is called off, so that nobody waits for it.
@@ -60,7 +60,7 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
 
 
 def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
-    """``work(k)`` of every k below ``count``, in order; shared out as by ``in_threads``."""
+    """Returns ``work(k)`` of every k below ``count``, in order; shared out as by ``in_threads``."""
     found: dict[int, Result] = {}
 
     def take(first: int, last: int) -> None:

@@ -45,7 +45,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     texturing = run(texture_head, context, views, head, refined)
     bust = run(fuse_bust, context, views, depth, refined, texturing.capture)
     pose = run(check_pose, context, faces, alignment, head, refined)
-    evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing, pose)
+    evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(

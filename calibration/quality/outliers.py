@@ -102,6 +102,7 @@ def explain_shot(
     bad: Sequence[View],
     detections: Detections,
     state: BundleState,
+    *,
     names: Sequence[str],
     boards: dict[str, RigidTransform],
     noise_px: float,

@@ -28,7 +28,8 @@ FORGIVEN_SIGMAS = 2.5  # a residual of that many deviations has twice its varian
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceAlignment:
-    """``rms_sigmas``: of what is left between the mean head's places and the found ones, by what is expected."""
+    """Holds the pose and how well it fits. ``rms_sigmas``: of what is left between the mean head's places and the found
+    ones, by what is expected."""
 
     world_from_head: Similarity
     landmarks: LandmarkObservations

@@ -14,7 +14,7 @@ NAMES_TOLD = 8
 
 
 def feature_faults(features: Features, rig: Rig) -> list[Message]:
-    """Why these points determine no alignment; nothing where they do, or where there are none."""
+    """Tells why these points determine no alignment; nothing where they do, or where there are none."""
     if not features:
         return []
     faults = unknown_landmarks(features)
@@ -33,6 +33,6 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
 
 
 def unknown_landmarks(features: Features) -> list[Message]:
-    """Names that no model has."""
+    """Returns names that no model has."""
     unknown = sorted(set(features) - set(NAMES))[:NAMES_TOLD]
     return [compose("feature-unknown", name=f"{name!r:.80}", known=SEVEN_POINTS) for name in unknown]

@@ -21,7 +21,7 @@ CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedFeatures:
-    """World points by landmark name, and a sentence for everything that was left out."""
+    """Holds the world points by landmark name, and a sentence for everything that was left out."""
 
     points: Mapping[str, TriangulatedPoint]
     remarks: tuple[Message, ...] = ()

@@ -35,7 +35,7 @@ OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points
 
 
 class TooFewFeatures(EigenheadError):
-    """Feature points that determine no alignment."""
+    """Reports feature points that determine no alignment."""
 
     def __init__(self, usable: Mapping[str, TriangulatedPoint], why: Message, remarks: tuple[Message, ...]) -> None:
         counts = [compose("landmark-views", name=n, views=len(point.residuals_px)) for n, point in usable.items()]
@@ -50,7 +50,7 @@ class TooFewFeatures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureAlignment:
-    """``world_from_head``, the paper's ``procrustes`` of the same points, and the evidence.
+    """Holds ``world_from_head``, the paper's ``procrustes`` of the same points, and the evidence.
 
     ``residuals_mm``: distance of every point from the mean head's landmark, outliers too; ``used`` says which spoke.
     """
@@ -64,12 +64,12 @@ class FeatureAlignment:
 
 
 def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> Similarity:
-    """world_from_head of ``feature_alignment``. Raises TooFewFeatures."""
+    """Returns world_from_head of ``feature_alignment``. Raises TooFewFeatures."""
     return feature_alignment(model, features, rig, settings).world_from_head
 
 
 def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> FeatureAlignment:
-    """Alignment to picked points: outliers found, eq. (3) minimised, then weighed. Raises TooFewFeatures."""
+    """Returns alignment to picked points: outliers found, eq. (3) minimised, then weighed. Raises TooFewFeatures."""
     located = locate_features(features, rig, noise_px=settings.feature_noise_px)
     unknown = [
         compose("feature-not-of-model", name=name, model=model.name)
@@ -107,7 +107,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
 def landmark_statistics(
     model: HeadModel, names: list[str], noise_mm: float
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "p p"]]:
-    """The mean head's landmarks (head frame, mm) and their covariance over the population (mm^2, p = 3 n).
+    """Returns the mean head's landmarks (head frame, mm) and their covariance over the population (mm^2, p = 3 n).
 
     ``noise_mm`` is what a person's idea of a landmark and the model's differ by.
     """
@@ -120,7 +120,7 @@ def landmark_statistics(
 def consensus(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], expected_mm: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"] | None:
-    """Which points belong together; None where no triple of them spans a triangle.
+    """Returns which points belong together; None where no triple of them spans a triangle.
 
     Of the rigid alignments through every triple, the one with the least truncated sum of squared residuals wins; points
     within OUTLIER_SIGMAS of the alignment of all that agree are kept. 26 points make 2,600 triples: 0.3 s.

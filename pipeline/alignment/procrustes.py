@@ -12,7 +12,8 @@ ITERATIONS = 20
 def procrustes(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> Similarity:
-    """Full ordinary Procrustes: the similarity T that minimises eq. (3), ``sum_j w_j |target_j - T(source_j)|^2``.
+    """Returns the full ordinary Procrustes: the similarity T that minimises eq. (3), ``sum_j w_j |target_j -
+    T(source_j)|^2``.
 
     Dryden and Mardia, Statistical Shape Analysis, section 7.2; the determinant keeps a mirror image out. Raises
     ValueError where the points determine no rotation (all on a line).
@@ -38,7 +39,8 @@ def generalised_procrustes(
     start: Similarity,
     scale_spread: float = SCALE_SPREAD,
 ) -> Similarity:
-    """Maximum likelihood of ``target = T(source + e) + f``: ``e`` (head frame) and ``f`` (world frame) correlated.
+    """Returns the maximum likelihood of ``target = T(source + e) + f``: ``e`` (head frame) and ``f`` (world frame)
+    correlated.
 
     Iterated generalised least squares from ``start``: the residual's covariance is ``s^2 R C R^T + F``, taken at the
     last estimate. log s has the prior N(0, ``scale_spread``^2).

@@ -54,7 +54,7 @@ REFERENCE_PX = 3000.0  # outline length that costs are scaled to, so that hiding
 
 
 class NoSubject(EigenheadError):
-    """The silhouettes have no common volume near the middle of the rig."""
+    """Reports that the silhouettes have no common volume near the middle of the rig."""
 
     def __init__(self) -> None:
         super().__init__(compose("no-subject"))
@@ -62,7 +62,8 @@ class NoSubject(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class FoundPose:
-    """``rival``: how much more the best pose that is turned otherwise costs, as a share; None where there is none."""
+    """Holds a pose with its evidence. ``rival``: how much more the best pose that is turned otherwise costs, as a
+    share; None where there is none."""
 
     world_from_head: Similarity
     rival: float | None
@@ -185,7 +186,8 @@ def _differently_turned(states: Sequence[State]) -> list[State]:
 def head_origin(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """Where the origin of the mean head is, so that its crown and the middle of its head meet the visual hull's."""
+    """Returns where the origin of the mean head is, so that its crown and the middle of its head meet the visual
+    hull's."""
     line = np.arange(-REACH_MM, REACH_MM + 1, SPACING_MM)
     grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)  # along the head's axes
     points = rig.centre_world() + grid @ axes.T
@@ -217,7 +219,7 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """The head turned about its own origin, first nodding and then about the upright axis."""
+    """Returns the head turned about its own origin, first nodding and then about the upright axis."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

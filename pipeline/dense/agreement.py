@@ -30,7 +30,7 @@ PIXEL_SHARE = 0.56  # of a pixel's square on the surface, brought onto the ray, 
 def depth_maps(
     crops: Sequence[Crop], stack: Stack, fields: Sequence[Field], settings: DenseSettings
 ) -> tuple[DepthMap, ...]:
-    """The fields of full size, held against each other."""
+    """Returns the fields of full size, held against each other."""
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
     depth = np.concatenate([field.depth.ravel() for field in fields])
     slopes = np.concatenate([field.slopes.reshape(-1, 2) for field in fields])
@@ -56,7 +56,7 @@ def depth_maps(
 def stated_deviation(
     camera: Camera, field: Field, agreeing: UInt8[np.ndarray, "h w"], apart: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Standard deviation of the depth, mm.
+    """Returns the standard deviation of the depth, mm.
 
     Args:
         agreeing: how many other views have the surface at the same place.
@@ -90,7 +90,8 @@ def _depth_map(
 
 
 def normals_world(camera: Camera, field: Field) -> Float32[np.ndarray, "h w 3"]:
-    """Unit normals towards the camera: of the plane ``z(x, y)`` through points ``z (x - cx, y - cy, f) / f``."""
+    """Returns unit normals towards the camera: of the plane ``z(x, y)`` through points ``z (x - cx, y - cy, f) /
+    f``."""
     k = camera.intrinsics
     column, row = np.meshgrid(np.arange(k.width, dtype=np.float32), np.arange(k.height, dtype=np.float32))
     x, y = (column - k.cx) / k.fx, (row - k.cy) / k.fy

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int64
 
 
 class Cells(NamedTuple):
-    """``order`` sorts the points by ``keys`` (given sorted): the rank of their cell in a box of ``spans`` cells, whose
-    outermost cells are empty. The neighbours of a cell are at fixed steps of the key."""
+    """Sorts points into cells: ``order`` sorts the points by ``keys`` (given sorted): the rank of their cell in a box
+    of ``spans`` cells, whose outermost cells are empty. The neighbours of a cell are at fixed steps of the key."""
 
     order: Int64[np.ndarray, " n"]
     keys: Int64[np.ndarray, " n"]
@@ -16,7 +16,7 @@ class Cells(NamedTuple):
 
 
 def sorted_into_cells(points: Float[np.ndarray, "n 3"], wide: float) -> Cells:
-    """The points in cells as ``wide`` as given, in the unit of the points."""
+    """Returns the points in cells as ``wide`` as given, in the unit of the points."""
     cell = np.floor((points - points.min(axis=0)) / wide).astype(np.int64) + 1
     spans = cell.max(axis=0) + 2
     keys = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]

@@ -28,7 +28,7 @@ BLUR_PX = 0.5  # before every halving, and of the full size: what is left is fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """A crop at one size. ``camera`` belongs to this size."""
+    """Holds a crop at one size. ``camera`` belongs to this size."""
 
     camera: Camera
     grey: Float32[np.ndarray, "h w"]
@@ -38,7 +38,7 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crop:
-    """What one camera shows of the subject; ``levels`` halve from one to the next."""
+    """Holds what one camera shows of the subject; ``levels`` halve from one to the next."""
 
     levels: tuple[Level, ...]
     colour: UInt8[np.ndarray, "h w 3"]
@@ -57,7 +57,7 @@ def make_crops(
     pixel_mm: float,
     at_world: Float[np.ndarray, " 3"],
 ) -> list[Crop]:
-    """The crops of all cameras that have a photograph and a usable silhouette with something in it.
+    """Returns the crops of all cameras that have a photograph and a usable silhouette with something in it.
 
     Args:
         pixel_mm: a photograph with smaller pixels than this (mm, at ``at_world``) is reduced to it.
@@ -105,7 +105,8 @@ def _crop(
 
 
 def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
-    """A pinhole at the camera's pose, whose image just holds the subject; sides are multiples of the least level's.
+    """Returns a pinhole at the camera's pose, whose image just holds the subject; sides are multiples of the least
+    level's.
 
     Where the photograph cuts the subject off, the crop goes on beyond it: the pixels of its edge are then unseen.
     """
@@ -128,7 +129,7 @@ def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
 
 
 def lens_map(camera: Camera, pinhole: Camera) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Column and row at which the camera's photograph shows each pixel of a pinhole at the same pose."""
+    """Returns the column and row at which the camera's photograph shows each pixel of a pinhole at the same pose."""
     k = pinhole.intrinsics
     x, y = np.empty((k.height, k.width), np.float32), np.empty((k.height, k.width), np.float32)
     fill_lens_map(k.values()[:4], packed_lens(camera), x, y)

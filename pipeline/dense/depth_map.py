@@ -10,7 +10,7 @@ from rig.camera import Camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthMap:
-    """The surface that one camera sees, on the pixels of a pinhole crop about the subject.
+    """Holds the surface that one camera sees, on the pixels of a pinhole crop about the subject.
 
     ``camera`` has no distortion; its name and pose are those of the rig's camera. A pixel is known where its deviation
     is finite; elsewhere depth, normal and ``views`` are 0.
@@ -26,12 +26,12 @@ class DepthMap:
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:
-        """Where the photographs say how far the surface is."""
+        """Returns where the photographs say how far the surface is."""
         return np.isfinite(self.deviation_mm)
 
 
 def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
-    """The known pixels as points of the world frame, mm, row by row."""
+    """Returns the known pixels as points of the world frame, mm, row by row."""
     camera = depth_map.camera
     row, column = np.nonzero(depth_map.known)
     z, k = depth_map.depth_mm[row, column].astype(float), camera.intrinsics

@@ -51,7 +51,7 @@ def estimate_depth(
     *,
     report: Progress,
 ) -> tuple[DepthMap, ...]:
-    """What each photograph, matched with its neighbours, says of the surface.
+    """Returns what each photograph, matched with its neighbours, says of the surface.
 
     Args:
         images: RGB, by camera name.

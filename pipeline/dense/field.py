@@ -8,7 +8,8 @@ from jaxtyping import Float32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """Depth (mm of camera z, 0 where there is no surface) and slopes (mm a pixel, by x and y) of a view's pixels."""
+    """Holds the depth (mm of camera z, 0 where there is no surface) and slopes (mm a pixel, by x and y) of a view's
+    pixels."""
 
     depth: Float32[np.ndarray, "h w"]
     slopes: Float32[np.ndarray, "h w 2"]

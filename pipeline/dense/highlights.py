@@ -65,7 +65,7 @@ class _Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excess:
-    """What k views show above the skin's own light at v places, by light that is less coloured."""
+    """Holds what k views show above the skin's own light at v places, by light that is less coloured."""
 
     levels: Float32[np.ndarray, "k v"]  # 0 to 255, as displayed
     sure: Bool[np.ndarray, "k v"]  # where nothing but a highlight explains it

@@ -12,7 +12,8 @@ from rig.camera import Camera
 def choose_neighbours(
     cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"], settings: DenseSettings
 ) -> list[Int[np.ndarray, " _"]]:
-    """For every camera the numbers of those to compare it with, the nearest in angle first; empty where it has none.
+    """Returns for every camera the numbers of those to compare it with, the nearest in angle first; empty where it has
+    none.
 
     Args:
         at_world: about the middle of the subject; angles are between the lines of sight to it.

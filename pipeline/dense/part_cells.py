@@ -32,8 +32,8 @@ DETAIL_BLUR_CELLS = 1.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadGuide:
-    """Where on a fitted head a place is, by vertex: signed distance (mm) from the border of the face region, positive
-    within, and height (mm) above the chin along the head's own axis; and that axis."""
+    """Says where on a fitted head a place is, by vertex: signed distance (mm) from the border of the face region,
+    positive within, and height (mm) above the chin along the head's own axis; and that axis."""
 
     mesh: Mesh  # world frame
     into_face_mm: Float[np.ndarray, " v"]
@@ -48,8 +48,8 @@ class HeadGuide:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """One view's cells. Places are those of the fitted head where it covers the cell; beside it, of the plane through
-    its middle that faces the camera."""
+    """Holds one view's cells. Places are those of the fitted head where it covers the cell; beside it, of the plane
+    through its middle that faces the camera."""
 
     camera: Camera
     size_px: int
@@ -69,7 +69,8 @@ class Cells:
 def head_guide(
     mesh: Mesh, face_region: Bool[np.ndarray, " v"], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> HeadGuide:
-    """The guide of a fitted head; ``landmarks`` (world) need the corners of eyes and mouth, glabella and gnathion."""
+    """Returns the guide of a fitted head; ``landmarks`` (world) need the corners of eyes and mouth, glabella and
+    gnathion."""
     vertices, chin = mesh.vertices, landmarks["gnathion"]
     eyes = (landmarks["exocanthion_right"] + landmarks["exocanthion_left"]) / 2
     left = landmarks["exocanthion_left"] - landmarks["exocanthion_right"]
@@ -126,7 +127,7 @@ def make_cells(
     head: HeadGuide,
     cell_mm: float,
 ) -> list[Cells]:
-    """The cells of every view that has a photograph, colours of all cameras made alike."""
+    """Returns the cells of every view that has a photograph, colours of all cameras made alike."""
     cameras = [camera for camera in rig if camera.name in images]
     sizes = [_cell_px(camera, head.middle, cell_mm) for camera in cameras]
     shots = [images[camera.name] for camera in cameras]
@@ -139,7 +140,7 @@ def make_cells(
 
     def cells(k: int) -> Cells:
         mask = masks[cameras[k].name]
-        return _cells(cameras[k], sizes[k], shots[k], mask, light[k] * gains[k], seen[k], head)
+        return _cells(cameras[k], sizes[k], shots[k], mask, light[k] * gains[k], seen[k], head=head)
 
     return map_in_threads(cells, len(cameras))
 
@@ -212,6 +213,7 @@ def _cells(
     mask: Bool[np.ndarray, "h w"],
     light: Float32[np.ndarray, "r c 3"],
     seen: tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 5"]],
+    *,
     head: HeadGuide,
 ) -> Cells:
     depth, values = seen
@@ -257,7 +259,7 @@ def _height_beside(camera: Camera, size: int, shape: tuple[int, int], head: Head
 
 
 def grey_of(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """The photograph in grey as displayed, 0 to 1."""
+    """Returns the photograph in grey as displayed, 0 to 1."""
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.float32) / np.float32(255.0)
 
 

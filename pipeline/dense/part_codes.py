@@ -11,7 +11,7 @@ from jaxtyping import Int, UInt8
 
 
 class Part(IntEnum):
-    """What a vertex or a point of the surface shows. The numbers stand in written files: they never change."""
+    """Holds what a vertex or a point of the surface shows. The numbers stand in written files: they never change."""
 
     UNSEEN = 0
     SKIN = 1

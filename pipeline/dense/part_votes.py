@@ -23,7 +23,8 @@ CELL_MM = 4.0  # edge of a cell
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartVotes:
-    """Cells of the visible surface: their mean places (world, mm) and the mean probability of skin, hair, clothes."""
+    """Holds cells of the visible surface: their mean places (world, mm) and the mean probability of skin, hair,
+    clothes."""
 
     corner: Float[np.ndarray, " 3"]
     size: Int[np.ndarray, " 3"]  # cells along each axis
@@ -33,7 +34,7 @@ class PartVotes:
 
 
 def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> PartVotes | None:
-    """The votes of all known pixels.
+    """Returns the votes of all known pixels.
 
     Args:
         depth_maps: one a view.
@@ -76,12 +77,12 @@ def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.n
 
 
 def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-    """The part (``Part``) that each point's own cell (or, without one, the nearest) shows most."""
+    """Returns the part (``Part``) that each point's own cell (or, without one, the nearest) shows most."""
     return codes_from_channels(part_shares(votes, points).argmax(axis=1))
 
 
 def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Probability of skin, hair and clothes at each point, of its own cell or, without one, the nearest."""
+    """Returns the probability of skin, hair and clothes at each point, of its own cell or, without one, the nearest."""
     cell = np.floor((points - votes.corner) / CELL_MM).astype(np.int64)
     inside = ((cell >= 0) & (cell < votes.size)).all(axis=1)
     keys = np.where(inside, _keys(cell, votes.size), -1)

@@ -48,7 +48,7 @@ FLOOR = 0.02  # of a part's looks that its histogram has not shown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartMap:
-    """One view. ``probability`` of skin, hair and clothes on the photograph's own grid; what is missing to one is
+    """Holds one view. ``probability`` of skin, hair and clothes on the photograph's own grid; what is missing to one is
     unknown, all of it outside the subject."""
 
     camera: str
@@ -62,11 +62,11 @@ def classify_parts(
     head_world: Mesh,
     face_region: Bool[np.ndarray, " v"],
     landmarks_world: Mapping[str, Float[np.ndarray, " 3"]],
-    settings: PartSettings,
     *,
+    settings: PartSettings,
     report: Progress,
 ) -> dict[str, PartMap]:
-    """What the pixels of every usable view with a photograph show.
+    """Returns what the pixels of every usable view with a photograph show.
 
     Args:
         images: sRGB photographs by camera.
@@ -115,7 +115,7 @@ def classify_parts(
 
 
 def bins(view: Cells) -> Int[np.ndarray, "r c 2"]:
-    """Bin of colour and of fine structure of every cell."""
+    """Returns the bin of colour and of fine structure of every cell."""
     red, blue, light = np.moveaxis(view.colour, 2, 0)
     a, b = _bin(red, RED_RANGE, RED_BINS), _bin(blue, BLUE_RANGE, BLUE_BINS)
     colour = (a * BLUE_BINS + b) * LIGHT_BINS + _bin(light, LIGHT_RANGE, LIGHT_BINS)
@@ -127,7 +127,7 @@ def _bin(values: Float32[np.ndarray, "r c"], span: tuple[float, float], count: i
 
 
 def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
-    """Cells that by their place can hardly be anything but skin, hair or clothes (1, else 0).
+    """Returns cells that by their place can hardly be anything but skin, hair or clothes (1, else 0).
 
     Skin: cheeks and nose. Hair:
     the cranium far from the face, and what lies beside the head above the ears. Clothes: what lies well below the chin
@@ -141,32 +141,33 @@ def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
 
 
 def beard_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Jaw, chin and upper lip."""
+    """Returns jaw, chin and upper lip."""
     low = (view.above_chin_mm > -20.0) & (view.above_chin_mm < 50.0)
     return view.on_head & low & (view.into_face_mm > -15.0)
 
 
 def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Above it, between cheeks and ears, where only a beard reaches."""
+    """Marks the zone above it, between cheeks and ears, where only a beard reaches."""
     above = (view.above_chin_mm >= 50.0) & (view.above_chin_mm < 80.0)
     return view.on_head & above & (view.into_face_mm > -15.0) & (view.cheek < 0.5)
 
 
 def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Where a beard grows and light falls on skin, too: the zone without lips and without the underside of jaw and
-    chin, which is dark with a beard and without."""
+    """Returns where a beard grows and light falls on skin, too: the zone without lips and without the underside of jaw
+    and chin, which is dark with a beard and without."""
     return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
 
 
 def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
-    """0 for a bare lower face, 1 for a beard, by the share of it that looks otherwise than cheeks and nose: of heads
-    without a beard it is below 0.12, of beards above 0.9."""
+    """Returns 0 for a bare lower face, 1 for a beard, by the share of it that looks otherwise than cheeks and nose: of
+    heads without a beard it is below 0.12, of beards above 0.9."""
     share = float(unlikeness[lower].mean()) if lower.any() else 0.0
     return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
 
 
 def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4"]:
-    """Probability of each part, and of none, by place alone, and by whether there is a beard (``beard_evidence``)."""
+    """Returns the probability of each part, and of none, by place alone, and by whether there is a beard
+    (``beard_evidence``)."""
     face = _ramp(view.into_face_mm, -25.0, 15.0)
     upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
     skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
@@ -197,8 +198,8 @@ def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float3
 def unlike_cheeks(
     appearance: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """How far every cell does not look like those that are skin for certain, 0 to 1: by colour, and by colour and fine
-    structure, which tells a blond beard from skin (but shadows' borders from skin, too)."""
+    """Tells how far every cell does not look like those that are skin for certain, 0 to 1: by colour, and by colour and
+    fine structure, which tells a blond beard from skin (but shadows' borders from skin, too)."""
     everything = np.ones(len(appearance), np.float32)
     colour, detail = (
         (of(which, cheeks) / of(which, everything))[which]
@@ -216,7 +217,8 @@ def fit_appearance(
     unlikeness: Float[np.ndarray, " n"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "n 4"]:
-    """Log likelihood of every cell's looks under skin, hair, clothes and the outlier, and of there being such a part.
+    """Returns the log likelihood of every cell's looks under skin, hair, clothes and the outlier, and of there being
+    such a part.
 
     Starts from the cells of each part that are sure by their place, less those of hair and clothes that look like skin.
     """
@@ -247,13 +249,13 @@ def _presence(
 
 
 def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
-    """Probability of each part; what is missing to one is the outlier's."""
+    """Returns the probability of each part; what is missing to one is the outlier's."""
     share = prior * np.exp(logs - logs.max(axis=1, keepdims=True))
     return share[:, :3] / share.sum(axis=1, keepdims=True)
 
 
 def colour_histogram(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " b"]:
-    """Probability of every bin of colour, smoothed, nowhere zero."""
+    """Returns the probability of every bin of colour, smoothed, nowhere zero."""
     shape = (RED_BINS, BLUE_BINS, LIGHT_BINS)
     counts = np.bincount(colour, weight, np.prod(shape)).astype(np.float32)
     counts = counts.reshape(RED_BINS, BLUE_BINS * LIGHT_BINS)
@@ -266,7 +268,7 @@ def colour_histogram(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, 
 
 
 def detail_histogram(detail: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
-    """Probability of every bin of fine structure, smoothed, nowhere zero."""
+    """Returns the probability of every bin of fine structure, smoothed, nowhere zero."""
     counts = np.bincount(detail, weight, DETAIL_BINS).astype(np.float32)[None]
     return _proper(cv2.GaussianBlur(counts, (0, 0), sigmaX=DETAIL_BLUR, sigmaY=0.1).ravel().astype(float))
 
@@ -284,7 +286,7 @@ def upsample_guided(
     mask: Bool[np.ndarray, "h w"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """The cells' probabilities made smooth up to edges of the photograph, on its own grid."""
+    """Returns the cells' probabilities made smooth up to edges of the photograph, on its own grid."""
     grid = np.zeros((*inside.shape, 3), np.float32)
     grid[inside] = share
     radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
@@ -301,7 +303,8 @@ def guided(
     radius: int,
     edge: float,
 ) -> tuple[Float32[np.ndarray, "r c p"], Float32[np.ndarray, "r c p"]]:
-    """Slope and offset of the guided filter: ``slope guide + offset`` are the smooth values (eqs. 5, 6 and 8 there).
+    """Returns slope and offset of the guided filter: ``slope guide + offset`` are the smooth values (eqs. 5, 6 and 8
+    there).
 
     ``weight`` is 0 where values are unknown; ``edge`` the contrast of the guide that ends a neighbourhood.
     """

@@ -29,7 +29,7 @@ MOST_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
 def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> list[Field]:
-    """The fields at twice the size, the size of ``stack``."""
+    """Returns the fields at twice the size, the size of ``stack``."""
 
     def work(view: int) -> Field:
         field, distance = fields[view], stack.image(stack.distance_px, view)
@@ -56,11 +56,21 @@ def refined(
     rounds: int,
     speck_px: int,
 ) -> list[Field]:
-    """The fields after planes of neighbours ``steps_px`` away were tried (odd; empty: none), without pieces of
+    """Returns the fields after planes of neighbours ``steps_px`` away were tried (odd; empty: none), without pieces of
     ``speck_px`` pixels or fewer, and after ``rounds`` slides."""
 
     def work(view: int) -> Field:
-        return _refined(fields[view], stack, view, neighbours[view], pattern, settings, steps_px, rounds, speck_px)
+        return _refined(
+            fields[view],
+            stack,
+            view,
+            neighbours[view],
+            pattern,
+            settings,
+            steps_px=steps_px,
+            rounds=rounds,
+            speck_px=speck_px,
+        )
 
     return map_in_threads(work, len(fields))
 
@@ -72,6 +82,7 @@ def _refined(
     neighbours: Int[np.ndarray, " m"],
     pattern: Float32[np.ndarray, "2 s"],
     settings: DenseSettings,
+    *,
     steps_px: Sequence[int],
     rounds: int,
     speck_px: int,

@@ -32,7 +32,8 @@ STEEPEST = 3.0  # slope against the image plane: 72 degrees
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthRange:
-    """Depth bounds (mm) of one view's pixels, 0 where there is none, and their slopes by x and y (mm a pixel)."""
+    """Holds the depth bounds (mm) of one view's pixels, 0 where there is none, and their slopes by x and y (mm a
+    pixel)."""
 
     near: Float32[np.ndarray, "h w"]
     far: Float32[np.ndarray, "h w"]
@@ -47,7 +48,7 @@ def find_depth_ranges(
     extent: tuple[Float[np.ndarray, " 3"], float],
     settings: DenseSettings,
 ) -> list[DepthRange]:
-    """The room of every view at the size of ``stack``.
+    """Returns the room of every view at the size of ``stack``.
 
     Args:
         least: the crops at their least size, where silhouettes and head are asked.

@@ -43,7 +43,7 @@ def first_fields(
     pattern: Float32[np.ndarray, "2 s"],
     settings: DenseSettings,
 ) -> list[Field]:
-    """The fields of all views by a sweep through their rooms; their information is 0.
+    """Returns the fields of all views by a sweep through their rooms; their information is 0.
 
     Args:
         neighbours: of each view, those that it is compared with.
@@ -61,7 +61,8 @@ def first_fields(
 
 
 def label_strides(room: DepthRange, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
-    """One in how many labels is matched: 1, 2, 4 ..., so that places lie no farther apart than in the deepest room."""
+    """Returns one in how many labels is matched: 1, 2, 4 ..., so that places lie no farther apart than in the deepest
+    room."""
     depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
     return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
 

@@ -42,7 +42,7 @@ class _Collapser:
         return {w for k in self.at[v] for w in self.faces[k]} - {v}
 
     def push_from(self, v: int) -> None:
-        """Offer the collapses of v into each neighbour."""
+        """Offers the collapses of v into each neighbour."""
         if self.fixed[v]:
             return
         for u in self.ring(v):
@@ -134,7 +134,7 @@ def decimate(
     fixed: Bool[np.ndarray, " V"],
     chart: Float[np.ndarray, "V 2"] | None = None,
 ) -> list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ 3"]]]:
-    """One level per target face count (falling): kept vertex indices, ascending, and faces among them.
+    """Returns one level per target face count (falling): kept vertex indices, ascending, and faces among them.
 
     ``importance`` multiplies the error of a vertex (denser where it is high), ``fixed`` vertices are all kept, no
     triangle turns over in the ``chart`` (texture coordinates) where there is one. A level

@@ -34,7 +34,7 @@ ARKIT = tuple(sorted([*_WHOLE, *(f"{name}{side}" for name in _SIDED for side in 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expressions:
-    """E shapes on the cage, head frame. Arrays are read-only once they belong to a model."""
+    """Holds E shapes on the cage, head frame. Arrays are read-only once they belong to a model."""
 
     names: tuple[str, ...]
     shapes: Float32[np.ndarray, "E V0 3"]  # mm at weight 1
@@ -43,7 +43,8 @@ class Expressions:
         return len(self.names)
 
     def moved(self, weights: Mapping[str, float]) -> Float[np.ndarray, "V0 3"]:
-        """The displacement of the cage (mm) for weights by name. Raises KeyError for a name that is not there."""
+        """Returns the displacement of the cage (mm) for weights by name. Raises KeyError for a name that is not
+        there."""
         out = np.zeros(self.shapes.shape[1:])
         for name, weight in weights.items():
             if name not in self.names:
@@ -53,30 +54,31 @@ class Expressions:
 
 
 def no_expressions(vertices: int) -> Expressions:
-    """Of a model that has none."""
+    """Returns the expressions of a model that has none."""
     return Expressions((), np.zeros((0, vertices, 3), np.float32))
 
 
 def visible(expressions: Expressions) -> Expressions:
-    """Those that move the skin."""
+    """Returns those that move the skin."""
     kept = np.linalg.norm(expressions.shapes, axis=2).max(axis=1) >= LEAST_MM if len(expressions) else np.zeros(0, bool)
     names = tuple(name for name, keep in zip(expressions.names, kept, strict=True) if keep)
     return Expressions(names, expressions.shapes[kept])
 
 
 def plain_name(name: str) -> str:
-    """A name in Apple's manner: ``mouthSmile_L`` is ``mouthSmileLeft``."""
+    """Returns a name in Apple's manner: ``mouthSmile_L`` is ``mouthSmileLeft``."""
     return re.sub(r"_([LR])$", lambda side: "Left" if side[1] == "L" else "Right", name)
 
 
 def words(name: str) -> str:
-    """A name as people say it: ``mouthSmile_L`` is ``mouth smile left``."""
+    """Returns a name as people say it: ``mouthSmile_L`` is ``mouth smile left``."""
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", plain_name(name))
     return re.sub(r"[-_ ]+", " ", spaced).strip().lower()
 
 
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """For each of Apple's names, in their order: which of the shapes together stand for it; none where none does.
+    """Returns for each of Apple's names, in their order: which of the shapes together stand for it; none where none
+    does.
 
     A shape of that name, or the two sides of one that Apple does not part (ICT-FaceKit's cheekPuff_L and cheekPuff_R).
     """
@@ -89,7 +91,8 @@ def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
-    """``NAME=WEIGHT`` with names of the model, in its own manner or Apple's. Raises InputError naming every fault."""
+    """Reads ``NAME=WEIGHT`` with names of the model, in its own manner or Apple's. Raises InputError naming every
+    fault."""
     known = {plain_name(name): name for name in names} | {name: name for name in names}
     found, faults = {}, []
     for text in texts:
@@ -112,7 +115,7 @@ def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str,
 
 
 def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
-    """How far the eyes (``right``, ``left``) are closed by blinking, 0 to 1."""
+    """Tells how far the eyes (``right``, ``left``) are closed by blinking, 0 to 1."""
     found: dict[str, float] = dict.fromkeys(("right", "left"), 0.0)
     for name, weight in weights.items():
         side = BLINKS.get(plain_name(name))
@@ -122,7 +125,7 @@ def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
 
 
 def packed(expressions: Expressions) -> dict[str, np.ndarray]:
-    """As a model file keeps them: the moved vertices of each shape, float16 (0.004 mm of a centimetre)."""
+    """Packs them as a model file keeps them: the moved vertices of each shape, float16 (0.004 mm of a centimetre)."""
     moved = np.abs(expressions.shapes).max(axis=2) > SPARSE_MM
     return {
         "expression_counts": moved.sum(axis=1).astype(np.int32),
@@ -132,7 +135,7 @@ def packed(expressions: Expressions) -> dict[str, np.ndarray]:
 
 
 def unpacked(names: list[str], arrays: Mapping[str, np.ndarray], vertices: int) -> Expressions:
-    """What ``packed`` made. Raises ValueError where the arrays contradict each other."""
+    """Returns what ``packed`` made. Raises ValueError where the arrays contradict each other."""
     counts, rows, moves = (arrays[f"expression_{part}"] for part in ("counts", "vertices", "moves"))
     if len(counts) != len(names) or counts.sum() != len(rows) or moves.shape != (len(rows), 3):
         raise ValueError("its expressions' arrays do not fit each other")

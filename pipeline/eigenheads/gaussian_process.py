@@ -26,7 +26,7 @@ KEPT = 0.98  # share of the process's variance that the modes must carry
 
 @dataclass(frozen=True, slots=True)
 class KernelScale:
-    """One Gaussian of the kernel."""
+    """Holds one Gaussian of the kernel."""
 
     length_mm: float
     amplitude_mm: float
@@ -41,7 +41,7 @@ FREE = 0.4  # share of the variance that need not be symmetric
 def with_kernel(
     model: HeadModel, count: int, *, scales: tuple[KernelScale, ...] = SCALES, most: int = 300
 ) -> HeadModel:
-    """The first ``count`` eigenheads followed by at most ``most`` kernel modes (mm per standard deviation)."""
+    """Returns the first ``count`` eigenheads followed by at most ``most`` kernel modes (mm per standard deviation)."""
     span = with_modes(model, count)
     modes = kernel_modes(span, scales, most)
     sigma = np.linalg.norm(modes.reshape(len(modes), -1), axis=1).astype(np.float32)
@@ -54,7 +54,8 @@ def with_kernel(
 
 
 def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float, most: int = 400) -> HeadModel:
-    """The model with further modes of a shorter length inside the face region, for those who see more than a rim.
+    """Returns the model with further modes of a shorter length inside the face region, for those who see more than a
+    rim.
 
     They fade out over half a length beyond the region, and are not made orthogonal to the others: prior variance of a
     deformation is meant to add up over lengths.
@@ -103,7 +104,7 @@ def kernel_modes(model: HeadModel, scales: tuple[KernelScale, ...], most: int) -
 def covariance(
     x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"], scales: tuple[KernelScale, ...]
 ) -> Float[np.ndarray, "n m"]:
-    """k(x, y) in mm^2."""
+    """Returns k(x, y) in mm^2."""
     direct, mirrored = _square_distance(x, y), _square_distance(x, y * (-1.0, 1.0, 1.0))
     total = np.zeros_like(direct)
     for scale in scales:
@@ -119,7 +120,7 @@ def _square_distance(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"]) -
 
 
 def spread_nodes(points: Float[np.ndarray, "v 3"], count: int) -> Int[np.ndarray, " n"]:
-    """Farthest-point sampling, from the point farthest along z: even cover, the same every time."""
+    """Returns farthest-point sampling, from the point farthest along z: even cover, the same every time."""
     nodes = np.empty(count, int)
     nodes[0] = int(np.argmax(points[:, 2]))
     distance = np.full(len(points), np.inf)

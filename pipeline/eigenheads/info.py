@@ -12,7 +12,7 @@ class LevelInfo(TypedDict):
 
 
 class ModelInfo(TypedDict):
-    """Vertices and faces are the full level's; what nobody measured is None."""
+    """Says what is known of a model. Vertices and faces are the full level's; what nobody measured is None."""
 
     name: str
     licence: str
@@ -32,7 +32,7 @@ class ModelInfo(TypedDict):
 
 
 def model_info(model: HeadModel) -> ModelInfo:
-    """Plain values."""
+    """Returns plain values."""
     full = model.levels["full"]
     return {
         "name": model.name,

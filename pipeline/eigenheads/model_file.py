@@ -22,7 +22,7 @@ DAMAGE = (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.erro
 
 
 class BadModel(EigenheadError):
-    """A file that is not a head model of this project, or a damaged one."""
+    """Reports a file that is not a head model of this project, or a damaged one."""
 
     def __init__(self, path: Path | str, why: str) -> None:
         super().__init__(
@@ -31,7 +31,7 @@ class BadModel(EigenheadError):
 
 
 class Damaged(BadModel):
-    """A file of which a part is missing or cannot be read."""
+    """Holds a file of which a part is missing or cannot be read."""
 
     def __init__(self, path: Path | str, fault: Exception) -> None:
         super().__init__(path, f"damaged or incomplete ({fault})")
@@ -39,7 +39,7 @@ class Damaged(BadModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelParts:
-    """What a model file holds; ``assemble`` makes the HeadModel of it."""
+    """Holds what a model file holds; ``assemble`` makes the HeadModel of it."""
 
     name: str
     licence: str
@@ -60,7 +60,7 @@ class ModelParts:
 
 
 def save_model(path: Path, parts: ModelParts) -> None:
-    """Write a model file (npz, compressed; float32, rounded to 2^-12 mm so that it packs small)."""
+    """Writes a model file (npz, compressed; float32, rounded to 2^-12 mm so that it packs small)."""
     expressions = parts.expressions or no_expressions(len(parts.mean))
     meta = {
         "format": FORMAT,
@@ -92,12 +92,12 @@ def save_model(path: Path, parts: ModelParts) -> None:
 
 
 def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
-    """As a model file keeps lengths."""
+    """Rounds as a model file keeps lengths."""
     return (np.round(np.asarray(values, float) * 4096) / 4096).astype(np.float32)
 
 
 def read_parts(path: Path) -> tuple[ModelParts, str]:
-    """The content of a model file and its SHA-256. Raises BadModel."""
+    """Returns the content of a model file and its SHA-256. Raises BadModel."""
     try:
         raw = path.read_bytes()
     except OSError as fault:

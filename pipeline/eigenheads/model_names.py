@@ -13,7 +13,7 @@ _PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman"
 
 
 class UnknownModel(EigenheadError):
-    """A model name that is neither shipped nor in the user's folder, nor a file."""
+    """Refuses a model name that is neither shipped nor in the user's folder, nor a file."""
 
     def __init__(self, name: str) -> None:
         known = ", ".join(sorted(list_models()))
@@ -24,14 +24,14 @@ class UnknownModel(EigenheadError):
 
 
 class ShippedModel(EigenheadError):
-    """A model that comes with the program, where one of the user's own is meant."""
+    """Reports a model that comes with the program, where one of the user's own is meant."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the head model {name!r} comes with the program and cannot be removed")
 
 
 def list_models() -> dict[str, Path]:
-    """Models at hand by name: the shipped default and the files of the user's folder."""
+    """Returns models at hand by name: the shipped default and the files of the user's folder."""
     found = {DEFAULT: PACKS / _PACK_FILES[DEFAULT]}
     folder = models_folder()
     if folder.is_dir():
@@ -40,7 +40,7 @@ def list_models() -> dict[str, Path]:
 
 
 def model_path(name_or_path: str | Path) -> Path:
-    """The file behind a name or path. Raises UnknownModel."""
+    """Returns the file behind a name or path. Raises UnknownModel."""
     name = str(name_or_path)
     if name in _PACK_FILES:
         return PACKS / _PACK_FILES[name]
@@ -54,7 +54,7 @@ def model_path(name_or_path: str | Path) -> Path:
 
 
 def model_sha256(path: Path) -> str:
-    """Of a model's file, as results name it. Raises OSError."""
+    """Returns the SHA-256 of a model's file, as results name it. Raises OSError."""
     state = path.stat()
     return _sha256(path, state.st_mtime_ns, state.st_size)
 

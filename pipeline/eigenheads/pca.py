@@ -15,7 +15,8 @@ from rig.geometry import rigid_fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
-    """mean + scores @ modes gives the heads back. Modes are mm per standard deviation and orthogonal."""
+    """Holds principal components: mean + scores @ modes gives the heads back. Modes are mm per standard deviation and
+    orthogonal."""
 
     mean: Float[np.ndarray, "V 3"]
     modes: Float[np.ndarray, "M V 3"]
@@ -26,7 +27,7 @@ class Components:
 def align(
     heads: Float[np.ndarray, "N V 3"], weights: Float[np.ndarray, " V"], *, rounds: int = 10
 ) -> Float[np.ndarray, "N V 3"]:
-    """Every head moved rigidly onto the common mean, which keeps the pose and place of the first head."""
+    """Returns every head moved rigidly onto the common mean, which keeps the pose and place of the first head."""
     aligned, mean = heads.copy(), heads[0]
     first = heads[0]
     for _ in range(rounds):
@@ -42,7 +43,8 @@ def align(
 
 
 def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
-    """N - 1 components of N aligned heads. The sign of a mode makes its largest entry positive: builds repeat."""
+    """Returns N - 1 components of N aligned heads. The sign of a mode makes its largest entry positive: builds
+    repeat."""
     count, vertices = heads.shape[:2]
     flat = heads.reshape(count, -1).astype(float)
     mean = flat.mean(0)
@@ -60,7 +62,7 @@ def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
 
 
 def orthogonalised(modes: Float[np.ndarray, "M V 3"]) -> tuple[Float[np.ndarray, "M V 3"], Float[np.ndarray, " M"]]:
-    """Orthogonal modes with exactly the same distribution of heads, and their sigma.
+    """Returns orthogonal modes with exactly the same distribution of heads, and their sigma.
 
     For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so U S spans the same Gaussian: no
     variance is lost or moved, only the axes turn.

@@ -15,14 +15,14 @@ from rig.mesh import boundary_edges, face_normals
 
 
 class NotAManifold(EigenheadError):
-    """A surface on which an edge has more than two triangles, or two that disagree about the outside."""
+    """Reports a surface on which an edge has more than two triangles, or two that disagree about the outside."""
 
     def __init__(self, count: int, what: str) -> None:
         super().__init__(f"{count} edges {what}; repair the mesh (one consistently wound surface) and try again")
 
 
 def row_count(operator: sparse.csr_array) -> int:
-    """Rows of a sparse operator."""
+    """Returns rows of a sparse operator."""
     shape = operator.shape
     assert shape is not None
     return int(shape[0])
@@ -31,7 +31,8 @@ def row_count(operator: sparse.csr_array) -> int:
 def edges_of(
     faces: Int[np.ndarray, "F 3"],
 ) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F 3"], Int[np.ndarray, " E"]]:
-    """Unique edges (sorted pairs), the edge opposite each corner of each face, and the faces at each edge (a count)."""
+    """Returns unique edges (sorted pairs), the edge opposite each corner of each face, and the faces at each edge (a
+    count)."""
     directed = np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]).astype(np.int64)
     low, high = directed.min(1), directed.max(1)
     base = int(faces.max()) + 1
@@ -55,7 +56,7 @@ def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndarray, " V"]:
-    """Vertices on an open edge of the mesh."""
+    """Returns vertices on an open edge of the mesh."""
     edges, _, uses = edges_of(faces)
     flags = np.zeros(count, bool)
     flags[edges[uses == 1].ravel()] = True
@@ -63,13 +64,13 @@ def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndar
 
 
 def vertex_areas(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, " V"]:
-    """A third of the area of the triangles at each vertex, mm²."""
+    """Returns a third of the area of the triangles at each vertex, mm²."""
     area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 6
     return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
 
 
 def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
-    """Closed loops of open edges, each in the direction in which its triangles run. Raises NotAManifold."""
+    """Returns closed loops of open edges, each in the direction in which its triangles run. Raises NotAManifold."""
     after: dict[int, int] = {}
     rim = boundary_edges(faces)
     for a, b in rim.tolist():
@@ -88,7 +89,7 @@ def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
 
 
 def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.ndarray, "T 3"]:
-    """A strip of triangles across a long opening such as a mouth or an eye, from its left end to its right one.
+    """Returns a strip of triangles across a long opening such as a mouth or an eye, from its left end to its right one.
 
     No vertex is added. The strip continues the surface if ``loop`` runs as ``boundary_loops`` gives it.
     """
@@ -111,7 +112,7 @@ def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.nd
 
 
 def subdivision(faces: Int[np.ndarray, "F 3"], count: int) -> tuple[sparse.csr_array, Int[np.ndarray, "F4 3"]]:
-    """One Loop step: the operator ((V + E) x V) and the refined faces. Old vertices come first."""
+    """Returns one Loop step: the operator ((V + E) x V) and the refined faces. Old vertices come first."""
     edges, opposite_edge, uses = edges_of(faces)
     moved = _even_rule(edges, uses, count)
     fresh = _odd_rule(faces, edges, opposite_edge, uses, count)
@@ -155,7 +156,7 @@ def _odd_rule(
 
 
 def refine(faces: Int[np.ndarray, "F 3"], count: int, steps: int) -> tuple[sparse.csr_array, Int[np.ndarray, "G 3"]]:
-    """``steps`` Loop steps as one operator (identity for 0)."""
+    """Returns ``steps`` Loop steps as one operator (identity for 0)."""
     operator: sparse.csr_array = sparse.csr_array(sparse.identity(count, format="csr"))
     for _ in range(steps):
         step, faces = subdivision(faces, row_count(operator))

@@ -15,7 +15,8 @@ def least_within(
     lower: Float[np.ndarray, " p"],
     upper: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """The x that minimises ``x^T M x / 2 + g^T x`` with ``lower <= x <= upper``, M symmetric and positive definite.
+    """Returns the x that minimises ``x^T M x / 2 + g^T x`` with ``lower <= x <= upper``, M symmetric and positive
+    definite.
 
     The unknowns without a bound are eliminated: with them first, the last corner of M's root is the root of their
     Schur complement.

@@ -32,7 +32,7 @@ Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.n
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """When to stop, and how to begin. ``tolerance``: predicted fall of the cost (squared standard deviations)."""
+    """Holds when to stop, and how to begin. ``tolerance``: predicted fall of the cost (squared standard deviations)."""
 
     steps: int = 50
     tolerance: float = 1e-6
@@ -43,7 +43,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """How a solution came about; ``predicted_fall``: of the last step tried, in squared standard deviations."""
+    """Says how a solution came about; ``predicted_fall``: of the last step tried, in squared standard deviations."""
 
     termination_reason: Reason
     evaluations: int
@@ -54,7 +54,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution(Generic[Value]):
-    """The best value found, the problem there (for its normal equations), and the evidence."""
+    """Holds the best value found, the problem there (for its normal equations), and the evidence."""
 
     value: Value
     at: Linearised
@@ -62,7 +62,7 @@ class Solution(Generic[Value]):
 
 
 def cholesky_solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """The solution of a symmetric positive definite system. Raises LinAlgError where it is not definite."""
+    """Returns the solution of a symmetric positive definite system. Raises LinAlgError where it is not definite."""
     # Not ``solve(assume_a="pos")``: its estimate of the condition warns of unknowns with different units.
     return scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix, check_finite=False), right, check_finite=False)
 
@@ -76,7 +76,7 @@ def minimise(
     at_start: Linearised | None = None,
     watch: Callable[[], None] = lambda: None,
 ) -> Solution[Value]:
-    """A local minimum of the problem's cost.
+    """Returns a local minimum of the problem's cost.
 
     Args:
         problem: terms, unknowns, and how a step moves a value.

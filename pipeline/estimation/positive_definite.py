@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 
 def inverse(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """M^-1, symmetric to the last bit."""
+    """Returns M^-1, symmetric to the last bit."""
     root = _root(matrix)
     (invert,) = scipy.linalg.get_lapack_funcs(("potri",), (root,))
     found, fault = invert(root, lower=1)
@@ -16,7 +16,7 @@ def inverse(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
 
 
 def inverse_diagonal(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
-    """The diagonal of M^-1: with M = L L^T the squares of L^-1, column by column."""
+    """Returns the diagonal of M^-1: with M = L L^T the squares of L^-1, column by column."""
     root = _root(matrix)
     (invert,) = scipy.linalg.get_lapack_funcs(("trtri",), (root,))
     found, fault = invert(root, lower=1)

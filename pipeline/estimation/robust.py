@@ -13,20 +13,20 @@ from jaxtyping import Float
 
 @runtime_checkable
 class Loss(Protocol):
-    """A robust loss; both methods take squared residuals, without unit, and keep their shape."""
+    """Describes a robust loss; both methods take squared residuals, without unit, and keep their shape."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """rho(s)."""
+        """Returns rho(s)."""
         ...
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """rho'(s): 1 at 0, less for what is forgiven."""
+        """Returns rho'(s): 1 at 0, less for what is forgiven."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class LeastSquares:
-    """rho(s) = s: a Gaussian."""
+    """Is rho(s) = s: a Gaussian."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         return squares
@@ -37,7 +37,7 @@ class LeastSquares:
 
 @dataclass(frozen=True, slots=True)
 class GemanMcClure:
-    """rho(s) = s / (1 + s / c^2), at most c^2: a residual of many c says nothing. Geman and McClure 1987.
+    """Is rho(s) = s / (1 + s / c^2), at most c^2: a residual of many c says nothing. Geman and McClure 1987.
 
     ``scale``: c, in the unit of the residual whose square is given; an array for one of each residual's own.
     """
@@ -53,7 +53,7 @@ class GemanMcClure:
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """rho(s) = c^2 log(1 + s / c^2)."""
+    """Is rho(s) = c^2 log(1 + s / c^2)."""
 
     scale: float
 
@@ -66,7 +66,7 @@ class Cauchy:
 
 @dataclass(frozen=True, slots=True)
 class Huber:
-    """rho(s) = s up to c^2, 2 c sqrt(s) - c^2 beyond. Huber 1964."""
+    """Is rho(s) = s up to c^2, 2 c sqrt(s) - c^2 beyond. Huber 1964."""
 
     scale: float
 

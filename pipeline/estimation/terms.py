@@ -20,7 +20,7 @@ from pipeline.estimation.robust import LeastSquares, Loss
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """J^T W J and J^T W r over p unknowns."""
+    """Holds j^T W J and J^T W r over p unknowns."""
 
     matrix: Float[np.ndarray, "p p"]
     gradient: Float[np.ndarray, " p"]
@@ -36,7 +36,7 @@ ValueIn = TypeVar("ValueIn", contravariant=True)
 
 @runtime_checkable
 class Linearised(Protocol):
-    """A term at one value: its cost, and its normal equations for who asks."""
+    """Describes a term at one value: its cost, and its normal equations for who asks."""
 
     @property
     def cost(self) -> float: ...
@@ -48,14 +48,14 @@ class Linearised(Protocol):
 
 @runtime_checkable
 class Term(Protocol[ValueIn]):
-    """One part of a cost."""
+    """Describes one part of a cost."""
 
     def at(self, value: ValueIn, /) -> Linearised: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Residuals at a value, with the Jacobian to be had: cost ``sum_i rho(|r_i|^2)``.
+    """Holds residuals at a value, with the Jacobian to be had: cost ``sum_i rho(|r_i|^2)``.
 
     ``residual``: n residuals of d components, in standard deviations; ``jacobian`` computes their derivatives by the
     unknowns. The loss is of the norm of all d components.
@@ -82,8 +82,8 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadratic:
-    """``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector: a Gaussian prior where g is zero, or what another problem,
-    solved for everything else, says of x. ``matrix`` M, ``centre`` c, ``pull`` g (towards the minimum)."""
+    """Holds ``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector: a Gaussian prior where g is zero, or what another
+    problem, solved for everything else, says of x. ``matrix`` M, ``centre`` c, ``pull`` g (towards the minimum)."""
 
     matrix: Float[np.ndarray, "p p"]
     centre: Float[np.ndarray, " p"]
@@ -91,7 +91,7 @@ class Quadratic:
 
     @classmethod
     def prior(cls, information: Float[np.ndarray, "p p"], mean: Float[np.ndarray, " p"]) -> "Quadratic":
-        """N(mean, information^-1)."""
+        """Returns N(mean, information^-1)."""
         return cls(information, mean, np.zeros(len(mean)))
 
     def at(self, value: Float[np.ndarray, " p"]) -> "LinearisedQuadratic":
@@ -100,7 +100,7 @@ class Quadratic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedQuadratic:
-    """``Quadratic`` at a distance from its centre."""
+    """Holds ``Quadratic`` at a distance from its centre."""
 
     term: Quadratic
     away: Float[np.ndarray, " p"]
@@ -116,7 +116,7 @@ class LinearisedQuadratic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sum:
-    """Several terms at one value."""
+    """Holds several terms at one value."""
 
     parts: tuple[Linearised, ...]
 
@@ -131,7 +131,7 @@ class Sum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeOnly:
-    """A term's part over some of its unknowns; the others stay where they are. ``free``: which of all q move."""
+    """Holds a term's part over some of its unknowns; the others stay where they are. ``free``: which of all q move."""
 
     whole: Linearised
     free: Bool[np.ndarray, " q"]
@@ -149,7 +149,7 @@ class FreeOnly:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem(Generic[Value]):
-    """A complete problem: all terms, the number of unknowns, and what a step in them does to a value.
+    """Holds a complete problem: all terms, the number of unknowns, and what a step in them does to a value.
 
     ``free``: which of the unknowns move, all by default. ``moved(value, step)`` gets steps of all unknowns.
     ``room(value)``: the least and the largest step of each free unknown, infinite where nothing bounds it.
@@ -163,7 +163,7 @@ class Problem(Generic[Value]):
 
     @property
     def size(self) -> int:
-        """How many unknowns move."""
+        """Tells how many unknowns move."""
         return self.unknowns if self.free is None else int(np.count_nonzero(self.free))
 
     def at(self, value: Value) -> Linearised:
@@ -171,13 +171,13 @@ class Problem(Generic[Value]):
         return terms if self.free is None else FreeOnly(terms, self.free)
 
     def equations(self, here: Linearised) -> NormalEquations:
-        """The normal equations of the free unknowns."""
+        """Returns the normal equations of the free unknowns."""
         equations = NormalEquations.empty(self.size)
         here.add_to(equations)
         return equations
 
     def after(self, value: Value, step: Float[np.ndarray, " f"]) -> Value:
-        """``value`` moved by a step of the free unknowns."""
+        """Returns ``value`` moved by a step of the free unknowns."""
         if self.free is None:
             return self.moved(value, step)
         whole = np.zeros(self.unknowns)

@@ -30,7 +30,7 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """How well the fitted head explains one camera.
+    """Says how well the fitted head explains one camera.
 
     ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none trimmed; ``excluded_share`` is the
     part of them (0 to 1) that the fit did not believe. ``xor_cost`` is eq. (5) of the fitted head, ``xor_cost_start``
@@ -57,7 +57,7 @@ def camera_figures(
     fitted: Masks,
     started: Masks,
 ) -> dict[str, CameraFigures]:
-    """Figures of every camera, in the rig's order; rim figures over the face region, none trimmed.
+    """Returns figures of every camera, in the rig's order; rim figures over the face region, none trimmed.
 
     The cameras stand where their calibration says, not where the fit has moved them.
     """
@@ -121,7 +121,7 @@ def _overlap(
 
 
 def start_masks(model: HeadModel, world_from_head: Similarity, rig: Rig) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """The mean head where the alignment put it, as each camera sees it."""
+    """Returns the mean head where the alignment put it, as each camera sees it."""
     vertices = world_from_head.apply(model.vertices(np.zeros(0), START_LEVEL))
     depths = depth_maps(rig, Mesh(vertices, model.levels[START_LEVEL].faces))
     return {name: np.isfinite(depth) for name, depth in depths.items()}

@@ -54,7 +54,7 @@ MIDSAGITTAL_MM = 5.0  # half width of the band that stands for the midsagittal p
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmark:
-    """A point in the world frame and the standard deviation of each coordinate (mm; None if the fit has none)."""
+    """Holds a point in the world frame and the standard deviation of each coordinate (mm; None if the fit has none)."""
 
     position_mm: Float[np.ndarray, " 3"]
     std_mm: Float[np.ndarray, " 3"] | None
@@ -62,14 +62,14 @@ class Landmark:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A length and its standard deviation (mm; None if the fit has none)."""
+    """Holds a length and its standard deviation (mm; None if the fit has none)."""
 
     value_mm: float
     std_mm: float | None
 
 
 def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None) -> dict[str, Landmark]:
-    """The model's landmarks on the fitted head, world frame.
+    """Returns the model's landmarks on the fitted head, world frame.
 
     ``vertices``: the head as delivered (full level, world, mm) where it goes beyond the fit; deviations stay the fit's.
     """
@@ -89,7 +89,7 @@ def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | N
 def measurements(
     model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None
 ) -> dict[str, Measurement]:
-    """Every distance of ``DISTANCES`` whose two points the model has; ``vertices`` as for ``landmarks``."""
+    """Returns every distance of ``DISTANCES`` whose two points the model has; ``vertices`` as for ``landmarks``."""
     rows = dict(model.landmarks) | _cranial_points(model, fit)
     found = {name: ends for name, ends in DISTANCES.items() if ends[0] in rows and ends[1] in rows}
     index = np.array([[rows[a], rows[b]] for a, b in found.values()], int).reshape(-1)

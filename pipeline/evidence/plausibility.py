@@ -35,11 +35,11 @@ UNEXPLAINED_MM = 5.0  # and median over the views of the rim's RMS distance from
 
 
 class UnexplainedOutlines(EigenheadError):
-    """A head that explains hardly any outline is none of this subject."""
+    """Reports a head that explains hardly any outline is none of this subject."""
 
 
 class ImplausibleResult(EigenheadError):
-    """A result with warnings that the settings do not let pass."""
+    """Reports a result with warnings that the settings do not let pass."""
 
     def __init__(self, warnings: Sequence[ReportWarning]) -> None:
         reasons = [compose("warning-of-code", warning=warning.code, text=warning) for warning in warnings]
@@ -49,7 +49,7 @@ class ImplausibleResult(EigenheadError):
 def plausibility_warnings(
     fit: Fit, model: HeadModel, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
 ) -> list[ReportWarning]:
-    """What speaks against a result.
+    """Returns what speaks against a result.
 
     Args:
         fit: coefficients in standard deviations; scale against the model's own size.
@@ -110,8 +110,8 @@ def _scale(scale: float) -> list[ReportWarning]:
 
 
 def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
-    """How large the face is against the mean one's (RMS distance from its middle), and by how many standard deviations
-    of the population: shape and scale together, whichever of them took it up."""
+    """Tells how large the face is against the mean one's (RMS distance from its middle), and by how many standard
+    deviations of the population: shape and scale together, whichever of them took it up."""
     by_mode = size_by_mode(model)
     z = fit.coefficients[: len(by_mode)]
     size = float(np.log(fit.world_from_head.scale) + z @ by_mode[: len(z)])
@@ -120,7 +120,7 @@ def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
 
 @lru_cache(maxsize=2)
 def size_by_mode(model: HeadModel) -> Float[np.ndarray, " m"]:
-    """Derivative of the face's log size by each coefficient; 0 for expressions."""
+    """Returns the derivative of the face's log size by each coefficient; 0 for expressions."""
     face = model.levels["cage"].face_region
     mean = model.mean[face].astype(float)
     mean -= mean.mean(axis=0)

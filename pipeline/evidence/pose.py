@@ -32,8 +32,9 @@ RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEvidence:
-    """``off``: by camera, the RMS distance of the head's landmarks from the found ones, by the face's size.
-    ``rival``: how much more the best other pose costs, as a share of the cost; None where none was tried."""
+    """Says how well the pose is known. ``off``: by camera, the RMS distance of the head's landmarks from the found
+    ones, by the face's size. ``rival``: how much more the best other pose costs, as a share of the cost; None where
+    none was tried."""
 
     method: str
     off: Mapping[str, float]
@@ -42,7 +43,7 @@ class PoseEvidence:
 
     @property
     def is_on_face(self) -> bool:
-        """Whether the face was found, and in every view where the head has it."""
+        """Tells whether the face was found, and in every view where the head has it."""
         return bool(self.off) and max(self.off.values()) <= ELSEWHERE
 
 

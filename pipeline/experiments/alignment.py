@@ -36,7 +36,7 @@ def alignment(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 200,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Share of right alignments, their errors, and the seconds of the search."""
+    """Returns the share of right alignments, their errors, and the seconds of the search."""
     records = Records(folder, "alignment", key_of(model.sha256, Settings(), *CONTOUR, silhouette_search))
     span, rows = with_modes(model, 60), []
     for seed in range(subjects):
@@ -55,7 +55,7 @@ def alignment(
 
 
 def draw(model: HeadModel, seed: int, renderer: Renderer) -> Row:
-    """One subject in one world."""
+    """Returns one subject in one world."""
     rng = np.random.default_rng([77, seed])
     rig = default_layout()
     subject = random_sitter(rig, rng)
@@ -83,7 +83,7 @@ def draw(model: HeadModel, seed: int, renderer: Renderer) -> Row:
 
 
 def random_sitter(rig: Rig, rng: np.random.Generator) -> Planted:
-    """A head that the model says, turned and shifted as far as a subject in the rig may be."""
+    """Returns a head that the model says, turned and shifted as far as a subject in the rig may be."""
     coefficients = np.clip(rng.standard_normal(60), -2, 2)
     yaw, pitch, roll = rng.uniform(-1, 1, 3) * np.radians(TURN_DEG)
     about = [rotation_from_vector(angle * np.eye(3)[axis]) for axis, angle in ((1, yaw), (0, pitch), (2, roll))]

@@ -29,7 +29,7 @@ def convergence(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 500,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Share of the draws that arrive, and the errors, of both kinds."""
+    """Returns the share of the draws that arrive, and the errors, of both kinds."""
     records = Records(folder, "convergence", key_of(model.sha256, FittingSettings(), *CONTOUR))
     span, rig = with_modes(model, 60), exact(default_layout())
     jobs: list[tuple[str, Planted]] = []

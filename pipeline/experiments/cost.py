@@ -33,7 +33,7 @@ from rig.studio.scene.layout import default_layout
 
 
 class SimplexCost(TypedDict):
-    """Which pixels count, and whether by eq. (5) or eq. (4)."""
+    """Holds which pixels count, and whether by eq. (5) or eq. (4)."""
 
     speaking: Literal["face", "all"]
     weighted: bool
@@ -56,7 +56,7 @@ def cost(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Errors by solver and cost, and of the mean head."""
+    """Returns errors by solver and cost, and of the mean head."""
     sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "cost", key_of(model.sha256, FittingSettings(), STYLE, *sources))
     span, rig = with_modes(model, 60), exact(default_layout())

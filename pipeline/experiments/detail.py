@@ -71,7 +71,7 @@ FAR_MM = 8.0  # along a normal nothing is looked for beyond
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
-    """A capture whose true surface is known."""
+    """Holds a capture whose true surface is known."""
 
     name: str
     capture: Capture
@@ -84,7 +84,7 @@ class Known:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """What one level of detail made of a capture."""
+    """Holds what one level of detail made of a capture."""
 
     fit: Fit
     model: HeadModel  # with the modes that the fit has
@@ -108,7 +108,7 @@ def run(
     held_out: bool = True,
     folder: Path | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``; ``figures`` is flat, ``<subject>_<model>_<level>_<quantity>``.
+    """Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat, ``<subject>_<model>_<level>_<quantity>``.
 
     ``models``: by the name that the figures carry; the first one is used for draws, faults and held-out cameras.
     ``captures``: folders with a truth beside them. ``others``: the population that the draws come from. Rows are kept
@@ -147,7 +147,7 @@ Job = tuple[str, Callable[[], Row]]
 
 
 def read_known(folder: Path) -> Known:
-    """A capture folder and the truth beside it. Raises InputError."""
+    """Returns a capture folder and the truth beside it. Raises InputError."""
     capture, rig = read_capture(folder)
     truth = folder.with_name(folder.name + ".truth")
     mesh, face = read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy")
@@ -164,7 +164,8 @@ def photographed(
     fault: Fault | None = None,
     preset: Preset = PRESET,
 ) -> Known:
-    """A random head in the simulated studio. The same seed makes the same head, look and pose, whatever the fault."""
+    """Returns a random head in the simulated studio. The same seed makes the same head, look and pose, whatever the
+    fault."""
     rng = np.random.default_rng((9, seed))
     coefficients = spread * rng.standard_normal(modes)
     level = population.levels["full"]
@@ -179,7 +180,7 @@ def photographed(
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
-    """Every level of detail on one subject: ``{level: {quantity: value}}``."""
+    """Returns every level of detail on one subject: ``{level: {quantity: value}}``."""
     subject = known()
     return {
         level: {
@@ -217,7 +218,7 @@ def hull_row(known: Callable[[], Known]) -> Row:
 
 
 def surface_error(known: Known, found: Mesh) -> dict[str, float]:
-    """Distances (mm) of the true face to the found surface, weighted by area."""
+    """Returns distances (mm) of the true face to the found surface, weighted by area."""
     distances = SurfaceIndex(found.vertices, found.faces, 1.0).closest(known.mesh.vertices[known.face]).distances
     areas = vertex_areas(known.mesh.vertices, known.mesh.faces)[known.face]
     return {
@@ -228,7 +229,7 @@ def surface_error(known: Known, found: Mesh) -> dict[str, float]:
 
 
 def posterior_cover(known: Known, fitted: Fitted) -> dict[str, float]:
-    """Share of the face's vertices whose 95 % interval along the normal holds the true surface."""
+    """Returns the share of the face's vertices whose 95 % interval along the normal holds the true surface."""
     mesh = fitted.mesh()
     rows = np.flatnonzero(fitted.model.levels["full"].face_region)[::5]
     deviation = vertex_deviation_mm(fitted.model, fitted.fit)[rows]
@@ -240,7 +241,7 @@ def posterior_cover(known: Known, fitted: Fitted) -> dict[str, float]:
 def along_normal(
     known: Known, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Signed distance (mm) along each normal to the true face, and where there is one."""
+    """Returns the signed distance (mm) along each normal to the true face, and where there is one."""
     kept = known.face[known.mesh.faces].all(axis=1)
     index = SurfaceIndex(known.mesh.vertices, known.mesh.faces[kept], 1.0)
     across = np.zeros(len(points))
@@ -255,8 +256,8 @@ def along_normal(
 
 
 def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) -> Row:
-    """Fit with all cameras but one, and predict that one: RMS distance of the true face's outline to the predicted one,
-    where the photograph shows it and where hair covers it too; PSNR over the face.
+    """Fits with all cameras but one, and predicts that one: RMS distance of the true face's outline to the predicted
+    one, where the photograph shows it and where hair covers it too; PSNR over the face.
 
     From the true outline to ours, since ours goes on where the true one hides behind shoulders, which no model has.
     """
@@ -270,7 +271,9 @@ def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) 
     for level, fitted in every_level(_without(known.capture, camera), rest, model, ("span", "photo"), renderer).items():
         mesh, full = fitted.mesh(), model.levels["full"]
         seen = {name: silhouettes[name] for name in rest.names}
-        coloured = texture(mesh, mesh.normals(), known.capture, seen, rest, depth_maps(rest, mesh), settings.texture)
+        coloured = texture(
+            mesh, mesh.normals(), known.capture, seen, rest, depth_maps(rest, mesh), settings=settings.texture
+        )
         ours = find_rim(make_topology(full.faces, full.face_region), mesh.vertices, views, whole_head=True)
         nearest = KDTree(ours.pixel).query(true.pixel)[1]
         across = ((true.pixel - ours.pixel[nearest]) * ours.normal[nearest]).sum(axis=1)
@@ -309,8 +312,8 @@ def colour_psnr(
     face: Bool[np.ndarray, " v"],
     mask: Bool[np.ndarray, "h w"],
 ) -> float:
-    """dB between a photograph and the coloured mesh over the pixels of the face, after one gain a channel: cameras
-    differ in exposure, and a camera that was left out has none."""
+    """Returns dB between a photograph and the coloured mesh over the pixels of the face, after one gain a channel:
+    cameras differ in exposure, and a camera that was left out has none."""
     pixels, depths = camera.project(mesh.vertices), camera_depths(camera, mesh.vertices)
     _, seen = rasterise(pixels, depths, mesh.faces, *image.shape[:2])
     drawn = interpolate(seen, pixels, depths, mesh.faces, colours.astype(np.float32))
@@ -321,7 +324,8 @@ def colour_psnr(
 
 
 def figures(rows: list[Row]) -> dict[str, float]:
-    """Of a subject its own values; of draws, in-span heads and held-out cameras means and worst ones."""
+    """Returns figures: of a subject its own values; of draws, in-span heads and held-out cameras means and worst
+    ones."""
     values: dict[str, list[float]] = {}
     for row in rows:
         subject, _, label = row["name"].rpartition("_")

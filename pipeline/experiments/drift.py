@@ -46,7 +46,8 @@ def drift(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Shares of turned cameras that are named, and good cameras that are, by condition and by what is said of them."""
+    """Returns shares of turned cameras that are named, and good cameras that are, by condition and by what is said of
+    them."""
     records = Records(folder, "drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
     span, rows = with_modes(model, 60), []
     for i, subject in enumerate(random_subjects(subjects, seed=17)):
@@ -58,7 +59,7 @@ def drift(
 
 
 def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
-    """What is said of every camera that is named, by condition."""
+    """Returns what is said of every camera that is named, by condition."""
     rig = default_layout()
     turned, near, *cut = rng.permutation(rig.names)[: 2 + CUT_VIEWS].tolist()
     others = {near: _renamed(close_up(rig[near]), "near")}
@@ -86,26 +87,26 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
 
 
 def said_of(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
-    """Codes of the cameras that are named."""
+    """Returns codes of the cameras that are named."""
     return {found.camera: found.code for found in find_drift(silhouettes, rig)}
 
 
 def loosened(silhouettes: Mapping[str, Silhouette]) -> dict[str, Silhouette]:
-    """Silhouettes of the masks dilated by ``LOOSE_PX``."""
+    """Returns silhouettes of the masks dilated by ``LOOSE_PX``."""
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * LOOSE_PX + 1, 2 * LOOSE_PX + 1))
     masks = {name: cv2.dilate(s.mask.view(np.uint8), disk).view(bool) for name, s in silhouettes.items()}
     return {name: silhouette_from_mask(mask) for name, mask in masks.items()}
 
 
 def close_up(camera: Camera) -> Camera:
-    """The camera with a lens of ``CLOSE_UP`` times the focal length, aimed higher."""
+    """Returns the camera with a lens of ``CLOSE_UP`` times the focal length, aimed higher."""
     k = camera.intrinsics
     down = k.cy + CLOSE_UP_SHARE * k.height
     return replace(camera, intrinsics=replace(k, fx=CLOSE_UP * k.fx, fy=CLOSE_UP * k.fy, cy=down))
 
 
 def aimed_beside(camera: Camera, rng: np.random.Generator) -> Camera:
-    """The camera with its picture shifted in a random direction, so that its border cuts the subject off."""
+    """Returns the camera with its picture shifted in a random direction, so that its border cuts the subject off."""
     k, around = camera.intrinsics, rng.uniform(0.0, 2.0 * np.pi)
     right, down = CUT_SHARE * k.width * np.cos(around), CUT_SHARE * k.height * np.sin(around)
     return replace(camera, intrinsics=replace(k, cx=k.cx + right, cy=k.cy + down))
@@ -140,7 +141,7 @@ def figures(rows: list[Row]) -> dict[str, float]:
 
 
 def as_markdown(found: Mapping[str, float]) -> str:
-    """Captures by condition in which a good camera is named."""
+    """Returns captures by condition in which a good camera is named."""
     whats = ("moved", "loose_or_moved")
     rows = [[name, *(found[f"{name}_good_called_{what}"] for what in whats)] for name in CONDITIONS]
     summary = f"turned cameras named: {found['turned_named']:.0f} of {found['captures']:.0f}, "

@@ -55,7 +55,7 @@ def exchanges(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Shares of exchanges that are named and repaired, by kind."""
+    """Returns shares of exchanges that are named and repaired, by kind."""
     records = Records(folder, "exchanges", key_of(model.sha256, *ASKED, *CONTOUR))
     rows = _rows(_exchanged_row, model, renderer, records, report, seed=18, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
@@ -72,7 +72,7 @@ def false_alarms(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 50,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Good captures in which pictures are called exchanged, or a camera moved or its mask loose."""
+    """Returns good captures in which pictures are called exchanged, or a camera moved or its mask loose."""
     records = Records(folder, "false_alarms", key_of(model.sha256, *ASKED, camera_drift))
     rows = _rows(_told_of_good, model, renderer, records, report, seed=19, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}

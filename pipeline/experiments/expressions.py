@@ -42,7 +42,7 @@ def expressions(
     models: Mapping[str, HeadModel], *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """``<model>_posed_median_mm``, ``<model>_neutral_before_median_mm`` and so on. Of weights:
+    """Returns ``<model>_posed_median_mm``, ``<model>_neutral_before_median_mm`` and so on. Of weights:
     ``<model>_weights_correlation`` over the ten largest of each posed head, ``..._but_eyes`` the same without those of
     lids and looks, ``..._true`` over those that it truly has, ``..._all`` over all that any of them has or is told to
     have; ``<model>_weights_off`` is how far the true ones are told off in the mean, ``<model>_off_<expression>`` the
@@ -61,7 +61,7 @@ def expressions(
 
 
 def drawn_weights(rng: np.random.Generator, names: tuple[str, ...]) -> dict[str, float]:
-    """A few expressions at random, and more often than not a smile about as strong on both sides."""
+    """Returns a few expressions at random, and more often than not a smile about as strong on both sides."""
     chosen = rng.choice(len(names), rng.integers(FEW, MANY), replace=False)
     found = {names[k]: float(rng.uniform(*WEIGHTS)) for k in chosen}
     if rng.random() < SMILING:

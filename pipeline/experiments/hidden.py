@@ -76,8 +76,8 @@ def hidden(
     subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<level>_<seen|hidden>_<region>_<quantity>`` or
-    ``<group>_<level>_<landmarks|measurements>_within_95``, the mean over the group: ``studio``, ``draws``, both as
+    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<level>_<seen|hidden>_<region>_<quantity>``
+    or ``<group>_<level>_<landmarks|measurements>_within_95``, the mean over the group: ``studio``, ``draws``, both as
     ``all``, or a capture by its name.
 
     Args:
@@ -110,12 +110,12 @@ def hidden(
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
-    """One subject: ``{level: {<seen|hidden>_<region>_<quantity>: value}}``."""
+    """Returns one subject: ``{level: {<seen|hidden>_<region>_<quantity>: value}}``."""
     subject = known()
     silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
 
     def segmented(capture: Capture, *_: object, report: Progress) -> dict[str, Silhouette]:
-        """The same for every level; pictures that were put right are segmented anew."""
+        """Returns the same for every level; pictures that were put right are segmented anew."""
         again = capture is not subject.capture
         return segment(capture, subject.rig, Settings().segmentation, report=report) if again else silhouettes
 
@@ -138,8 +138,8 @@ def landmark_figures(
     found: Mapping[str, Landmark],
     lengths: Mapping[str, Measurement],
 ) -> dict[str, float]:
-    """Median error and stated deviation (mm), and share within 95 % intervals, of landmarks (by coordinate) and of
-    measurements; nothing where no landmark is known.
+    """Returns the median error and stated deviation (mm), and share within 95 % intervals, of landmarks (by coordinate)
+    and of measurements; nothing where no landmark is known.
 
     Args:
         true: world frame, mm, by name.
@@ -176,8 +176,8 @@ def skin_figures(
     deviation_mm: Float[np.ndarray, " v"],
     regions: Mapping[str, Bool[np.ndarray, " v"]],
 ) -> dict[str, float]:
-    """Median distance (mm), share within the stated interval and median stated deviation (mm) of the true skin, by
-    what is seen of it and by region; ``all`` are all of them together.
+    """Returns the median distance (mm), share within the stated interval and median stated deviation (mm) of the true
+    skin, by what is seen of it and by region; ``all`` are all of them together.
 
     Args:
         known: the truth, with its visible points.
@@ -211,7 +211,8 @@ def skin_figures(
 
 
 def reached_from_outside(mesh: Mesh) -> Bool[np.ndarray, " v"]:
-    """Which vertices are seen from several directions far away: nostrils and the inside of a mouth are none of them."""
+    """Returns which vertices are seen from several directions far away: nostrils and the inside of a mouth are none of
+    them."""
     centre = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
     radius = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
     focal, middle = 0.5 * OUTSIDE_PX * OUTSIDE_MM / (1.05 * radius), 0.5 * (OUTSIDE_PX - 1)
@@ -243,7 +244,8 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def as_markdown(found: Mapping[str, float]) -> str:
-    """Shares within 95 % intervals by group and level, and of seen and hidden skin median error and deviation."""
+    """Returns shares within 95 % intervals by group and level, and of seen and hidden skin median error and
+    deviation."""
     columns = ("seen_all", "seen_face", "hidden_all", "hidden_face", "landmarks", "measurements")
     present = [key.removesuffix("_seen_all_within_95") for key in found if key.endswith("_seen_all_within_95")]
     rows = [

@@ -42,7 +42,7 @@ def levels(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Seconds, evaluations and errors by hierarchy."""
+    """Returns seconds, evaluations and errors by hierarchy."""
     sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "levels", key_of(model.sha256, FittingSettings(), *sources))
     span, rig = with_modes(model, 60), exact(default_layout())

@@ -78,7 +78,7 @@ def light(
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of lights, and a row a subject.
+    """Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of lights, and a row a subject.
 
     Args:
         model: fitted, and drawn from.
@@ -103,7 +103,7 @@ def light(
 
 
 def row_of(model: HeadModel, seed: int, renderer: Renderer, settings: Settings, picture: Path | None) -> Row:
-    """One subject in every light, and in the first one twice; all of it again with a colour chart."""
+    """Returns one subject in every light, and in the first one twice; all of it again with a colour chart."""
     rig = default_layout()
     found = {name: lit_head(model, seed, rig, lamps, renderer, settings) for name, lamps in LIGHTS.items()}
     again = lit_head(model, seed, rig, LAMPS, renderer, settings, shot=1)
@@ -120,7 +120,8 @@ def row_of(model: HeadModel, seed: int, renderer: Renderer, settings: Settings, 
 
 
 def differences(model: HeadModel, found: Mapping[str, Reconstruction], again: Reconstruction) -> Row:
-    """Of textures and albedos, in the mean over the pairs of lights; ``again`` is the first light's second shot."""
+    """Returns figures of textures and albedos, in the mean over the pairs of lights; ``again`` is the first light's
+    second shot."""
     every = [*found.values(), again]
     layout = albedo_of(every[0]).atlas.layout
     seen = (
@@ -152,9 +153,10 @@ def lit_head(
     lamps: tuple[Lamp, ...],
     renderer: Renderer,
     settings: Settings,
+    *,
     shot: int = 0,
 ) -> Reconstruction:
-    """The head of ``seed`` in a light. Its look and pose are the same in every light; the noise is not."""
+    """Returns the head of ``seed`` in a light. Its look and pose are the same in every light; the noise is not."""
     coefficients = IN_SPAN_SPREAD * np.random.default_rng((9, seed)).standard_normal(IN_SPAN_MODES)
     level = model.levels["full"]
     head = Mesh(model.vertices(coefficients), level.faces)
@@ -169,7 +171,7 @@ def lit_head(
 
 
 def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], rng: np.random.Generator) -> Capture:
-    """One more clean plate of every camera that a chart, held up for the front camera, is turned to."""
+    """Returns one more clean plate of every camera that a chart, held up for the front camera, is turned to."""
     front, middle = scene.rig.front_camera(), scene.world_from_head.translation
     towards = {camera.name: camera.centre_world - middle for camera in scene.rig}
     facing = {
@@ -185,7 +187,7 @@ def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], r
 
 
 def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, "s s"]:
-    """Texels of the compared size whose triangle has such corners, and all about them, too."""
+    """Returns texels of the compared size whose triangle has such corners, and all about them, too."""
     texels, ones = GRID * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, GRID, GRID)
     whole = np.asarray(seen[layout.source[layout.faces]].all(axis=1))
@@ -194,13 +196,13 @@ def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray
 
 
 def texels(image: Image, where: Bool[np.ndarray, "g g"]) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of an image, brought to the compared size."""
+    """Returns colours of an image, brought to the compared size."""
     small = cv2.resize(np.ascontiguousarray(image), (GRID, GRID), interpolation=cv2.INTER_AREA)
     return np.asarray(small)[where]
 
 
 def levelled(codes: UInt8[np.ndarray, "n 3"], to: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """``codes`` with the median of the other in each channel, in linear light."""
+    """Returns ``codes`` with the median of the other in each channel, in linear light."""
     ours, theirs = linear_from_srgb(codes / 255.0), linear_from_srgb(to / 255.0)
     ratio = np.median(theirs, axis=0) / np.maximum(np.median(ours, axis=0), 1e-4)
     return np.rint(255 * srgb_from_linear(ours * ratio)).astype(np.uint8)
@@ -228,7 +230,7 @@ def albedo_of(head: Reconstruction) -> Albedo:
 
 
 def sheet(found: Mapping[str, Reconstruction], rig: Rig) -> Image:
-    """A column a light: the texture above, the albedo below, as the front camera sees them unlit."""
+    """Returns a column a light: the texture above, the albedo below, as the front camera sees them unlit."""
     camera = rig[rig.front_camera()]
     columns = []
     for name, head in found.items():

@@ -39,7 +39,7 @@ UNROBUST_PX = 1e3  # a robust scale so wide that the bound knows of no outliers
 def limit(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 15, draws: int = 2
 ) -> Outcome:
-    """eta and coverage over ``subjects`` x ``draws`` for each noise."""
+    """Returns eta and coverage over ``subjects`` x ``draws`` for each noise."""
     span, rig = with_modes(model, 60), exact(default_layout())
     planted = random_subjects(subjects, seed=91)
     rows = []
@@ -49,7 +49,9 @@ def limit(
             bound = bound_mm(span, subject, clean, rig, sigma)
             for draw in range(draws):
                 report("limit", (i + draw / draws) / len(planted))
-                rows.append(_row(span, subject, clean, rig, sigma, bound, np.random.default_rng([i, draw])))
+                rows.append(
+                    _row(span, subject, clean, rig, sigma=sigma, bound=bound, rng=np.random.default_rng([i, draw]))
+                )
     figures = {}
     for sigma in NOISES_PX:
         of = [row for row in rows if row["sigma_px"] == sigma]
@@ -67,6 +69,7 @@ def _row(
     subject: Planted,
     clean: dict[str, Silhouette],
     rig: Rig,
+    *,
     sigma: float,
     bound: float,
     rng: np.random.Generator,
@@ -87,14 +90,14 @@ def _row(
 
 
 def settings_for(sigma: float) -> FittingSettings:
-    """The noise is stated, so that nothing is estimated; four sigma is no outlier."""
+    """Returns settings in which the noise is stated, so that nothing is estimated; four sigma is no outlier."""
     return FittingSettings(
         contour_noise_px=sigma, contour_correlation_px=CORRELATION_PX, robust_px=max(1.5, 6.0 * sigma)
     )
 
 
 def bound_mm(model: HeadModel, subject: Planted, clean: dict[str, Silhouette], rig: Rig, sigma: float) -> float:
-    """The Cramer-Rao bound of the RMS face error."""
+    """Returns the Cramer-Rao bound of the RMS face error."""
     settings = settings_for(sigma)
     stage = replace(schedule(settings, len(model.modes))[-1], whole_head=True)
     problem = make_problem(model, subject.world_from_head, clean, rig, settings, {})
@@ -107,7 +110,7 @@ def bound_mm(model: HeadModel, subject: Planted, clean: dict[str, Silhouette], r
 
 
 def rms_deviation_mm(model: HeadModel, fit: Fit) -> float:
-    """sqrt(tr(B C B^T) / V) over the face region, all three axes."""
+    """Returns sqrt(tr(B C B^T) / V) over the face region, all three axes."""
     assert fit.covariance is not None
     factor = np.linalg.cholesky(fit.covariance)
     region = np.flatnonzero(model.levels["full"].face_region)[::7]  # the trace is smooth: every seventh vertex will do
@@ -124,7 +127,7 @@ def rms_deviation_mm(model: HeadModel, fit: Fit) -> float:
 
 
 def with_noise(silhouette: Silhouette, sigma: float, correlation: float, rng: np.random.Generator) -> Silhouette:
-    """The silhouette with its contour moved along its normals by a random process of the arc length.
+    """Returns the silhouette with its contour moved along its normals by a random process of the arc length.
 
     Near the contour every pixel takes the displacement of its nearest contour point, so that the signed distance keeps
     its slope across the contour, as the distance to any contour does; a random field over the image would not.
@@ -140,8 +143,8 @@ def with_noise(silhouette: Silhouette, sigma: float, correlation: float, rng: np
 
 
 def contour_points(distance: Float32[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Points (x, y) on the zero contour, STEP_PX or less apart, and the arc length (px) at each; a gap of 1,000 px
-    between pieces makes their noise independent."""
+    """Returns points (x, y) on the zero contour, STEP_PX or less apart, and the arc length (px) at each; a gap of 1,000
+    px between pieces makes their noise independent."""
     slopes = np.stack([np.gradient(distance, axis=1), np.gradient(distance, axis=0)], axis=-1)
     pieces, _ = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     points, arcs, end = [], [], 0.0
@@ -160,8 +163,8 @@ def contour_points(distance: Float32[np.ndarray, "h w"]) -> tuple[Float[np.ndarr
 def contour_process(
     arc: Float[np.ndarray, " n"], sigma: float, correlation: float, rng: np.random.Generator
 ) -> Float[np.ndarray, " n"]:
-    """Gaussian process at the arc lengths: read between pixels it has the standard deviation sigma and the correlation
-    exp(-x^2 / 4 a^2), whose integral is ``correlation`` for a = l / (2 sqrt(pi)).
+    """Returns a Gaussian process at the arc lengths: read between pixels it has the standard deviation sigma and the
+    correlation exp(-x^2 / 4 a^2), whose integral is ``correlation`` for a = l / (2 sqrt(pi)).
 
     Reading bilinearly is one more filter, a triangle of variance 1/6 px^2, so that the process itself is that much
     narrower and stronger.

@@ -6,7 +6,7 @@ Cell = str | float | int | None
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """A Markdown table; numbers with three significant digits, None as a dash."""
+    """Returns a Markdown table; numbers with three significant digits, None as a dash."""
     lines = [header, ["---"] * len(header), *([_text(cell) for cell in row] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 

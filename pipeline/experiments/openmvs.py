@@ -30,14 +30,14 @@ COLMAP_PX = 0.5  # the centre of the top-left pixel there
 
 
 class PeerFailed(EigenheadError):
-    """A program of the peer ended without a result."""
+    """Reports that a program of the peer ended without a result."""
 
     def __init__(self, program: str, why: str) -> None:
         super().__init__(f"{program}: {why}")
 
 
 def programs_in(folder: Path) -> dict[str, Path]:
-    """The programs by name. Raises InputError that names every missing one."""
+    """Returns the programs by name. Raises InputError that names every missing one."""
     found = {name: folder / name for name in PROGRAMS}
     missing = [name for name, path in found.items() if not path.is_file()]
     if missing:
@@ -48,7 +48,7 @@ def programs_in(folder: Path) -> dict[str, Path]:
 def surface_by_openmvs(
     depth_maps: Sequence[DepthMap], hull_world: Mesh, programs: Mapping[str, Path], folder: Path
 ) -> tuple[Mesh, float]:
-    """Its refined surface (world frame, mm) and the CPU seconds that its programs took.
+    """Returns its refined surface (world frame, mm) and the CPU seconds that its programs took.
 
     Args:
         depth_maps: for their cameras, photographs and masks; their depth is not used.
@@ -87,7 +87,7 @@ def _run(programs: Mapping[str, Path], name: str, folder: Path, *arguments: str)
 
 
 def write_input(depth_maps: Sequence[DepthMap], hull_world: Mesh, folder: Path) -> None:
-    """``images``, ``masks`` and ``sparse`` (cameras.txt, images.txt, points3D.txt) as the programs read them."""
+    """Writes ``images``, ``masks`` and ``sparse`` (cameras.txt, images.txt, points3D.txt) as the programs read them."""
     rng = np.random.default_rng(0)
     rows = rng.permutation(len(hull_world.vertices))[:SEEDS]
     points, normals = hull_world.vertices[rows], hull_world.normals()[rows]

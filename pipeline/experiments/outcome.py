@@ -8,8 +8,8 @@ Row = dict[str, Any]  # of one subject: each experiment has its own quantities
 
 
 class Outcome(TypedDict):
-    """``figures`` is flat: every number that README and docs quote. ``markdown`` and ``pictures`` go to files, the
-    rest is printed; for people ``lines`` in place of the figures."""
+    """Holds an outcome; ``figures`` is flat: every number that README and docs quote. ``markdown`` and ``pictures`` go
+    to files, the rest is printed; for people ``lines`` in place of the figures."""
 
     figures: dict[str, float]
     rows: list[Row] | dict[str, list[Row]]

@@ -62,7 +62,7 @@ BOBYQA_RADII = ((1.0, 0.05), (0.5, 0.02))  # first and last trust region of each
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """One subject as all solvers get it."""
+    """Holds one subject as all solvers get it."""
 
     whole: HeadModel
     model: HeadModel  # its first 60 modes, which every solver has
@@ -73,7 +73,7 @@ class Task:
 
 
 class Counted:
-    """A function that counts its calls and their seconds."""
+    """Holds a function that counts its calls and their seconds."""
 
     def __init__(self, function: Callable[[np.ndarray], float]) -> None:
         self._function = function
@@ -94,7 +94,8 @@ def peers(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 10,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Seconds, evaluations and errors of every solver on ``subjects`` of section 5.2's hundred, evenly taken."""
+    """Returns seconds, evaluations and errors of every solver on ``subjects`` of section 5.2's hundred, evenly
+    taken."""
     span, rig = with_modes(model, MODES), exact(default_layout())
     everyone = subjects_of_section_5_2(model, 100)
     chosen = [everyone[i] for i in np.linspace(0, len(everyone) - 1, subjects).round().astype(int)]
@@ -116,17 +117,18 @@ def peers(
 
 
 def machine(renderer: Renderer) -> str:
-    """What seconds depend on."""
+    """Returns what seconds depend on."""
     return f"{len(os.sched_getaffinity(0))} cores, {renderer.context.description}"
 
 
 def mean_head(subject: Planted) -> Fit:
-    """Where the peers start: the mean head at the true pose."""
+    """Returns where the peers start: the mean head at the true pose."""
     return Fit("mean head", np.zeros(MODES), subject.world_from_head, 0, "")
 
 
 def timed(name: str, solve: Callable[[Task], Row], task: Task, warm: set[str]) -> Row:
-    """The solver's row with its seconds; before its first one, compiled code is warmed up where there is any."""
+    """Returns the solver's row with its seconds; before its first one, compiled code is warmed up where there is
+    any."""
     if name in WARMED and name not in warm:
         solve(task)
     warm.add(name)
@@ -136,7 +138,7 @@ def timed(name: str, solve: Callable[[Task], Row], task: Task, warm: set[str]) -
 
 
 def derivative_free(minimise: Minimiser) -> Callable[[Task], Row]:
-    """A solver that knows only the values of eq. (5), on the paper's two levels."""
+    """Returns a solver that knows only the values of eq. (5), on the paper's two levels."""
 
     def solve(task: Task) -> Row:
         coefficients, calls, seconds = np.zeros(MODES), 0, 0.0
@@ -160,8 +162,8 @@ def error_row(task: Task, fit: Fit) -> Row:
 
 
 def nelder_mead(function: Counted, start: Float[np.ndarray, " m"], *, adaptive: bool) -> Float[np.ndarray, " m"]:
-    """scipy's, stopped by the relative spread of its values, which scipy itself does not offer: it is run a few moves
-    at a time, and goes on from its own simplex, whose values are remembered."""
+    """Runs scipy's, stopped by the relative spread of its values, which scipy itself does not offer: it is run a few
+    moves at a time, and goes on from its own simplex, whose values are remembered."""
     known: dict[bytes, float] = {}
 
     def remembered(x: Float[np.ndarray, " m"]) -> float:
@@ -210,7 +212,7 @@ def soft(task: Task, *, whole: bool = False) -> Row:
 
 
 def hull(task: Task) -> Row:
-    """Distance of the true face's vertices to the hull."""
+    """Returns the distance of the true face's vertices to the hull."""
     mesh = visual_hull(task.silhouettes, task.rig)
     face = task.subject.vertices(task.whole)[task.model.levels["full"].face_region]
     distances = SurfaceIndex(mesh.vertices, mesh.faces, 1.0).closest(face).distances

@@ -57,7 +57,7 @@ FIVE_DEG = ((0, 0), (-40, 8), (40, 8), (0, 32), (0, -30))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Person:
-    """A capture and its truth. ``seen``: vertices of the true face that two of the cameras see, not under hair;
+    """Holds a capture and its truth. ``seen``: vertices of the true face that two of the cameras see, not under hair;
     ``vertices_correspond``: whether the true mesh has the fitted model's vertices, row by row."""
 
     capture: Capture
@@ -70,7 +70,7 @@ class Person:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One row of the table, before it is computed. ``kind``: how many cameras stand how."""
+    """Holds one row of the table, before it is computed. ``kind``: how many cameras stand how."""
 
     subject: str
     kind: str
@@ -84,7 +84,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaptureWithTruth:
-    """A capture folder as it was read, its true masks, and its truth."""
+    """Holds a capture folder as it was read, its true masks, and its truth."""
 
     capture: Capture
     rig: Rig
@@ -113,7 +113,8 @@ class CaptureWithTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudioKind:
-    """A rig in the studio and who sits before it. ``kind`` as in ``Case``; ``what`` tells it from others of its kind.
+    """Holds a rig in the studio and who sits before it. ``kind`` as in ``Case``; ``what`` tells it from others of its
+    kind.
 
     ``pose_deg``: yaw to the subject's left, pitch downwards, roll to its left shoulder.
     """

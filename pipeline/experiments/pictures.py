@@ -16,12 +16,13 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 
 def heads(rows: Sequence[Sequence[tuple[str, Mesh]]]) -> ImageRgb:
-    """Figure 4: shaded heads (head frame) in rows, seen from the subject's left front."""
+    """Draws figure 4: shaded heads (head frame) in rows, seen from the subject's left front."""
     return np.vstack([np.hstack([labelled(clay(mesh), text) for text, mesh in row]) for row in rows])
 
 
 def differences(rows: Sequence[tuple[str, Masks, Masks]], cameras: Sequence[str]) -> ImageRgb:
-    """Figure 5: for each row (text, input masks, model masks) what differs in some cameras, and how many pixels."""
+    """Draws figure 5: for each row (text, input masks, model masks) what differs in some cameras, and how many
+    pixels."""
     drawn = []
     for text, observed, model in rows:
         panels = []
@@ -34,7 +35,7 @@ def differences(rows: Sequence[tuple[str, Masks, Masks]], cameras: Sequence[str]
 
 
 def labelled(image: ImageRgb, text: str) -> ImageRgb:
-    """The image with a line of text at its top."""
+    """Returns the image with a line of text at its top."""
     out = image.copy()
     cv2.putText(out, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
     return out

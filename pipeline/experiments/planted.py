@@ -46,8 +46,8 @@ SEED = 400
 def planted(
     model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = 2, folder: Path | None = None
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``; a figure is ``<fault>_<quantity>``, the mean over the subjects that it did
-    not end, ``refused`` the share that it did.
+    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<fault>_<quantity>``, the mean over the subjects
+    that it did not end, ``refused`` the share that it did.
 
     Args:
         model: fitted, and drawn from.
@@ -72,7 +72,7 @@ def planted(
 
 
 def planted_row(known: Known, model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
-    """One job: what it was refused for, or what came of it."""
+    """Returns one job: what it was refused for, or what came of it."""
     try:
         found = reconstruct(ReconstructionContext(known.capture, known.rig, model, Settings(), renderer))
     except EigenheadError as error:
@@ -100,7 +100,7 @@ def planted_row(known: Known, model: HeadModel, renderer: Renderer, picture: Pat
 
 
 def strands(known: Known, rng: np.random.Generator) -> Known:
-    """Loose hair that stands off the head, other strands in every view: thinner than a mask can follow."""
+    """Plants loose hair that stands off the head, other strands in every view: thinner than a mask can follow."""
     images = {}
     for camera in known.rig:
         image, mask = known.capture.images[camera.name].copy(), subject_mask(known, camera)
@@ -122,7 +122,7 @@ def strands(known: Known, rng: np.random.Generator) -> Known:
 
 
 def hand(known: Known, rng: np.random.Generator) -> Known:
-    """Somebody's hand reaches between one camera and the face."""
+    """Plants a hand that reaches between one camera and the face."""
     camera = known.rig[HIT]
     image, scale = known.capture.images[HIT].copy(), px_per_mm(known, camera)
     face = camera.project(known.mesh.vertices[known.face])
@@ -138,7 +138,7 @@ def hand(known: Known, rng: np.random.Generator) -> Known:
 
 
 def behind(known: Known, rng: np.random.Generator) -> Known:
-    """Somebody stands behind the subject, in the sight of one camera."""
+    """Plants somebody who stands behind the subject, in the sight of one camera."""
     camera = known.rig[HIT]
     image, mask, scale = known.capture.images[HIT].copy(), subject_mask(known, camera), px_per_mm(known, camera)
     columns = np.nonzero(mask.any(axis=0))[0]
@@ -152,7 +152,7 @@ def behind(known: Known, rng: np.random.Generator) -> Known:
 
 
 def wrong_mask(known: Known, rng: np.random.Generator) -> Known:
-    """An operator's mask of one view that lies a finger's breadth off."""
+    """Plants an operator's mask of one view that lies a finger's breadth off."""
     camera = known.rig[HIT]
     shift = round(25 * px_per_mm(known, camera))
     mask = np.roll(subject_mask(known, camera), shift, axis=1)
@@ -161,7 +161,7 @@ def wrong_mask(known: Known, rng: np.random.Generator) -> Known:
 
 
 def half_a_pixel_off(known: Known, rng: np.random.Generator) -> Known:
-    """One camera has turned after calibration, by less than anybody sees."""
+    """Turns one camera after calibration, by less than anybody sees."""
     camera = known.rig[HIT]
     turn = RigidTransform(rotation_from_vector(np.array([0.0, OFF_PX / camera.intrinsics.fx, 0.0])), np.zeros(3))
     turned = replace(camera, camera_from_world=turn @ camera.camera_from_world)
@@ -179,7 +179,7 @@ PLANTS: Mapping[str, Callable[[Known, np.random.Generator], Known]] = {
 
 
 def subject_mask(known: Known, camera: Camera) -> Bool[np.ndarray, "h w"]:
-    """About where the subject is: what two cameras see of it, its gaps closed."""
+    """Marks about where the subject is: what two cameras see of it, its gaps closed."""
     height, width = known.capture.images[camera.name].shape[:2]
     drawn = np.zeros((height, width), np.uint8)
     radius = max(2, round(2.0 * px_per_mm(known, camera)))
@@ -192,7 +192,7 @@ def subject_mask(known: Known, camera: Camera) -> Bool[np.ndarray, "h w"]:
 
 
 def px_per_mm(known: Known, camera: Camera) -> float:
-    """Of the head's middle."""
+    """Returns it of the head's middle."""
     depth = camera.camera_from_world.apply(known.mesh.vertices.mean(axis=0))[2]
     return float(camera.intrinsics.fx / depth)
 

@@ -33,8 +33,8 @@ SURFACE_WORTH = 60.0  # observations that the face's points count as, for they e
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseError:
-    """``truth_from_result``: what takes the delivered face to the true one; ``shift_mm`` is how far it moves the middle
-    of the delivered face."""
+    """Holds how far the pose is off. ``truth_from_result``: what takes the delivered face to the true one; ``shift_mm``
+    is how far it moves the middle of the delivered face."""
 
     truth_from_result: RigidTransform
     turn_deg: float

@@ -46,7 +46,8 @@ def posterior_check(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Chain over Laplace: standard deviations of coefficients and pose, and of the face's points along the axes."""
+    """Returns chain over Laplace: standard deviations of coefficients and pose, and of the face's points along the
+    axes."""
     records = Records(folder, "posterior", key_of(model.sha256, *CONTOUR, STEPS, BETA))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
@@ -95,12 +96,12 @@ def run_chain(
     rng: np.random.Generator,
     steps: int = STEPS,
 ) -> Chain:
-    """The chain from the mode; the first ``FORGOTTEN`` draws are dropped."""
+    """Returns the chain from the mode; the first ``FORGOTTEN`` draws are dropped."""
     factor = np.linalg.cholesky(covariance)
     whole, _ = started_problem(problem, first_evidence(problem.settings), stage, UNROBUST_PX, mode)
 
     def beyond(white: Float[np.ndarray, " p"]) -> float:
-        """Negative log density at ``mode + factor @ white``, less that of N(mode, covariance)."""
+        """Returns negative log density at ``mode + factor @ white``, less that of N(mode, covariance)."""
         state = apply_step(mode, factor @ white, replace(stage, cameras=False))
         return 0.5 * whole.at(state).cost - 0.5 * float(white @ white)
 

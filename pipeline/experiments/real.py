@@ -42,7 +42,7 @@ CLIPPED = 250
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RealCapture:
-    """A capture with more views than are used. ``drawn``: masks by hand, True = subject, of some of its views."""
+    """Holds a capture with more views than are used. ``drawn``: masks by hand, True = subject, of some of its views."""
 
     name: str
     capture: Capture
@@ -54,7 +54,8 @@ class RealCapture:
 def real(
     model: HeadModel, captures: list[RealCapture], *, renderer: Renderer, settings: Settings, report: Progress
 ) -> Outcome:
-    """Rows of every capture, and their figures. Raises InputError where a folder has no more views than are used."""
+    """Returns rows of every capture, and their figures. Raises InputError where a folder has no more views than are
+    used."""
     rows: list[Row] = []
     for one in captures:
         rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=report)})
@@ -70,7 +71,7 @@ def real(
 def judge(
     model: HeadModel, real_capture: RealCapture, *, renderer: Renderer, settings: Settings, report: Progress
 ) -> Row:
-    """The bust of eleven views, against the others."""
+    """Returns the bust of eleven views, against the others."""
     started = time.perf_counter()
     silhouettes = segment(real_capture.capture, real_capture.rig, settings.segmentation, report=report)
     seconds_masks = time.perf_counter() - started
@@ -123,8 +124,8 @@ def judge(
 
 
 def choose(real_capture: RealCapture, sound: list[str], silhouettes: Mapping[str, Silhouette]) -> list[str]:
-    """The eleven: spread, where there are enough none that somebody drew an outline of, and none that cuts the subject
-    off."""
+    """Returns the eleven: spread, where there are enough none that somebody drew an outline of, and none that cuts the
+    subject off."""
     undrawn = [name for name in sound if name not in real_capture.drawn]
     whole = [name for name in undrawn if not silhouettes[name].quality.cut_off]
     enough = next((names for names in (whole, undrawn) if len(names) >= USED), sound)
@@ -132,7 +133,7 @@ def choose(real_capture: RealCapture, sound: list[str], silhouettes: Mapping[str
 
 
 def views_in_front(rig: Rig, front: str | None) -> list[str]:
-    """The views that look from the front view's side."""
+    """Returns the views that look from the front view's side."""
     away = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     ahead = away[rig.names.index(front or rig.front_camera())]
@@ -140,14 +141,15 @@ def views_in_front(rig: Rig, front: str | None) -> list[str]:
 
 
 def surface_of(done: Reconstruction) -> tuple[Mesh, UInt8[np.ndarray, "v 3"]]:
-    """The bust, or the head where the photographs told none."""
+    """Returns the bust, or the head where the photographs told none."""
     if done.bust is None:
         return done.mesh_world, done.texturing.vertices.colours
     return done.bust.mesh_world, done.bust.colours
 
 
 def outline_px(camera: Camera, mesh: Mesh, mask: Bool[np.ndarray, "h w"]) -> float:
-    """Median distance of the surface's outline from the mask's, px, where neither is cut off by the image's border."""
+    """Returns the median distance of the surface's outline from the mask's, px, where neither is cut off by the image's
+    border."""
     shown = np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])
     distance = np.abs(signed_distance(mask))
     rim = shown & ~eroded(shown, 1)
@@ -163,7 +165,7 @@ def psnr_db(
     image: UInt8[np.ndarray, "h w 3"],
     silhouette: Silhouette,
 ) -> float:
-    """Of the surface in its vertex colours against a photograph, inside both outlines, exposure fitted."""
+    """Computes it of the surface in its vertex colours against a photograph, inside both outlines, exposure fitted."""
     drawn = picture(camera, mesh.vertices, mesh.faces, colours).astype(np.float64)
     shown = np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])
     inside = eroded(shown, INSIDE_PX) & (silhouette.distance < -INSIDE_PX) & (image.max(axis=2) < CLIPPED)
@@ -182,7 +184,8 @@ def psnr_db(
 def distances_mm(
     real_capture: RealCapture, views: list[str], silhouettes: Mapping[str, Silhouette], mesh: Mesh
 ) -> Float[np.ndarray, " n"]:
-    """Of the points that neighbouring views (of ``views``) agree on, where their masks show the subject."""
+    """Returns distances of the points that neighbouring views (of ``views``) agree on, where their masks show the
+    subject."""
     points = find_scene_points(real_capture.capture.images, real_capture.rig.subset(views))
     subject = np.zeros(len(points.points), int)
     for name in points.rows:

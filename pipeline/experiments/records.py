@@ -33,7 +33,7 @@ CONTOUR = (
 
 
 class Records:
-    """Rows by key in one JSON file; ``None`` as a folder keeps them in memory alone."""
+    """Holds rows by key in one JSON file; ``None`` as a folder keeps them in memory alone."""
 
     def __init__(self, folder: Path | None, name: str, key: str) -> None:
         """``key`` names all that the rows depend on (model, settings, code version): another key starts anew."""
@@ -45,7 +45,7 @@ class Records:
             self._rows = kept["rows"] if kept.get("key") == key else {}
 
     def row(self, name: str, compute: Callable[[], Row]) -> Row:
-        """The kept row, or the computed one, kept from now on."""
+        """Returns the kept row, or the computed one, kept from now on."""
         if name not in self._rows:
             self._rows[name] = compute()
             if self._path is not None:
@@ -55,7 +55,7 @@ class Records:
 
 
 def key_of(*parts: object) -> str:
-    """A key for ``Records``: modules count by their source, so that rows of an older solver are computed anew, and
-    everything else by its text."""
+    """Returns a key for ``Records``: modules count by their source, so that rows of an older solver are computed anew,
+    and everything else by its text."""
     texts = [inspect.getsource(part) if isinstance(part, ModuleType) else str(part) for part in parts]
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]

@@ -46,14 +46,14 @@ MIN_AROUND = 6  # places within SMOOTH_MM, for a mean
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relief:
-    """Two surfaces' relief (mm) at the same places."""
+    """Holds two surfaces' relief (mm) at the same places."""
 
     first_mm: Float[np.ndarray, " n"]
     second_mm: Float[np.ndarray, " n"]
 
     def figures(self) -> dict[str, float]:
-        """``unrepeated_rms_mm`` is one surface's share of the difference, the root of half of its mean square;
-        ``unrepeated_median_mm`` its median; ``repeated_rms_mm`` of what both show."""
+        """Compares the shots; ``unrepeated_rms_mm`` is one surface's share of the difference, the root of half of its
+        mean square; ``unrepeated_median_mm`` its median; ``repeated_rms_mm`` of what both show."""
         off = np.abs(self.first_mm - self.second_mm) / np.sqrt(2.0)
         return {
             "unrepeated_rms_mm": float(np.sqrt(np.mean(off**2))),

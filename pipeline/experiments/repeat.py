@@ -54,7 +54,8 @@ STILL = ("noise", "clicked")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """A reconstructed head (world frame), what it states of itself (mm, along the normal), and the truth beside it."""
+    """Holds a reconstructed head (world frame), what it states of itself (mm, along the normal), and the truth beside
+    it."""
 
     vertices: Float[np.ndarray, "v 3"]
     stated_mm: Float[np.ndarray, " v"]
@@ -66,7 +67,8 @@ class Shot:
 def repeat(
     model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = SHOTS, folder: Path | None = None
 ) -> Outcome:
-    """Scatter, stated deviation and repeated error by condition. ``subjects`` is the number of shots, two or more."""
+    """Returns scatter, stated deviation and repeated error by condition. ``subjects`` is the number of shots, two or
+    more."""
     records = Records(
         folder, "repeat", key_of(model.sha256, Settings(), subjects, *CONTOUR, composition, repeatability)
     )
@@ -108,7 +110,7 @@ def _row(model: HeadModel, condition: str, count: int, renderer: Renderer, repor
 def scenes(
     model: HeadModel, condition: str, count: int, renderer: Renderer
 ) -> Iterator[tuple[Scene, np.random.Generator]]:
-    """The subject as each shot finds it with the rig as calibrated, and the shot's own noise.
+    """Yields the subject as each shot finds it with the rig as calibrated, and the shot's own noise.
 
     Where cameras drift, the calibration is moved and the cameras stand: a shot cannot tell the one from the other.
     """
@@ -131,7 +133,7 @@ def scenes(
 
 
 def moved(rng: np.random.Generator) -> tuple[Lamp, ...]:
-    """The studio's lamps, each carried to another place and dimmed on its own."""
+    """Returns the studio's lamps, each carried to another place and dimmed on its own."""
     lamps = []
     for lamp in LAMPS:
         x, y, z = (np.array(lamp.towards) + rng.normal(0, LAMP_SHIFT, 3)).tolist()
@@ -148,7 +150,8 @@ def reconstructed(scene: Scene, capture: Capture, model: HeadModel, renderer: Re
 
 
 def judged(model: HeadModel, shots: list[Shot]) -> Row:
-    """Figures over the face, over its skin that cameras see in every shot (``seen_``), and what all shots repeat."""
+    """Returns figures over the face, over its skin that cameras see in every shot (``seen_``), and what all shots
+    repeat."""
     full = model.levels["full"]
     face, areas = full.face_region, vertex_areas(shots[0].vertices, full.faces)
     seen = face & np.all([shot.photographed for shot in shots], axis=0)

@@ -66,7 +66,7 @@ def robustness(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Errors by condition, their ratios to the base and to the bound, and how often faults are found."""
+    """Returns errors by condition, their ratios to the base and to the bound, and how often faults are found."""
     records = Records(folder, "robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
     span = with_modes(model, 60)
     rows = []
@@ -115,7 +115,7 @@ def wrong_contours(model: HeadModel, subject: Planted, renderer: Renderer, rng: 
 
 
 def spoiled(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Bool[np.ndarray, "h w"]:
-    """The mask with ``WRONG_SHARE`` of its contour inside disks that were stuck on or bitten out."""
+    """Returns the mask with ``WRONG_SHARE`` of its contour inside disks that were stuck on or bitten out."""
     edge = mask & ~_eroded(mask)
     at = np.argwhere(edge)
     wrong, out = np.zeros(len(at), bool), mask.copy()
@@ -139,7 +139,8 @@ def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def calibration(
     error_px: float, known: bool, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator
 ) -> Row:
-    """Root mean square error and the joint bound; the cameras that take the picture are where the rig does not say."""
+    """Returns root mean square error and the joint bound; the cameras that take the picture are where the rig does not
+    say."""
     rig, clean = default_layout(), _clean(model, subject, renderer)
     believed = off_by(stated(rig, error_px) if known else rig, error_px, rng)
     noisy = {n: limit.with_noise(s, CONTOUR_NOISE_PX, limit.CORRELATION_PX, rng) for n, s in clean.items()}
@@ -159,7 +160,8 @@ def _clean(model: HeadModel, subject: Planted, renderer: Renderer) -> dict[str, 
 
 
 def faulty(kind: str, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
-    """Which cameras ``reconstruct`` leaves out, and what is left of the error; ``none`` tells of false alarms."""
+    """Returns which cameras ``reconstruct`` leaves out, and what is left of the error; ``none`` tells of false
+    alarms."""
     rig = default_layout()
     first, second = rng.choice(rig.names, 2, replace=False).tolist()
     true, bad = rig, []
@@ -177,7 +179,7 @@ def faulty(kind: str, model: HeadModel, subject: Planted, renderer: Renderer, rn
 
 
 def knocked(rig: Rig, name: str, turn_deg: float, rng: np.random.Generator) -> Rig:
-    """The rig with one camera turned about a random axis across its view."""
+    """Returns the rig with one camera turned about a random axis across its view."""
     around = rng.uniform(0.0, 2.0 * np.pi)
     turn = np.radians(turn_deg) * np.array([np.cos(around), np.sin(around), 0.0])
     motion = RigidTransform(rotation_from_vector(turn), np.zeros(3))

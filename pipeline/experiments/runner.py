@@ -41,14 +41,14 @@ from rig.render.renderer import Renderer
 
 
 class UnknownExperiment(EigenheadError):
-    """A name that no experiment has."""
+    """Refuses a name that no experiment has."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"no experiment is called {name!r}; there are {', '.join(EXPERIMENTS)}")
 
 
 class MissingPeers(EigenheadError):
-    """A package of the group ``peers`` is not installed."""
+    """Reports that a package of the group ``peers`` is not installed."""
 
     def __init__(self, package: str) -> None:
         super().__init__(f"{package} is not installed: run `uv sync --group peers`")
@@ -56,7 +56,7 @@ class MissingPeers(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What some experiments take alone.
+    """Holds what some experiments take alone.
 
     ``simplex``: how many subjects of a table the simplex fits too; ``captures``: whether those of the shared folder
     count beside the studio's heads; ``openmvs``: that peer's programs. Of people and
@@ -73,7 +73,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What a command asks for."""
+    """Holds what a command asks for."""
 
     head: HeadModel
     subjects: int | None
@@ -96,8 +96,8 @@ def run_experiment(
     report: Progress,
     options: Options = NO_OPTIONS,
 ) -> Outcome:
-    """Figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a table and
-    pictures are left there.
+    """Returns figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a
+    table and pictures are left there.
 
     ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
     """

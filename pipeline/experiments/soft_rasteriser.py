@@ -36,7 +36,7 @@ DECAY = (0.9, 0.999)  # Adam's
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Steps of Adam at one sigma (px of the reduced image), and their size (standard deviations)."""
+    """Holds steps of Adam at one sigma (px of the reduced image), and their size (standard deviations)."""
 
     steps: int
     sigma_px: float
@@ -48,7 +48,7 @@ PHASES = (Phase(30, 1.0, 0.1), Phase(60, 0.5, 0.04), Phase(80, 0.25, 0.02))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Pixels near the outline, and the triangles near them; pairs are sorted by pixel."""
+    """Holds pixels near the outline, and the triangles near them; pairs are sorted by pixel."""
 
     pixel: Float32[np.ndarray, "p 2"]
     target: Float32[np.ndarray, " p"]  # coverage of the input
@@ -66,7 +66,7 @@ def fit_soft(
     modes: int = 60,
     phases: tuple[Phase, ...] = PHASES,
 ) -> tuple[Float[np.ndarray, " m"], int]:
-    """Coefficients (standard deviations) at a given pose, and the number of gradients taken."""
+    """Returns coefficients (standard deviations) at a given pose, and the number of gradients taken."""
     scaled, faces = rig.scaled(IMAGE_SCALE), model.levels[MESH].faces
     coverage = np.stack([input_coverage(silhouettes[camera.name], IMAGE_SCALE) for camera in scaled])
     shape = shape_of(model, world_from_head, scaled, modes)
@@ -96,14 +96,14 @@ def _compiled(name: Literal["screen", "slope"]) -> Callable[..., Any]:
 
 
 def input_coverage(silhouette: Silhouette, scale: float) -> Float32[np.ndarray, "h w"]:
-    """Share of every pixel of the reduced image that the input covers."""
+    """Returns the share of every pixel of the reduced image that the input covers."""
     height, width = silhouette.distance.shape
     soft = np.clip(0.5 - silhouette.distance, 0.0, 1.0)
     return cv2.resize(soft, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
 
 
 def shape_of(model: HeadModel, world_from_head: Similarity, rig: Rig, modes: int) -> tuple[np.ndarray, ...]:
-    """Mean (V, 3) and modes (M, V, 3) in the world, and every camera (K, 21), as JAX takes them."""
+    """Returns the mean (V, 3) and modes (M, V, 3) in the world, and every camera (K, 21), as JAX takes them."""
     mean = world_from_head.apply((model.levels[MESH].operator @ model.mean).astype(float))
     turn = (world_from_head.scale * world_from_head.rotation).astype(np.float32)
     basis = np.einsum("ab,mvb->mva", turn, model.basis(MESH, modes), optimize=True)
@@ -115,7 +115,7 @@ def shape_of(model: HeadModel, world_from_head: Similarity, rig: Rig, modes: int
 
 
 def screen_points(coefficients: Any, mean: Any, basis: Any, cameras: Any) -> Any:
-    """Pixels (K * V, 2) of the vertices in all views."""
+    """Returns pixels (K * V, 2) of the vertices in all views."""
     import jax
     import jax.numpy as jnp
 
@@ -138,7 +138,7 @@ def loss(
     coefficients: Any, mean: Any, basis: Any, cameras: Any, pixel: Any, target: Any, weight: Any, row: Any, corner: Any,
     present: Any, sigma: Any,
 ) -> Any:  # fmt: skip
-    """Squared difference of soft and input coverage in units of ``NOISE``, plus the prior: z ~ N(0, I)."""
+    """Returns the squared difference of soft and input coverage in units of ``NOISE``, plus the prior: z ~ N(0, I)."""
     import jax.numpy as jnp
     from jax.ops import segment_sum
 
@@ -150,7 +150,7 @@ def loss(
 
 
 def signed_square(triangles: Any, points: Any) -> Any:
-    """Squared distance of points (n, 2) to the border of triangles (n, 3, 2), positive inside."""
+    """Returns the squared distance of points (n, 2) to the border of triangles (n, 3, 2), positive inside."""
     import jax.numpy as jnp
 
     squares, sides = [], []
@@ -171,7 +171,7 @@ def find_pairs(
     coverage: Float32[np.ndarray, "k h w"],
     reach_px: float,
 ) -> Pairs:
-    """Pixels within ``reach_px`` of the model's outline, and the triangles within that of each."""
+    """Returns pixels within ``reach_px`` of the model's outline, and the triangles within that of each."""
     near = np.stack([_near_outline(mask, reach_px) for mask in masks])
     index = np.full(near.shape, -1, np.int32)
     index[near] = np.arange(near.sum(), dtype=np.int32)
@@ -220,7 +220,7 @@ def _search(points, faces, index, reach):
 
 
 def padded(pairs: Pairs) -> tuple[np.ndarray, ...]:
-    """Pixel, target, weight, row, corner, present: of few sizes, since JAX compiles for each."""
+    """Returns pixel, target, weight, row, corner, present: of few sizes, since JAX compiles for each."""
     pixels, count = len(pairs.pixel), len(pairs.row)
     more, spare = _room(pixels + 1) - pixels, _room(count) - count
     return (

@@ -30,7 +30,7 @@ POINTS = 4000  # points of the truth in a fit; all of them count in the figures
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Points of a true face with the areas they stand for (mm²), and its seven feature points."""
+    """Holds points of a true face with the areas they stand for (mm²), and its seven feature points."""
 
     name: str
     points: Float[np.ndarray, "N 3"]
@@ -45,7 +45,8 @@ def run(
     counts: Sequence[int] = (60, 0),
     report: Progress | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``: floors of each model on each truth, for each count of modes (0: all).
+    """Returns ``{"figures": {...}, "rows": [...]}``: floors of each model on each truth, for each count of modes (0:
+    all).
 
     ``figures`` is flat: ``<model>_<modes>_<truth>_{median,mean}_mm`` and ``_largest_sigma`` for each single truth, and
     ``<model>_<modes>_draws_...`` as means over the truths whose names start with ``draw:``. Beside them
@@ -64,7 +65,7 @@ def run(
 
 
 def floor(name: str, model: HeadModel, truth: Truth, count: int = 0) -> dict:
-    """One row: distances (mm, area-weighted) of the true face to the model's best likeness of it."""
+    """Returns one row: distances (mm, area-weighted) of the true face to the model's best likeness of it."""
     used = min(count or len(model.modes), len(model.modes))
     fit = best_likeness(model, truth, used)
     z = np.abs(fit.coefficients)
@@ -83,7 +84,7 @@ def floor(name: str, model: HeadModel, truth: Truth, count: int = 0) -> dict:
 
 
 def best_likeness(model: HeadModel, truth: Truth, count: int) -> SurfaceFit:
-    """The model fitted to the truth's points, from the seven feature points on; distances to every point."""
+    """Returns the model fitted to the truth's points, from the seven feature points on; distances to every point."""
     ours = model.vertices(np.zeros(0))
     source = np.array([ours[model.landmarks[name]] for name in truth.features])
     start = rigid_fit(source, np.array(list(truth.features.values())))
@@ -94,14 +95,14 @@ def best_likeness(model: HeadModel, truth: Truth, count: int) -> SurfaceFit:
 
 
 def weighted_quantile(values: Float[np.ndarray, " N"], weights: Float[np.ndarray, " N"], share: float) -> float:
-    """The value below which ``share`` of the weight lies."""
+    """Returns the value below which ``share`` of the weight lies."""
     order = np.argsort(values)
     below = np.cumsum(weights[order]) / weights.sum()
     return float(values[order][np.searchsorted(below, share).clip(0, len(values) - 1)])
 
 
 def read_truth(folder: Path) -> Truth:
-    """A truth folder as the simulator and the shared captures write it. Raises InputError."""
+    """Returns a truth folder as the simulator and the shared captures write it. Raises InputError."""
     missing = [f"{n} is missing" for n in ("head.ply", "face_mask.npy", "meta.json") if not (folder / n).is_file()]
     if missing:
         raise InputError(str(folder), missing)
@@ -115,7 +116,7 @@ def read_truth(folder: Path) -> Truth:
 
 
 def random_draws(model: HeadModel, count: int, *, seed: int = 0) -> list[Truth]:
-    """Faces of random heads of ``model``, all modes, z ~ N(0, I); named ``draw:0`` and following."""
+    """Returns faces of random heads of ``model``, all modes, z ~ N(0, I); named ``draw:0`` and following."""
     level = model.levels["full"]
     rng = np.random.default_rng(seed)
     out = []

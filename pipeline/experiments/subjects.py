@@ -29,7 +29,7 @@ START_TURN, START_SHIFT_MM = np.radians(2.0), 4.0  # what feature points leave (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planted:
-    """A head with known coefficients in a known pose, and a start as feature points would leave it."""
+    """Holds a head with known coefficients in a known pose, and a start as feature points would leave it."""
 
     name: str
     coefficients: Float[np.ndarray, " m"]
@@ -41,7 +41,7 @@ class Planted:
 
 
 def subjects_of_section_5_2(model: HeadModel, count: int = 100, seed: int = 52) -> list[Planted]:
-    """Half of them heads of the database (all their modes), half random (60 modes)."""
+    """Returns half of them heads of the database (all their modes), half random (60 modes)."""
     rng = np.random.default_rng(seed)
     known = rng.permutation(len(model.scores))[: count // 2]
     found = [_planted(f"database-{i:03}", np.asarray(model.scores[i], float), rng) for i in known]
@@ -51,7 +51,7 @@ def subjects_of_section_5_2(model: HeadModel, count: int = 100, seed: int = 52) 
 
 
 def random_subjects(count: int, seed: int, modes: int = 60, most: float | None = SPREAD) -> list[Planted]:
-    """Random heads of the model's span, each coefficient within ``most`` standard deviations if not None."""
+    """Returns random heads of the model's span, each coefficient within ``most`` standard deviations if not None."""
     rng = np.random.default_rng(seed)
     bound = np.inf if most is None else most
     return [_planted(f"random-{i:03}", _within(rng, modes, bound), rng) for i in range(count)]
@@ -74,14 +74,14 @@ def _planted(name: str, coefficients: np.ndarray, rng: np.random.Generator) -> P
 
 
 def exact(rig: Rig) -> Rig:
-    """The rig with calibration errors stated as none."""
+    """Returns the rig with calibration errors stated as none."""
     return Rig(tuple(replace(camera, covariance=1e-12 * np.eye(6)) for camera in rig))
 
 
 def binary_silhouettes(
     model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, scale: float = 1.0
 ) -> dict[str, Silhouette]:
-    """Masks as the renderer draws them at full mesh resolution."""
+    """Returns masks as the renderer draws them at full mesh resolution."""
     with renderer.silhouette_set(rig, model.levels["full"].faces, scale) as drawn:
         masks = drawn.masks(subject.vertices(model))
     return {name: silhouette_from_mask(mask) for name, mask in masks.items()}
@@ -90,7 +90,7 @@ def binary_silhouettes(
 def exact_silhouettes(
     model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, finer: int = 4, level: str = "full"
 ) -> dict[str, Silhouette]:
-    """Signed distances of the true outline, to 0.03 px or so, from masks drawn ``finer`` times as large."""
+    """Returns signed distances of the true outline, to 0.03 px or so, from masks drawn ``finer`` times as large."""
     with renderer.silhouette_set(rig, model.levels[level].faces, float(finer)) as drawn:
         masks = drawn.masks(subject.vertices(model, level))
     found = {}
@@ -103,14 +103,14 @@ def exact_silhouettes(
 
 
 def face_errors(model: HeadModel, fit: Fit, subject: Planted) -> Float[np.ndarray, "n 3"]:
-    """Found minus true position (mm, world) of every face-region vertex."""
+    """Returns found minus true position (mm, world) of every face-region vertex."""
     region = model.levels["full"].face_region
     found = fit.world_from_head.apply(model.vertices(fit.coefficients))
     return found[region] - subject.vertices(model)[region]
 
 
 def mean_error_mm(model: HeadModel, fit: Fit, subject: Planted) -> float:
-    """Mean distance (mm) of the face region's vertices from where they truly are."""
+    """Returns the mean distance (mm) of the face region's vertices from where they truly are."""
     return float(np.linalg.norm(face_errors(model, fit, subject), axis=1).mean())
 
 
@@ -118,8 +118,8 @@ def worn_silhouettes(
     model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, style: HairStyle, rng: np.random.Generator,
     *, strands: bool = True,
 ) -> dict[str, Silhouette]:  # fmt: skip
-    """Masks of the head with hair, strands and all, and a shirt, as the studio dresses a subject. Without ``strands``
-    they are as masks that ask for half of a pixel: most strands are thinner."""
+    """Returns masks of the head with hair, strands and all, and a shirt, as the studio dresses a subject. Without
+    ``strands`` they are as masks that ask for half of a pixel: most strands are thinner."""
     head, full = model.vertices(subject.coefficients), model.levels["full"]
     body = anatomy(head, {name: head[row] for name, row in model.landmarks.items()})
     hair, worn = grow(head, body, style, rng), shirt(Mesh(head, full.faces), body, rng)
@@ -134,8 +134,8 @@ def worn_silhouettes(
 
 
 def off_by(rig: Rig, error_px: float, rng: np.random.Generator) -> Rig:
-    """The rig with every camera's pose off, drawn from the solver's prior for ``error_px``: a head in the middle moves
-    by 1.3 times that along each axis of the image, RMS."""
+    """Returns the rig with every camera's pose off, drawn from the solver's prior for ``error_px``: a head in the
+    middle moves by 1.3 times that along each axis of the image, RMS."""
     moved = []
     for camera in rig:
         depth = float(camera.camera_from_world.apply(rig.centre_world())[2])
@@ -147,7 +147,7 @@ def off_by(rig: Rig, error_px: float, rng: np.random.Generator) -> Rig:
 
 
 def stated(rig: Rig, error_px: float) -> Rig:
-    """The rig with calibration errors of that size stated as each camera's covariance."""
+    """Returns the rig with calibration errors of that size stated as each camera's covariance."""
     cameras = []
     for camera in rig:
         depth = float(camera.camera_from_world.apply(rig.centre_world())[2])
@@ -159,7 +159,7 @@ def stated(rig: Rig, error_px: float) -> Rig:
 def face_rows(
     model: HeadModel, coefficients: Float[np.ndarray, " m"], pose: Similarity, every: int
 ) -> Float[np.ndarray, "n p"]:
-    """d(position along a world axis) / d(coefficients, rotation, translation, log scale): three rows for every
+    """Returns d(position along a world axis) / d(coefficients, rotation, translation, log scale): three rows for every
     ``every``-th vertex of the face region, all x first."""
     region = np.flatnonzero(model.levels["full"].face_region)[::every]
     basis = model.basis("full", len(coefficients), region).astype(float)

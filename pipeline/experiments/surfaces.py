@@ -54,7 +54,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A subject and what surfaces are made of; each is made when it is first asked for."""
+    """Holds a subject and what surfaces are made of; each is made when it is first asked for."""
 
     known: Known
     model: HeadModel
@@ -82,7 +82,7 @@ def surfaces(
     openmvs: Path | None = None,
     folder: Path | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``; a figure is ``<capture>_<peer>_<quantity>``.
+    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<capture>_<peer>_<quantity>``.
 
     Args:
         model: fitted.
@@ -120,7 +120,7 @@ def surfaces(
 
 
 def peer_row(known: Known, make: Callable[[], tuple[Mesh, float]]) -> Row:
-    """Its scores, or why it has none."""
+    """Returns its scores, or why it has none."""
     try:
         mesh, seconds = make()
     except EigenheadError as failed:
@@ -176,7 +176,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """A row a surface; what is left out stands below with its reason."""
+    """Returns a row a surface; what is left out stands below with its reason."""
     scored = [row for row in rows if "left_out" not in row]
     cells = [[row["name"], row["peer"], *(row.get(column) for column in COLUMNS)] for row in scored]
     header = ("capture", "surface", *(column.replace("_", " ") for column in COLUMNS))

@@ -61,7 +61,17 @@ def table1(
     folder: Path | None = None,
 ) -> Outcome:
     """Tables 1 and 2, and pictures like figures 4 and 5. ``simplex_subjects``: how many the simplex fits too."""
-    rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder, all_too=True)
+    rows = _rows(
+        model,
+        default_layout(),
+        "table1",
+        subjects,
+        simplex_subjects,
+        renderer=renderer,
+        report=report,
+        folder=folder,
+        all_too=True,
+    )
     figures: dict[str, float] = {"subjects": len(rows), "simplex_subjects": sum("simplex" in row for row in rows)}
     for method in METHODS:
         done = [row[method] for row in rows if method in row]
@@ -99,8 +109,18 @@ def table2(
     simplex_subjects: int = 100,
     folder: Path | None = None,
 ) -> Outcome:
-    """Table 2 alone, from table 1's rows."""
-    rows = _rows(model, default_layout(), "table1", subjects, simplex_subjects, renderer, report, folder, all_too=True)
+    """Returns table 2 alone, from table 1's rows."""
+    rows = _rows(
+        model,
+        default_layout(),
+        "table1",
+        subjects,
+        simplex_subjects,
+        renderer=renderer,
+        report=report,
+        folder=folder,
+        all_too=True,
+    )
     figures = _correlations(rows)
     return {"figures": {"subjects": len(rows)} | figures, "rows": rows, "markdown": _table2_markdown(figures)}
 
@@ -114,11 +134,13 @@ def table3(
     simplex_subjects: int = 25,
     folder: Path | None = None,
 ) -> Outcome:
-    """The four arrangements of section 5.3."""
+    """Returns the four arrangements of section 5.3."""
     figures, rows, table = {}, {}, []
     for name in ARRANGEMENTS:
         rig = arrangement(name)
-        rows[name] = _rows(model, rig, f"table3-{name}", subjects, simplex_subjects, renderer, report, folder)
+        rows[name] = _rows(
+            model, rig, f"table3-{name}", subjects, simplex_subjects, renderer=renderer, report=report, folder=folder
+        )
         for method in ("contour", "simplex"):
             done = [row[method] for row in rows[name] if method in row]
             if done:
@@ -132,7 +154,7 @@ def table3(
 
 
 def correlation(rows: list[Row], one: str, two: str) -> float | None:
-    """Pearson's; None of fewer than three rows."""
+    """Returns Pearson's; None of fewer than three rows."""
     values = np.array([[row[one], row[two]] for row in rows])
     return float(np.corrcoef(values.T)[0, 1]) if len(values) > 2 else None
 
@@ -178,10 +200,10 @@ def _rows(
     name: str,
     subjects: int,
     simplex_subjects: int,
+    *,
     renderer: Renderer,
     report: Progress,
     folder: Path | None,
-    *,
     all_too: bool = False,
 ) -> list[Row]:
     """One row a subject; the solvers' rows are kept apart, so that a change of one does not cost the other's.
@@ -241,7 +263,7 @@ def _simplex_row(model: HeadModel, subject: Planted, rig: Rig, renderer: Rendere
 
 
 def scores(model: HeadModel, fit: Fit, subject: Planted, rig: Rig, renderer: Renderer) -> Row:
-    """XOR, L2, Hausdorff and mean face error of a fit, and the fit itself."""
+    """Returns XOR, L2, Hausdorff and mean face error of a fit, and the fit itself."""
     found = fit.world_from_head.apply(model.vertices(fit.coefficients))
     true = subject.vertices(model)
     with renderer.silhouette_set(rig, model.levels["full"].faces) as drawn:

@@ -39,7 +39,7 @@ def templates(
     draws: int = 50,
     folder: Path | None = None,
 ) -> Outcome:
-    """``<model>_median_mm``, ``<model>_p95_mm`` over all vertices of all draws, and so on; ``facekit_drawn`` is
+    """Returns ``<model>_median_mm``, ``<model>_p95_mm`` over all vertices of all draws, and so on; ``facekit_drawn`` is
     ICT-FaceKit with a mesh that has one draw's shape; ``_marked``: the registration was given the twelve landmarks."""
     modules = (carrying, likeness, placement, registration)
     key = key_of(facekit.sha256, *(model.sha256 for model in models.values()), draws, *modules)
@@ -59,7 +59,7 @@ def templates(
 def foreign(
     facekit: HeadModel, shape: Float[np.ndarray, "v 3"], seed: int
 ) -> tuple[PolygonMesh, Int[np.ndarray, " v"]]:
-    """ICT-FaceKit's own triangles in another order, unit and axis convention; and which vertex each one is."""
+    """Returns ICT-FaceKit's own triangles in another order, unit and axis convention; and which vertex each one is."""
     order = np.random.default_rng((SEED, seed)).permutation(len(shape))
     place = np.argsort(order)
     faces = facekit.levels["full"].faces

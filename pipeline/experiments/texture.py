@@ -65,8 +65,8 @@ def texture(
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean over the group: ``studio``,
-    or a capture by its name.
+    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean over the group:
+    ``studio``, or a capture by its name.
 
     Args:
         model: fitted, and drawn from.
@@ -101,7 +101,7 @@ def row_of(
     number: int,
     picture: Path | None,
 ) -> Row:
-    """One subject, the ``number``-th nearest camera to the front one (in turn) kept back."""
+    """Returns one subject, the ``number``-th nearest camera to the front one (in turn) kept back."""
     known = read()
     kept = kept_back(known.rig, number)
     rig = known.rig.subset(name for name in known.rig.names if name != kept.name)
@@ -114,7 +114,7 @@ def row_of(
     photograph, mesh, layout = known.capture.images[kept.name], found.mesh_world, atlas.layout
     face = face_pixels(kept, mesh, model.levels["full"].face_region)
     depths = depth_maps(rig, mesh)
-    blend = paper_texture(layout, mesh, capture, silhouettes, rig, depths, atlas.image)
+    blend = paper_texture(layout, mesh, capture, silhouettes, rig, depths, filled=atlas.image)
     drawn = {
         "texture": drawn_texture(kept, mesh, layout, atlas.image),
         "vertices": _drawn(kept, mesh.vertices, mesh.faces, found.texturing.vertices.colours.astype(np.float32)),
@@ -133,14 +133,15 @@ def row_of(
 
 
 def kept_back(rig: Rig, number: int) -> Camera:
-    """One of the cameras that look at the face."""
+    """Returns one of the cameras that look at the face."""
     front = rig[rig.front_camera()]
     order = sorted(rig, key=lambda camera: -float(camera.axis_world @ front.axis_world))
     return order[1 + number % KEPT_BACK]
 
 
 def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig, settings: Settings) -> Row:
-    """Wall and processor seconds of vertex colours alone, and of all that the texture adds, its JPEG included."""
+    """Returns wall and processor seconds of vertex colours alone, and of all that the texture adds, its JPEG
+    included."""
     mesh, layout = found.mesh_world, model_layout(model)
     coloured_by = partial(
         colour,
@@ -150,7 +151,7 @@ def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig,
         found.views.silhouettes,
         rig,
         depth_maps(rig, mesh),
-        settings.texture,
+        settings=settings.texture,
     )
     times = [(time.perf_counter(), time.process_time())]
     coloured_by()
@@ -165,7 +166,7 @@ def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig,
 
 
 def face_pixels(camera: Camera, mesh: Mesh, region: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, "h w"]:
-    """Where the camera sees the face, away from edges that hide other parts of it."""
+    """Returns where the camera sees the face, away from edges that hide other parts of it."""
     k = camera.intrinsics
     depth, seen = rasterise(
         project_points(camera, mesh.vertices), camera_depths(camera, mesh.vertices), mesh.faces, k.height, k.width
@@ -180,7 +181,7 @@ def face_pixels(camera: Camera, mesh: Mesh, region: Bool[np.ndarray, " v"]) -> B
 
 
 def drawn_texture(camera: Camera, mesh: Mesh, layout: Layout, image: Image) -> Float32[np.ndarray, "h w 3"]:
-    """A textured mesh as the camera sees it, unlit."""
+    """Returns a textured mesh as the camera sees it, unlit."""
     texels = (len(image) * layout.uv - 0.5).astype(np.float32)
     at = _drawn(camera, mesh.vertices[layout.source], layout.faces, texels)
     x, y = (np.nan_to_num(at[:, :, i]) for i in range(2))
@@ -195,7 +196,7 @@ def _drawn(camera: Camera, vertices: np.ndarray, faces: np.ndarray, values: np.n
 
 
 def errors(drawn: Float32[np.ndarray, "h w 3"], photograph: Image, face: Bool[np.ndarray, "h w"]) -> dict[str, float]:
-    """PSNR (dB) at the best of ``BLURS_PX``, as the module says."""
+    """Returns PSNR (dB) at the best of ``BLURS_PX``, as the module says."""
     tries = [cv2.GaussianBlur(drawn, (0, 0), blur) if blur else drawn for blur in BLURS_PX]
     residuals = [_residual(image[face], photograph[face]) for image in tries]
     best = min(residuals, key=lambda residual: float((residual**2).mean()))
@@ -226,7 +227,7 @@ def _residual(drawn: Float32[np.ndarray, "n 3"], seen: UInt8[np.ndarray, "n 3"])
 
 
 def noise_power(photograph: Image, face: Bool[np.ndarray, "h w"]) -> float:
-    """Variance of the photograph's noise, codes squared."""
+    """Returns the variance of the photograph's noise, codes squared."""
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     answers = cv2.filter2D(photograph.astype(np.float32), -1, kernel)[face]
     return float(np.mean((1.4826 * np.median(np.abs(answers), axis=0) / 6) ** 2))

@@ -44,7 +44,8 @@ def views(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """The planned directions, and limit and error of every arrangement over ``subjects`` heads not planned on."""
+    """Returns the planned directions, and limit and error of every arrangement over ``subjects`` heads not planned
+    on."""
     span = with_modes(model, 60)
     records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
     heads = random_subjects(CHOSEN_ON + subjects, seed=33)
@@ -105,7 +106,7 @@ def _row(model: HeadModel, head: Planted, rig: Rig, renderer: Renderer, number: 
 
 
 def information(model: HeadModel, head: Planted, rig: Rig) -> Information:
-    """Fisher information of each camera about (coefficients, pose): the face's rim alone, exact cameras."""
+    """Returns the Fisher information of each camera about (coefficients, pose): the face's rim alone, exact cameras."""
     settings, pose = settings_for(NOISE_PX), head.world_from_head
     stage = Stage("p95", len(model.modes), False, (UNROBUST_PX,), False, False, 1)
     state = State(head.coefficients, pose, np.zeros((1, PER_CAMERA)))
@@ -122,12 +123,12 @@ def information(model: HeadModel, head: Planted, rig: Rig) -> Information:
 
 
 def prior(model: HeadModel) -> Float[np.ndarray, "p p"]:
-    """z ~ N(0, I), no knowledge of the pose, a metric scale."""
+    """Returns the prior's information: z ~ N(0, I), no knowledge of the pose, a metric scale."""
     return np.diag([*np.ones(len(model.modes)), *np.zeros(POSE - 1), FittingSettings().scale_spread ** -2.0])
 
 
 def face_quadratic(model: HeadModel, head: Planted) -> Float[np.ndarray, "p p"]:
-    """``B^T B / V`` over the face: with it ``tr(C B^T B / V)`` is the mean square error of a covariance C."""
+    """Returns ``B^T B / V`` over the face: with it ``tr(C B^T B / V)`` is the mean square error of a covariance C."""
     rows = face_rows(model, head.coefficients, head.world_from_head, every=7)  # smooth: every seventh vertex will do
     return 3.0 * rows.T @ rows / len(rows)
 

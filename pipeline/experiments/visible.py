@@ -66,8 +66,8 @@ def visible(
     subjects: int = len(STYLES),
     folder: Path | None = None,
 ) -> Outcome:
-    """``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean over the group: ``studio``,
-    or a capture by its name.
+    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean over the group:
+    ``studio``, or a capture by its name.
 
     Args:
         model: fitted, and drawn from.
@@ -96,7 +96,7 @@ def visible(
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
-    """One subject by the default job."""
+    """Returns one subject by the default job."""
     subject, before = known(), time.process_time()
     found = reconstruct(ReconstructionContext(subject.capture, subject.rig, model, Settings(), renderer))
     seconds = time.process_time() - before
@@ -124,8 +124,8 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
 
 
 def region_errors(known: Known, head_world: Mesh, regions: Mapping[str, Bool[np.ndarray, " v"]]) -> dict[str, float]:
-    """Median, mean and 95th percentile (mm, by area) of the distance of true skin that two cameras see to the head, by
-    region of the head, carried to the truth by the nearest vertex."""
+    """Returns median, mean and 95th percentile (mm, by area) of the distance of true skin that two cameras see to the
+    head, by region of the head, carried to the truth by the nearest vertex."""
     skin = known.visible.points[known.visible.part == PARTS.index("head")].astype(float)
     seen = np.flatnonzero(KDTree(skin).query(known.mesh.vertices, distance_upper_bound=SEEN_MM)[0] < SEEN_MM)
     hit = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(known.mesh.vertices[seen])
@@ -145,19 +145,19 @@ def region_errors(known: Known, head_world: Mesh, regions: Mapping[str, Bool[np.
 
 
 def seen_of(bust: BustSurface) -> Mesh:
-    """The triangles whose corners some photograph measures."""
+    """Returns the triangles whose corners some photograph measures."""
     return Mesh(bust.mesh_world.vertices, bust.mesh_world.faces[bust.seen[bust.mesh_world.faces].all(axis=1)])
 
 
 def head_to_bust(head_world: Mesh, bust: BustSurface) -> Float[np.ndarray, " n"]:
-    """Distances (mm) of the bust's seen skin to the head, where the head has any within 5 mm."""
+    """Returns distances (mm) of the bust's seen skin to the head, where the head has any within 5 mm."""
     skin = bust.mesh_world.vertices[bust.part == SKIN]
     far = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(skin).distances
     return far[far < 5.0]
 
 
 def splats(points: VisiblePoints) -> Mesh:
-    """A square about each point, across its normal: what there is to see of a truth."""
+    """Returns a square about each point, across its normal: what there is to see of a truth."""
     normals = points.normals.astype(float)
     aside = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     aside *= SPLAT_MM / np.linalg.norm(aside, axis=1, keepdims=True)

@@ -27,14 +27,15 @@ LEAST_POINTS = 100  # of a part, for figures of its own
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibleScore:
-    """``recall`` and ``precision`` by part: median, p95 (mm) and shares within 1, 2 and 5 mm; recall has "all", too."""
+    """Holds ``recall`` and ``precision`` by part: median, p95 (mm) and shares within 1, 2 and 5 mm; recall has "all",
+    too."""
 
     recall: dict[str, dict[str, float]]
     precision: dict[str, dict[str, float]]
     closed: bool
 
     def flat(self) -> dict[str, float]:
-        """One number a key, for tables: ``recall_hair_within_2mm``."""
+        """Returns one number a key, for tables: ``recall_hair_within_2mm``."""
         kinds = {"recall": self.recall, "precision": self.precision}
         named = ((f"{kind}_{part}_{key}", value) for kind, parts in kinds.items() for part, figures in parts.items()
                  for key, value in figures.items())  # fmt: skip
@@ -42,7 +43,7 @@ class VisibleScore:
 
 
 def read_visible(truth: Path) -> VisiblePoints:
-    """``visible.npz`` of a truth folder."""
+    """Returns ``visible.npz`` of a truth folder."""
     with np.load(truth / "visible.npz") as kept:
         return VisiblePoints(kept["points"], kept["normals"], kept["part"], kept["views"])
 
@@ -70,7 +71,7 @@ def score_visible(truth: VisiblePoints, mesh: Mesh) -> VisibleScore:
 
 
 def figures_of(distances: Distances) -> dict[str, float]:
-    """Median, 95th percentile, and the share within 1, 2 and 5 mm."""
+    """Returns median, 95th percentile, and the share within 1, 2 and 5 mm."""
     shares = {f"within_{limit}mm": float((distances <= limit).mean()) for limit in (1, 2, 5)}
     return {"median": float(np.median(distances)), "p95": float(np.percentile(distances, 95))} | shares
 
@@ -96,5 +97,5 @@ def _by_part(
 
 
 def document(score: VisibleScore) -> dict[str, object]:
-    """The score as JSON types."""
+    """Returns the score as JSON types."""
     return {"recall": score.recall, "precision": score.precision, "closed": score.closed}

@@ -15,21 +15,22 @@ CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found
 
 
 def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
-    """The rim where cranium, ears and neck only count as far as they stick out of the input."""
+    """Returns the rim where cranium, ears and neck only count as far as they stick out of the input."""
     face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
     return replace(rim, length=np.where(face, rim.length, share * rim.length))
 
 
 def face_of(problem: ContourProblem, evidence: StageEvidence, level: str) -> Bool[np.ndarray, " v"]:
-    """The face region, less what is known to lie under hair."""
+    """Returns the face region, less what is known to lie under hair."""
     region = problem.model.levels[level].face_region
     hair = {} if evidence.photographs is None else evidence.photographs.hair
     return region & ~hair[level] if level in hair else region
 
 
 def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Cells of every view where the input lies outside the model by more than the threshold, and around them."""
+    """Returns cells of every view where the input lies outside the model by more than the threshold, and around
+    them."""
     maps = []
     for k, (width, height) in enumerate(problem.views.size):
         cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), np.uint8)
@@ -41,7 +42,7 @@ def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tupl
 
 
 def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
-    """The rim with no weight where the input is clutter."""
+    """Returns the rim with no weight where the input is clutter."""
     if evidence.noise.clutter is None:
         return rim
     cell = (rim.pixel / CELL_PX).astype(int)

@@ -43,7 +43,7 @@ NON_MONOTONE = 4  # costs that a step may climb back to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourSolution:
-    """A problem with its solution, from which others may go on."""
+    """Holds a problem with its solution, from which others may go on."""
 
     problem: ContourProblem
     evidence: StageEvidence
@@ -82,7 +82,7 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> ContourSolution:
-    """``fit_contour`` without its covariance."""
+    """Returns ``fit_contour`` without its covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
@@ -108,8 +108,9 @@ def solve_contour(
 
 
 def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
-    """Pose and a few modes on a decimated mesh; the eigenheads, from the face's rim; the same from the whole head's,
-    kept if the head turns out to be bare; then what modes the model has beyond the eigenheads; then the full mesh."""
+    """Returns the pose and a few modes on a decimated mesh; the eigenheads, from the face's rim; the same from the
+    whole head's, kept if the head turns out to be bare; then what modes the model has beyond the eigenheads; then the
+    full mesh."""
     few, span = min(settings.modes_first, modes), min(settings.modes, modes)
     last = settings.robust_px
     wider = [Stage("p95", modes, True, (2.0 * last, last), False, True, 4)] if modes > span else []
@@ -125,7 +126,7 @@ def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
 def run_stage(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, report: Callable[[float], None]
 ) -> tuple[State, int, str]:
-    """Levenberg-Marquardt through the robust scales of one stage: state, evaluations, why it stopped.
+    """Returns Levenberg-Marquardt through the robust scales of one stage: state, evaluations, why it stopped.
 
     The set of rim samples changes with the state, which makes the cost slightly uneven: strict descent was seen to stop
     at ridges 0.3 mm from the minimum, so that a step may climb back a little.
@@ -145,27 +146,28 @@ def run_stage(
 
 
 def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
-    """The evidence while residuals of that scale are let in: half of them counts as noise."""
+    """Returns the evidence while residuals of that scale are let in: half of them counts as noise."""
     noise = evidence.noise
     unit = max(noise.unit, coarse_unit(scale_px))
     return replace(evidence, noise=replace(noise, unit=unit))
 
 
 def coarse_unit(scale_px: float) -> float:
-    """l sigma^2 (px^3) while residuals of that scale are let in: half of it counts as noise, so that the prior holds
-    the shape. Without it hair over both ears pulled the first 15 modes to 8 standard deviations, and a head 5 mm."""
+    """Returns l sigma^2 (px^3) while residuals of that scale are let in: half of it counts as noise, so that the prior
+    holds the shape. Without it hair over both ears pulled the first 15 modes to 8 standard deviations, and a head 5
+    mm."""
     return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
 
 
 def normal_equations(solved: ContourSolution) -> NormalEquations:
-    """Of the last stage, at the solution."""
+    """Returns those of the last stage, at the solution."""
     scale = max(solved.stage.scales_px[-1], solved.evidence.noise.floor_px)
     whole, there = started_problem(solved.problem, solved.evidence, solved.stage, scale, solved.state)
     return whole.equations(there)
 
 
 def finish(solved: ContourSolution) -> Fit:
-    """The fit with its Laplace covariance: the inverse of the last normal matrix, cameras marginalised."""
+    """Returns the fit with its Laplace covariance: the inverse of the last normal matrix, cameras marginalised."""
     problem, state, stage = solved.problem, solved.state, solved.stage
     kept = stage.modes + POSE
     equations = normal_equations(solved)

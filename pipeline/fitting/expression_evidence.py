@@ -24,7 +24,7 @@ VARIANCE_RANGE = (0.02, 4.0)
 
 
 def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
-    """The solution moved to where the estimated variances put it; a neutral one as it is.
+    """Returns the solution moved to where the estimated variances put it; a neutral one as it is.
 
     Args:
         solved: with all modes; its model's ``posed`` says which are expressions.
@@ -58,7 +58,7 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
 
 
 def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
-    """Whether the weights among coefficients are those of a face that is not neutral."""
+    """Tells whether the weights among coefficients are those of a face that is not neutral."""
     return len(posed) > 0 and bool(coefficients[posed.start : posed.stop].sum() >= NEUTRAL)
 
 

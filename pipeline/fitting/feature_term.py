@@ -19,7 +19,7 @@ FEATURE_SCALE = 4.0  # Geman-McClure scale of a feature point, in its standard d
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureTerm:
-    """Over (coefficients, pose, cameras where they are solved for)."""
+    """Is a term over (coefficients, pose, cameras where they are solved for)."""
 
     problem: ContourProblem
     observed: Observed

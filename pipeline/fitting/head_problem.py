@@ -36,7 +36,7 @@ def head_problem(
 
 
 def weight_bounds(state: State, posed: range, unknowns: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Steps that keep the weights of expressions between 0 and 1."""
+    """Returns steps that keep the weights of expressions between 0 and 1."""
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]
     weights = np.clip(weights, 0.0, 1.0)
@@ -47,7 +47,7 @@ def weight_bounds(state: State, posed: range, unknowns: int) -> tuple[Float[np.n
 def started_problem(
     problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, start: State
 ) -> tuple[Problem[State], Linearised]:
-    """The problem whose outline length is that of ``start``, and itself there: the rim is found only once."""
+    """Returns the problem whose outline length is that of ``start``, and itself there: the rim is found only once."""
     seen = RimTerm(problem, evidence, stage, scale_px).at(start)
     whole = head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
     rim, *others = whole.terms
@@ -67,7 +67,7 @@ def _other_terms(problem: ContourProblem, evidence: StageEvidence, stage: Stage)
 
 
 def apply_step(state: State, step: Float[np.ndarray, " p"], stage: Stage) -> State:
-    """The state after a step in the unknowns of the stage."""
+    """Returns the state after a step in the unknowns of the stage."""
     m = stage.modes
     pose = state.world_from_head
     turned = rotation_from_vector(step[m : m + 3]) @ pose.rotation

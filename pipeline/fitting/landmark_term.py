@@ -47,7 +47,7 @@ def observe_landmarks(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTerm:
-    """Over (coefficients, pose, cameras, which it does not depend on)."""
+    """Is a term over (coefficients, pose, cameras, which it does not depend on)."""
 
     observed: LandmarkObservations
     stage: Stage

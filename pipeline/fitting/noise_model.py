@@ -19,7 +19,8 @@ UNIT_RANGE = (1.0, 40.0)  # px^3: noise of 0.5 px over 4 px; misfit of 2 px over
 
 
 def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
-    """The evidence with what the residuals say of the model's misfit: unit, robust floor and, once, where clutter is.
+    """Returns the evidence with what the residuals say of the model's misfit: unit, robust floor and, once, where
+    clutter is.
 
     Clutter is found while the eigenheads alone still hold the shape: a wider basis would rather bulge into the hair
     than pay for it as an outlier, since every px of outline pays alone.
@@ -38,7 +39,7 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
 def with_clutter_of_start(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage
 ) -> StageEvidence:
-    """The evidence with what no head makes of the outlines, where found landmarks say how the head lies.
+    """Returns the evidence with what no head makes of the outlines, where found landmarks say how the head lies.
 
     Long hair before a face is wider than any face, and pulls the first modes to it before residuals could tell.
     """
@@ -50,7 +51,7 @@ def with_clutter_of_start(
 
 
 def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
-    """l sigma^2 (px^3) of what the contours still miss, the model's misfit included; None where the settings
+    """Returns l sigma^2 (px^3) of what the contours still miss, the model's misfit included; None where the settings
     state both.
 
     Means over blocks of B px of outline have the variance l sigma^2 / B where B is well above l, whatever l is.
@@ -75,8 +76,8 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
 
 
 def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
-    """Does a fit to the whole head explain cranium and ears, and the face as well as ``from_face``, the fit to the face
-    alone? An outline of hair is mostly no head's; where it is, that head has another face."""
+    """Tells whether a fit to the whole head explains cranium and ears, and the face as well as ``from_face``, the fit
+    to the face alone. An outline of hair is mostly no head's; where it is, that head has another face."""
     rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
     region = problem.model.levels[stage.level].face_region
     other = np.flatnonzero(~region[rim.corner].all(axis=1))

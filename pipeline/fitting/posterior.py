@@ -34,7 +34,7 @@ EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance rat
 
 
 def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
-    """The fit with the covariance that follows from a prior whose variance is estimated from the fit itself.
+    """Returns the fit with the covariance that follows from a prior whose variance is estimated from the fit itself.
 
     What the photographs determine keeps its variance. With ``C`` the covariance under unit priors, group by group of
     modes ``s^2 = sum z^2 / sum (1 - C_ii)``, and the new covariance is ``(C^-1 + 1 / s^2 - 1)^-1``.
@@ -72,7 +72,8 @@ def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
 
 
 def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
-    """Standard deviation (mm) of every full-level vertex along its normal; zero where the fit has no covariance.
+    """Returns the standard deviation (mm) of every full-level vertex along its normal; zero where the fit has no
+    covariance.
 
     Taken on the cage and carried to the full level by its operator, whose rows are convex combinations: a posterior is
     smooth there, and the cage has a twentieth of the vertices. Along the normal, since sliding along the surface
@@ -86,7 +87,7 @@ def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
 
 
 def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
-    """Variance (mm^2) of the cage's vertices along their normals, of a fit with a covariance."""
+    """Returns the variance (mm^2) of the cage's vertices along their normals, of a fit with a covariance."""
     assert fit.covariance is not None
     rows = normal_rows(model, fit)
     # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.
@@ -99,7 +100,7 @@ def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
 
 
 def normal_rows(model: HeadModel, fit: Fit) -> Float[np.ndarray, "v0 p"]:
-    """d(position along the normal) / d(parameters of the covariance) at every cage vertex."""
+    """Returns d(position along the normal) / d(parameters of the covariance) at every cage vertex."""
     pose, count = fit.world_from_head, len(fit.coefficients)
     cage = model.cage(fit.coefficients)
     normals_head = vertex_normals(cage, model.levels["cage"].faces)

@@ -25,18 +25,18 @@ TAIL = 2.0  # exponent of the weights' prior
 
 
 def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, " e"]:
-    """The weights of expressions among coefficients; none while a stage has none."""
+    """Returns the weights of expressions among coefficients; none while a stage has none."""
     return np.maximum(coefficients[problem.model.posed.start : problem.model.posed.stop], 0.0)
 
 
 def weight_slope(weights: Float[np.ndarray, " e"], median: float) -> Float[np.ndarray, " e"]:
-    """Half the slope of ``2 TAIL log(1 + w / t)``, their part of the cost beside the Gaussian's."""
+    """Returns half the slope of ``2 TAIL log(1 + w / t)``, their part of the cost beside the Gaussian's."""
     return TAIL / (median + weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorTerm:
-    """Over (coefficients, pose, cameras where they are solved for)."""
+    """Is a term over (coefficients, pose, cameras where they are solved for)."""
 
     problem: ContourProblem
     stage: Stage
@@ -47,7 +47,7 @@ class PriorTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedPriorTerm:
-    """The priors at one state."""
+    """Holds the priors at one state."""
 
     term: PriorTerm
     state: State

@@ -23,7 +23,7 @@ FIRST_NOISE_PX, FIRST_CORRELATION_PX = 1.0, 6.0  # before the residuals have bee
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Where the solver stands."""
+    """Says where the solver stands."""
 
     coefficients: Float[np.ndarray, " m"]
     world_from_head: Similarity
@@ -32,7 +32,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One level of the coarse-to-fine schedule."""
+    """Holds one level of the coarse-to-fine schedule."""
 
     level: str
     modes: int
@@ -45,8 +45,8 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Feature points, packed: landmark vertex (row of the full level), view, pixel, and what the model says of the
-    landmark (head frame, mm)."""
+    """Holds feature points, packed: landmark vertex (row of the full level), view, pixel, and what the model says of
+    the landmark (head frame, mm)."""
 
     vertex: Int[np.ndarray, " n"]
     view: Int[np.ndarray, " n"]
@@ -57,9 +57,9 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkObservations:
-    """Places of the face that were found in the world (mm). ``corner`` and ``blend``: vertices of the full level and
-    their weights; ``whiten``: takes all differences (mm, stacked) to standard deviations; ``mean`` and ``basis``: the
-    places of the mean head and what the modes do to them, head frame."""
+    """Holds places of the face that were found in the world (mm). ``corner`` and ``blend``: vertices of the full level
+    and their weights; ``whiten``: takes all differences (mm, stacked) to standard deviations; ``mean`` and ``basis``:
+    the places of the mean head and what the modes do to them, head frame."""
 
     corner: Int[np.ndarray, "n 3"]
     blend: Float[np.ndarray, "n 3"]
@@ -71,15 +71,17 @@ class LandmarkObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelBasis:
-    """Mean and modes contiguous by vertex, and what takes them to the level: for a decimated level its own rows (2 MB),
-    for the full one the cage's, through the level's operator (the full level's own rows would be 40 to 170 MB)."""
+    """Holds the mean and modes contiguous by vertex, and what takes them to the level: for a decimated level its own
+    rows (2 MB), for the full one the cage's, through the level's operator (the full level's own rows would be 40 to 170
+    MB)."""
 
     operator: sparse.csr_array
     mean: Float[np.ndarray, "v 3"]
     modes: Float32[np.ndarray, "v 3 m"]
 
     def vertices(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "V 3"]:
-        """Head frame, mm. The sum over modes is in single precision (1e-5 mm), a third of the memory's traffic."""
+        """Returns the vertices in the head frame, mm. The sum over modes is in single precision (1e-5 mm), a third of
+        the memory's traffic."""
         flat = self.modes.reshape(self.mean.size, -1)
         moved = flat[:, : len(coefficients)] @ coefficients.astype(np.float32)
         return self.operator @ (self.mean + moved.reshape(-1, 3))
@@ -87,7 +89,7 @@ class LevelBasis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourProblem:
-    """Everything that stays fixed during a fit."""
+    """Holds everything that stays fixed during a fit."""
 
     model: HeadModel
     rig: Rig
@@ -102,7 +104,7 @@ class ContourProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceObservations:
-    """n observations of vertices of the full level; K cameras in the order of the solver's views."""
+    """Holds n observations of vertices of the full level; K cameras in the order of the solver's views."""
 
     vertex: Int[np.ndarray, " n"]
     basis: Float32[np.ndarray, "m n 3"]  # the model's modes at those vertices, head frame
@@ -120,10 +122,10 @@ class SurfaceObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimNoise:
-    """How far an outline may be believed. ``unit``: l sigma^2 (px^3), what a px^2 of residual along a px of outline is
-    divided by; ``floor_px``: no robust scale below this, three standard deviations of the model's misfit; ``clutter``:
-    per view, in cells, where the input is hair or clothes, None where nobody has looked; ``is_settled``: whether that
-    comes from a fit, not from its start alone."""
+    """Says how far an outline may be believed. ``unit``: l sigma^2 (px^3), what a px^2 of residual along a px of
+    outline is divided by; ``floor_px``: no robust scale below this, three standard deviations of the model's misfit;
+    ``clutter``: per view, in cells, where the input is hair or clothes, None where nobody has looked; ``is_settled``:
+    whether that comes from a fit, not from its start alone."""
 
     unit: float
     floor_px: float
@@ -133,7 +135,7 @@ class RimNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoEvidence:
-    """What photographs say between the rims, and by level which vertices' outline is hair's."""
+    """Holds what photographs say between the rims, and by level which vertices' outline is hair's."""
 
     surface: SurfaceObservations
     hair: Mapping[str, Bool[np.ndarray, " v"]]
@@ -141,14 +143,15 @@ class PhotoEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageEvidence:
-    """What has been found out by the time a stage begins."""
+    """Holds what has been found out by the time a stage begins."""
 
     noise: RimNoise
     photographs: PhotoEvidence | None = None
 
 
 def first_evidence(settings: FittingSettings) -> StageEvidence:
-    """Before any residual has been seen: noise as stated, or that of a model that does not quite fit."""
+    """Returns the evidence before any residual has been seen: noise as stated, or that of a model that does not quite
+    fit."""
     noise, length = settings.contour_noise_px or FIRST_NOISE_PX, settings.contour_correlation_px
     return StageEvidence(RimNoise(noise**2 * (length or FIRST_CORRELATION_PX), 0.0, None))
 
@@ -160,6 +163,7 @@ def make_problem(
     rig: Rig,
     settings: FittingSettings,
     features: Mapping[str, Mapping[str, np.ndarray]],
+    *,
     levels: tuple[str, ...] = ("p95", "full"),
     landmarks: LandmarkObservations | None = None,
 ) -> ContourProblem:
@@ -185,7 +189,8 @@ def make_problem(
 
 @lru_cache(maxsize=4)  # models are few, jobs are many
 def level_basis(model: HeadModel, name: str) -> LevelBasis:
-    """Mean and modes (mm, head frame) where a level's vertices come from them: a coarse level has its own."""
+    """Returns the mean and modes (mm, head frame) where a level's vertices come from them: a coarse level has its
+    own."""
     level = model.levels[name]
     if level.count < len(model.mean):
         coarse_basis = model.basis(name, len(model.modes)).transpose(1, 2, 0)
@@ -196,8 +201,8 @@ def level_basis(model: HeadModel, name: str) -> LevelBasis:
 
 @lru_cache(maxsize=4)
 def level_topology(model: HeadModel, name: str) -> Topology:
-    """A level's edges and regions. The neck below the chin never speaks: heads turn on it, collars hide it, and its cut
-    is no contour of anybody."""
+    """Returns a level's edges and regions. The neck below the chin never speaks: heads turn on it, collars hide it, and
+    its cut is no contour of anybody."""
     level = model.levels[name]
     mean = model.vertices(np.zeros(0), name)
     chin = model.vertices(np.zeros(0))[model.landmarks["gnathion"], 1]
@@ -205,7 +210,8 @@ def level_topology(model: HeadModel, name: str) -> Topology:
 
 
 def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Float[np.ndarray, "6 6"]:
-    """Inverse prior covariance of a camera's correction: its calibration's own, or ``error_px`` in the image.
+    """Returns the inverse prior covariance of a camera's correction: its calibration's own, or ``error_px`` in the
+    image.
 
     A correction of the default prior moves a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS, half of it (in
     variance) by rotation and half by translation, which a head cannot tell apart.
@@ -222,7 +228,7 @@ def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Floa
 def pack_features(
     model: HeadModel, names: tuple[str, ...], features: Mapping[str, Mapping[str, np.ndarray]]
 ) -> Observed | None:
-    """Feature points (px) of the model's landmarks as arrays; None where no camera has one."""
+    """Returns feature points (px) of the model's landmarks as arrays; None where no camera has one."""
     found = [
         (model.landmarks[landmark], names.index(camera), pixel)
         for landmark, views in sorted(features.items())
@@ -239,7 +245,7 @@ def pack_features(
 def landmark_basis(
     model: HeadModel, vertex: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
-    """Mean and all modes at vertices of the full level."""
+    """Returns the mean and all modes at vertices of the full level."""
     mean = np.asarray(model.levels["full"].operator[vertex] @ model.mean, float)
     return mean, model.basis("full", len(model.modes), vertex)
 
@@ -247,7 +253,7 @@ def landmark_basis(
 def blended_basis(
     model: HeadModel, corner: Int[np.ndarray, "n 3"], blend: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
-    """Mean and all modes at places within triangles of the full level."""
+    """Returns the mean and all modes at places within triangles of the full level."""
     rows, inverse = np.unique(corner, return_inverse=True)
     mean, basis = landmark_basis(model, rows)
     at = inverse.reshape(corner.shape)
@@ -256,7 +262,7 @@ def blended_basis(
 
 
 def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
-    """The same problem with a model of the same mesh that has more modes, solved on ``levels``."""
+    """Returns the same problem with a model of the same mesh that has more modes, solved on ``levels``."""
     features = problem.features
     if features is not None:
         mean, basis = landmark_basis(model, features.vertex)
@@ -270,12 +276,12 @@ def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) 
 
 
 def start_state(problem: ContourProblem, world_from_head: Similarity) -> State:
-    """The mean head at a pose, every camera where it was calibrated."""
+    """Returns the mean head at a pose, every camera where it was calibrated."""
     return State(np.zeros(0), world_from_head, np.zeros((len(problem.views.names), PER_CAMERA)))
 
 
 def moved_views(problem: ContourProblem, state: State) -> Views:
-    """The views with the cameras where the state has them."""
+    """Returns the views with the cameras where the state has them."""
     if not state.camera_shift.any():
         return problem.views
     turn = rotation_from_vector(state.camera_shift[:, :3])

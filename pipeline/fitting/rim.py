@@ -44,7 +44,7 @@ STEPS_OUT_PX = (0.3, 2.5)  # both must leave the mask: the second drops samples 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """What the rim needs to know of a mesh level; computed once."""
+    """Holds what the rim needs to know of a mesh level; computed once."""
 
     faces: Int32[np.ndarray, "f 3"]
     edges: Int32[np.ndarray, "e 4"]  # from, to (as in face one), face one, face two or -1
@@ -54,7 +54,7 @@ class Topology:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """The cameras and their signed distances, packed for compiled loops."""
+    """Holds the cameras and their signed distances, packed for compiled loops."""
 
     names: tuple[str, ...]
     rotation: Float[np.ndarray, "k 3 3"]
@@ -65,13 +65,13 @@ class Views:
     offset: Int[np.ndarray, " k"]
 
     def packed(self) -> Float[np.ndarray, "k 22"]:
-        """The cameras as ``packed_camera`` has them."""
+        """Returns the cameras as ``packed_camera`` has them."""
         return np.concatenate([self.rotation.reshape(-1, 9), self.translation, self.lens], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim:
-    """Samples of the outer outline, all views together."""
+    """Holds samples of the outer outline, all views together."""
 
     view: Int32[np.ndarray, " s"]
     corner: Int32[np.ndarray, "s 2"]  # the edge's two vertices
@@ -89,8 +89,8 @@ def make_topology(
     face_region: Bool[np.ndarray, " v"],
     head_region: Bool[np.ndarray, " v"] | None = None,
 ) -> Topology:
-    """Edges with their two faces; ``head_region`` is the whole mesh by default. Raises ValueError where more than two
-    faces share an edge."""
+    """Returns edges with their two faces; ``head_region`` is the whole mesh by default. Raises ValueError where more
+    than two faces share an edge."""
     faces = np.ascontiguousarray(faces, np.int32)
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     owner = np.tile(np.arange(len(faces), dtype=np.int32), 3)
@@ -111,7 +111,7 @@ def make_topology(
 
 
 def pack_views(rig: Rig, distances: dict[str, Float32[np.ndarray, "h w"]]) -> Views:
-    """The cameras of ``rig`` that have a signed distance."""
+    """Returns the cameras of ``rig`` that have a signed distance."""
     cameras = [camera for camera in rig if camera.name in distances]
     maps = [np.ascontiguousarray(distances[camera.name], np.float32) for camera in cameras]
     return Views(
@@ -133,8 +133,8 @@ def find_rim(
     whole_head: bool = False,
     averaged: bool = False,
 ) -> Rim:
-    """The outer outline of a mesh in every view, and the input's signed distance there; ``averaged``: its mean half way
-    to the neighbours along the outline, for a mesh as fine as the outline (2 to 6 px)."""
+    """Returns the outer outline of a mesh in every view, and the input's signed distance there; ``averaged``: its mean
+    half way to the neighbours along the outline, for a mesh as fine as the outline (2 to 6 px)."""
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
     normals, planes = normals_and_planes(vertices, topology.faces)
@@ -179,5 +179,5 @@ def _outlines(
 def project_with_slopes(
     points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-    """Pixel of every point in the view named beside it, and d(pixel) / d(point)."""
+    """Returns the pixel of every point in the view named beside it, and d(pixel) / d(point)."""
     return projected_with_slopes(points_world, view, views.packed())

@@ -20,7 +20,7 @@ LEVEL, STEPS = "p95", 4  # as the contour solver's own stage with more modes
 
 
 def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
-    """The fit of a solution, with the misfit of its span.
+    """Returns the fit of a solution, with the misfit of its span.
 
     Args:
         solved: to the outlines, with the eigenheads alone.
@@ -42,7 +42,7 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
 
 
 def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:
-    """A fit with the misfit (mm, along the normals) that a wider one of the same outlines shows; both have
+    """Returns a fit with the misfit (mm, along the normals) that a wider one of the same outlines shows; both have
     covariances."""
     cage = fit.world_from_head.apply(model.cage(fit.coefficients))
     normals = vertex_normals(cage, model.levels["cage"].faces)

@@ -32,7 +32,7 @@ def surface_residual(
     world_from_head: Similarity,
     camera_shift: Float[np.ndarray, "k 6"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """e (mm), 0 where a bound is kept, and where the vertices are now (world)."""
+    """Returns e (mm), 0 where a bound is kept, and where the vertices are now (world)."""
     count = len(coefficients)
     moved = (coefficients.astype(np.float32) @ seen.basis[:count].reshape(count, -1)).reshape(-1, 3)
     points = world_from_head.apply(seen.mean + moved)
@@ -43,7 +43,7 @@ def surface_residual(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceTerm:
-    """Over (coefficients, pose, cameras where they are solved for)."""
+    """Is a term over (coefficients, pose, cameras where they are solved for)."""
 
     seen: SurfaceObservations
     stage: Stage
@@ -55,7 +55,7 @@ class SurfaceTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedSurfaceTerm:
-    """The observations at one state: e (mm), and where the vertices are now (world)."""
+    """Holds the observations at one state: e (mm), and where the vertices are now (world)."""
 
     term: SurfaceTerm
     state: State
@@ -68,7 +68,7 @@ class LinearisedSurfaceTerm:
 
     @property
     def cameras(self) -> LinearisedQuadratic:
-        """What the images say of the cameras alone."""
+        """Returns what the images say of the cameras alone."""
         seen = self.term.seen
         form = Quadratic(seen.camera_matrix, seen.camera_shift.ravel(), seen.camera_gradient)
         return form.at(self.state.camera_shift.ravel())
@@ -98,7 +98,7 @@ def surface_rows(
     *,
     cameras: bool,
 ) -> Float32[np.ndarray, "n p"]:
-    """de / d(coefficients, rotation, translation, log scale, cameras)."""
+    """Returns de / d(coefficients, rotation, translation, log scale, cameras)."""
     turned = (world_from_head.scale * (seen.normal @ world_from_head.rotation)).astype(np.float32)
     shape = np.einsum("nc,mnc->nm", turned, seen.basis[:count], optimize=True)
     arm = points - world_from_head.translation

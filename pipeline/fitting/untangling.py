@@ -29,7 +29,7 @@ ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Triangles, which of them share an edge, and which vertices do (1 in ``beside``)."""
+    """Holds triangles, which of them share an edge, and which vertices do (1 in ``beside``)."""
 
     faces: Int[np.ndarray, "f 3"]
     pairs: Int[np.ndarray, "e 2"]

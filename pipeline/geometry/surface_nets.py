@@ -18,7 +18,8 @@ from pipeline.geometry.surface_nets_kernels import linked, net_faces, net_vertic
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceNet:
-    """A mesh in steps of its grid; ``of_cell`` is the vertex in the cell above each node, -1 where there is none."""
+    """Holds a mesh in steps of its grid; ``of_cell`` is the vertex in the cell above each node, -1 where there is
+    none."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int32[np.ndarray, "f 3"]

@@ -17,14 +17,14 @@ LEAST_CELLS = 4  # a chart of 50 px in a thousand has 6
 
 
 def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:
-    """The plates that show no chart; all where each does."""
+    """Returns the plates that show no chart; all where each does."""
     if len(plates) < 2 or not _differ(plates):
         return plates
     return tuple(plate for plate in plates if find_chart(plate) is None) or plates
 
 
 def charts_in(plates: tuple[Plate, ...]) -> list[Chart]:
-    """The charts of one camera's plates; of plates that are alike, of the first."""
+    """Returns the charts of one camera's plates; of plates that are alike, of the first."""
     searched = plates if len(plates) > 1 and _differ(plates) else plates[:1]
     return [chart for chart in map(find_chart, searched) if chart is not None]
 

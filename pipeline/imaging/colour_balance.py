@@ -20,7 +20,7 @@ SAMPLE = 4_000  # vertices are enough
 def balance(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Gains and offsets, so that ``gains * colours + offsets`` agree; gains of each channel multiply to one."""
+    """Returns gains and offsets, so that ``gains * colours + offsets`` agree; gains of each channel multiply to one."""
     cameras = len(weights)
     shared = np.flatnonzero(np.count_nonzero(weights, axis=0) >= 2)
     shared = shared[:: max(1, len(shared) // SAMPLE)]

@@ -25,7 +25,7 @@ MOST_OFF = 0.06  # rms of what the correction leaves of the patches: its own col
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chart:
-    """Where the patches' middles are (px), row by row from dark skin to black, and their mean linear colours."""
+    """Says where the patches' middles are (px), row by row from dark skin to black, and their mean linear colours."""
 
     centres: Float[np.ndarray, "24 2"]
     colours: Float[np.ndarray, "24 3"]
@@ -33,7 +33,7 @@ class Chart:
 
 @cache
 def true_colours() -> Float[np.ndarray, "24 3"]:
-    """Linear sRGB of the patches, D65."""
+    """Returns the linear sRGB of the patches, D65."""
     any_colours = np.linspace(0.1, 0.9, 24 * 3).reshape(24, 1, 3)
     model = cv2.ccm.ColorCorrectionModel(any_colours, cv2.ccm.COLORCHECKER_MACBETH)
     model.setLinearization(cv2.ccm.LINEARIZATION_IDENTITY)
@@ -44,7 +44,7 @@ def true_colours() -> Float[np.ndarray, "24 3"]:
 
 
 def find_chart(picture: UInt8[np.ndarray, "h w 3"]) -> Chart | None:
-    """The chart in an sRGB picture; None where there is none, or what looks like one has not its colours."""
+    """Returns the chart in an sRGB picture; None where there is none, or what looks like one has not its colours."""
     height, width = picture.shape[:2]
     for wanted in WIDTHS_PX:
         scale = wanted / width
@@ -85,15 +85,16 @@ def _mean_colour(picture: UInt8[np.ndarray, "h w 3"], corners: Float[np.ndarray,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartCorrection:
-    """``matrix``: linear sRGB = matrix @ linear colour of the camera; ``off``: rms of what it leaves of the patches."""
+    """Holds a correction. ``matrix``: linear sRGB = matrix @ linear colour of the camera; ``off``: rms of what it
+    leaves of the patches."""
 
     matrix: Float[np.ndarray, "3 3"]
     off: float
 
 
 def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
-    """The matrix that brings the patches of one camera's charts to their true colours, by least squares; None where
-    too many are clipped, or their colours are not a chart's."""
+    """Returns the matrix that brings the patches of one camera's charts to their true colours, by least squares; None
+    where too many are clipped, or their colours are not a chart's."""
     seen = np.concatenate([chart.colours for chart in charts])
     true = np.concatenate([true_colours()] * len(charts))
     kept = (seen < CLIPPED).all(axis=1)
@@ -108,7 +109,7 @@ def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
 
 
 def chart_normal(chart: Chart, camera: Camera) -> Float[np.ndarray, " 3"]:
-    """The way that the chart faces, a unit vector in the world frame."""
+    """Returns the way that the chart faces, a unit vector in the world frame."""
     grid = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2).astype(float)
     flat = np.column_stack([grid, np.zeros(len(grid))])
     _, turn, _ = cv2.solvePnP(flat, camera.undistort(chart.centres), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)

@@ -16,7 +16,7 @@ BAND_PX = 12
 
 
 def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> Float32[np.ndarray, "h w"]:
-    """Signed distance (px) to the contour ``field == level``; negative where the field is above.
+    """Returns the signed distance (px) to the contour ``field == level``; negative where the field is above.
 
     Without one it is farther than any pixel (+-(h + w)), and finite: slopes are taken of it."""
     above = field > level
@@ -31,7 +31,7 @@ def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> 
 
 
 def chamfer(above: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Signed distance from a mask; a transform ends at pixel centres, half a pixel beyond the contour."""
+    """Returns the signed distance from a mask; a transform ends at pixel centres, half a pixel beyond the contour."""
     distance = cv2.distanceTransform(1 - above, cv2.DIST_L2, cv2.DIST_MASK_5)
     distance -= np.float32(0.5)
     box = box_around(above.view(bool), 1)

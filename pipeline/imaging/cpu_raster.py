@@ -21,14 +21,14 @@ from rig.rig import Rig
 
 
 def camera_depths(camera: Camera, points_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
-    """Camera z of world points, mm."""
+    """Returns the camera z of world points, mm."""
     return points_world @ camera.camera_from_world.rotation[2] + camera.camera_from_world.translation[2]
 
 
 def depth_map(
     camera: Camera, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
-    """``rasterise`` for a camera and world vertices."""
+    """Returns ``rasterise`` for a camera and world vertices."""
     k = camera.intrinsics
     return rasterise(
         project_points(camera, vertices_world), camera_depths(camera, vertices_world), faces, k.height, k.width
@@ -36,7 +36,7 @@ def depth_map(
 
 
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """What every camera of a rig sees of a mesh: camera z (mm) at each pixel, inf beside it."""
+    """Returns what every camera of a rig sees of a mesh: camera z (mm) at each pixel, inf beside it."""
     with ThreadPoolExecutor(thread_count()) as pool:  # compiled code releases the interpreter lock
         found = pool.map(lambda camera: depth_map(camera, mesh_world.vertices, mesh_world.faces)[0], rig)
         return dict(zip(rig.names, found, strict=True))
@@ -49,7 +49,7 @@ def picture(
     colours: UInt8[np.ndarray, "v 3"],
     background: tuple[int, int, int] = (255, 255, 255),
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The mesh in its vertex colours, unlit, as the camera sees it."""
+    """Returns the mesh in its vertex colours, unlit, as the camera sees it."""
     pixels, depths = camera.project(vertices_world), camera_depths(camera, vertices_world)
     _, seen = rasterise(pixels, depths, faces, camera.intrinsics.height, camera.intrinsics.width)
     image = interpolate(seen, pixels, depths, faces, colours.astype(np.float32))

@@ -8,7 +8,7 @@ FAR = 0.01  # weight of a window four times as wide, which speaks where the near
 
 
 def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """Rows and columns of what is in the mask and a margin; of nothing where it is empty."""
+    """Returns rows and columns of what is in the mask and a margin; of nothing where it is empty."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     if not width:
         return slice(0, 0), slice(0, 0)
@@ -17,17 +17,17 @@ def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice
 
 
 def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
-    """Where the subject is left by a border of ``steps`` pixels; the image's own border is none."""
+    """Returns where the subject is left by a border of ``steps`` pixels; the image's own border is none."""
     return cv2.erode(mask.view(np.uint8), _disc(steps), borderValue=1).view(bool)
 
 
 def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
-    """The mask grown by a disc of ``steps`` pixels."""
+    """Returns the mask grown by a disc of ``steps`` pixels."""
     return cv2.dilate(mask.view(np.uint8), _disc(steps)).view(bool)
 
 
 def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The mask and what it encloses: background that does not reach the image's border."""
+    """Returns the mask and what it encloses: background that does not reach the image's border."""
     _, labels = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
     reaching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     return mask | ~np.isin(labels, reaching)
@@ -36,8 +36,8 @@ def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def spread(
     values: Float32[np.ndarray, "h w c"], weight: Float32[np.ndarray, "h w"], sigma: float
 ) -> Float32[np.ndarray, "h w c"]:
-    """Values carried to every pixel from where there is weight: a mean in a Gaussian window, and in a wider one where
-    that is empty."""
+    """Returns values carried to every pixel from where there is weight: a mean in a Gaussian window, and in a wider one
+    where that is empty."""
     whole = _carried(weight, sigma)
     return cv2.merge([_carried(plane * weight, sigma) / whole for plane in cv2.split(values)])
 

@@ -10,17 +10,17 @@ RADIUS_MOST = 1e6  # instead of an endless turning radius, which compiled loops 
 
 
 def packed_lens(camera: Camera) -> Float[np.ndarray, " 10"]:
-    """fx fy cx cy k1 k2 p1 p2 k3 and the turning radius."""
+    """Returns fx fy cx cy k1 k2 p1 p2 k3 and the turning radius."""
     k = camera.intrinsics
     return np.append(k.values(), min(k.distortion.max_valid_radius(), RADIUS_MOST))
 
 
 def packed_camera(camera: Camera) -> Float[np.ndarray, " 22"]:
-    """Rotation (row by row), translation, and ``packed_lens``."""
+    """Returns the rotation (row by row), translation, and ``packed_lens``."""
     pose = camera.camera_from_world
     return np.concatenate([pose.rotation.ravel(), pose.translation, packed_lens(camera)])
 
 
 def project_points(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """``Camera.project``, compiled: a tenth of its seconds."""
+    """Returns ``Camera.project``, compiled: a tenth of its seconds."""
     return project_all(packed_camera(camera), np.ascontiguousarray(points_world, float))

@@ -15,7 +15,7 @@ CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a be
 
 @dataclass(frozen=True, slots=True)
 class ViewQuality:
-    """How far a view's silhouette is to be trusted: ``usable`` or not, and every reason against it; ``doubts`` are
+    """Says how far a view's silhouette is to be trusted: ``usable`` or not, and every reason against it; ``doubts`` are
     those that a clean plate or a mask would settle, where there was neither."""
 
     usable: bool = True
@@ -30,8 +30,8 @@ class ViewQuality:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Silhouette:
-    """What one camera saw: the mask (True = subject) and the sub-pixel signed distance to its contour (px, negative
-    inside)."""
+    """Holds what one camera saw: the mask (True = subject) and the sub-pixel signed distance to its contour (px,
+    negative inside)."""
 
     mask: Bool[np.ndarray, "h w"]
     distance: Float32[np.ndarray, "h w"]
@@ -39,12 +39,12 @@ class Silhouette:
 
 
 def silhouette_from_mask(mask: Bool[np.ndarray, "h w"]) -> Silhouette:
-    """A silhouette of a ready binary mask."""
+    """Returns a silhouette of a ready binary mask."""
     return Silhouette(mask, signed_distance(mask))
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Sub-pixel signed distance (px) to the contour of a binary mask, negative inside.
+    """Returns sub-pixel signed distance (px) to the contour of a binary mask, negative inside.
 
     Far from the contour it is the Euclidean distance transform, which measures to the nearest pixel *centre* of the
     other kind: the contour lies half a pixel before. Within two pixels that staircase would leave 0.3 px of noise;
@@ -80,12 +80,13 @@ def _distance_transform(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h
 
 
 def xor_cost(observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> float:
-    """Eq. (4): the number of pixels that differ."""
+    """Computes eq. (4): the number of pixels that differ."""
     return float(np.count_nonzero(observed ^ model))
 
 
 def boundary_weights(observed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """``1 / d(i, j)^2`` of eq. (5), with ``d = D(S) + D(~S)`` the distance map from the contour of the input."""
+    """Returns ``1 / d(i, j)^2`` of eq. (5), with ``d = D(S) + D(~S)`` the distance map from the contour of the
+    input."""
     inside, outside = _distance_transforms(observed)
     # One of the two is zero at every pixel, the other at least one; a mask without a contour has no boundary at all.
     return (1.0 / np.maximum(inside + outside, 1.0) ** 2).astype(np.float32)
@@ -94,5 +95,5 @@ def boundary_weights(observed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "
 def boundary_weighted_xor(
     observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"], weights: Float[np.ndarray, "h w"]
 ) -> float:
-    """Eq. (5): a differing pixel costs ``1 / d^2``."""
+    """Computes eq. (5): a differing pixel costs ``1 / d^2``."""
     return float(weights[observed ^ model].sum(dtype=np.float64))

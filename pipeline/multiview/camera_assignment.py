@@ -50,7 +50,8 @@ CAMERAS_LEAST = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
-    """``pictures``: for every camera that holds another's picture, the name under which its own is filed.
+    """Holds who has whose picture. ``pictures``: for every camera that holds another's picture, the name under which
+    its own is filed.
 
     ``gain`` is how many tangent planes agree that did not before, ``overwhelming`` whether that leaves no doubt.
     """
@@ -71,7 +72,8 @@ NOTHING = Assignment({})
 
 
 def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignment:
-    """The permutation of pictures among cameras of one size that the tangent planes ask for; none in a good capture.
+    """Returns the permutation of pictures among cameras of one size that the tangent planes ask for; none in a good
+    capture.
 
     Args:
         silhouettes: by camera; views without a mask are left out of the question.
@@ -91,7 +93,7 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
 
 
 def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, float]:
-    """How much each camera's picture contradicts the others where it is filed: 0.2 for its own, 0.5 and more for
+    """Tells how much each camera's picture contradicts the others where it is filed: 0.2 for its own, 0.5 and more for
     another's (mean robust misfit of its tangent planes)."""
     seen = with_masks(silhouettes, rig)
     if len(seen) < CAMERAS_LEAST:
@@ -101,7 +103,8 @@ def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, flo
 
 
 def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
-    """The rings of an exchange: in (a, b, c) camera a's picture is filed under b, b's under c, and c's under a."""
+    """Returns the rings of an exchange: in (a, b, c) camera a's picture is filed under b, b's under c, and c's under
+    a."""
     left, found = dict(pictures), []
     while left:
         first = min(left)
@@ -130,7 +133,7 @@ def _ring_message(ring: tuple[str, ...], what: Message) -> Message:
 
 
 def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
-    """The cameras whose mask is more than a few pixels of anything."""
+    """Returns the cameras whose mask is more than a few pixels of anything."""
     return rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )
@@ -155,7 +158,8 @@ def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Flo
 
 
 def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
-    """Robust misfit of each camera, the mean of its planes; of those that the border hides ``cut_off``, or nothing."""
+    """Returns the robust misfit of each camera, the mean of its planes; of those that the border hides ``cut_off``, or
+    nothing."""
     there = np.isfinite(errors_px)
     of_each = np.where(there, _robust(errors_px, ROBUST_SIGMAS * _noise_px(errors_px[there])), cut_off or 0.0)
     count = there.sum(axis=(1, 2)) if cut_off is None else 2 * (len(errors_px) - 1)

@@ -47,9 +47,9 @@ CHANCE = 0.01  # that a good camera disagrees so much with the rest (F test)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """A camera whose image does not stand where its calibration says: its shift (px) and standard deviation, the turn
-    that explains it, and how many standard deviations that is, all as if the mask were tight. ``moved``: a loose mask
-    cannot explain it, and the other cameras agree better without this one."""
+    """Holds a camera whose image does not stand where its calibration says: its shift (px) and standard deviation, the
+    turn that explains it, and how many standard deviations that is, all as if the mask were tight. ``moved``: a loose
+    mask cannot explain it, and the other cameras agree better without this one."""
 
     camera: str
     shift_px: Float[np.ndarray, " 2"]
@@ -60,7 +60,7 @@ class Drift:
 
     @property
     def code(self) -> str:
-        """Of the warning that says it."""
+        """Returns that of the warning that says it."""
         return "camera-moved" if self.moved else "mask-loose"
 
     def warning(self) -> Message:
@@ -78,7 +78,8 @@ class Drift:
 
 
 def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, ...]:
-    """Cameras that no longer stand where their calibration says, or seem so by a loose mask, the farthest moved first.
+    """Returns cameras that no longer stand where their calibration says, or seem so by a loose mask, the farthest moved
+    first.
 
     One after the other: what the worst camera does to its neighbours' equations goes with it.
     """
@@ -123,7 +124,7 @@ def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftEquations:
-    """``normal . shift + outward * loose = excess`` of one camera's tangencies, in its own pixels; ``pixels`` is
+    """Holds ``normal . shift + outward * loose = excess`` of one camera's tangencies, in its own pixels; ``pixels`` is
     what an error of a pixel in both pictures amounts to, the other's in proportion of the pixels that a plane's turn
     passes in each, ``noise_px`` what contours are good to."""
 
@@ -150,13 +151,13 @@ class ShiftEquations:
         )
 
     def missed(self, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> Float[np.ndarray, " n"]:
-        """What shift and looseness leave, in standard deviations."""
+        """Returns what shift and looseness leave, in standard deviations."""
         return (self.normals @ shift_px + self.outward * loose_px - self.excess_px) / self.noise_px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftTerm:
-    """``(normal . shift - excess) / noise`` of one camera's tangencies, with Geman and McClure's loss."""
+    """Holds ``(normal . shift - excess) / noise`` of one camera's tangencies, with Geman and McClure's loss."""
 
     equations: ShiftEquations
 

@@ -29,7 +29,7 @@ VIEWS_LEAST = 3  # whose crown is in the picture
 
 
 def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float | None:
-    """Median over the views of the head's diameter (mm); None where too few show the crown.
+    """Returns the median over the views of the head's diameter (mm); None where too few show the crown.
 
     Args:
         silhouettes: by camera; those that are not usable have no say.
@@ -54,7 +54,7 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float |
 
 
 class WrongScale(EigenheadError):
-    """Outlines of a head that no head has the size of: the unit of the cameras is not millimetres."""
+    """Reports outlines of a head that no head has the size of: the unit of the cameras is not millimetres."""
 
     def __init__(self, diameter_mm: float) -> None:
         message = compose("size-refused", size=_size_told(diameter_mm), remedy=compose("advice-known-length"))
@@ -86,7 +86,8 @@ def _size_told(diameter_mm: float) -> Message:
 
 
 def crown_disc(mask: Bool[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, " 2"], float] | None:
-    """Middle (px) and diameter (px) of the head in a mask whose crown is in the picture; None where it is not."""
+    """Returns the middle (px) and diameter (px) of the head in a mask whose crown is in the picture; None where it is
+    not."""
     turns = _turns_to_upright(mask)
     upright = np.rot90(_without_strands(mask), turns)
     rows = np.flatnonzero(upright.any(axis=1))

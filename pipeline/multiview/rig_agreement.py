@@ -41,7 +41,7 @@ Turn = Callable[[Pixels, Intrinsics], Pixels]
 
 
 def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
-    """What is wrong with cameras and pictures as wholes, with the remedy; None where most cameras agree.
+    """Returns what is wrong with cameras and pictures as wholes, with the remedy; None where most cameras agree.
 
     Args:
         silhouettes: by camera; views without a usable mask are left out of the question.
@@ -66,7 +66,8 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
 
 
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
-    """Whether most outlines contradict the others, though these cameras took the pictures (``wrong_rig`` is None)."""
+    """Tells whether most outlines contradict the others, though these cameras took the pictures (``wrong_rig`` is
+    None)."""
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < CAMERAS_LEAST:
         return False
@@ -74,8 +75,8 @@ def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
-    """The one camera that contradicts all others, who agree without it: it was moved farther than a shift of its
-    picture tells (``camera_drift``), its pose is wrong in the file, or its mask is. None where there is none."""
+    """Returns the one camera that contradicts all others, who agree without it: it was moved farther than a shift of
+    its picture tells (``camera_drift``), its pose is wrong in the file, or its mask is. None where there is none."""
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MISPLACED_AMONG:
         return None

@@ -24,7 +24,8 @@ MISS_MOST_PX = 1.5  # of the reduced picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenePoints:
-    """``points``: world, mm; ``pixels``: by view, where the points whose ``rows`` these are were seen."""
+    """Holds the points. ``points``: world, mm; ``pixels``: by view, where the points whose ``rows`` these are were
+    seen."""
 
     points: Float[np.ndarray, "n 3"]
     pixels: Mapping[str, Float[np.ndarray, "_ 2"]]
@@ -34,7 +35,7 @@ class ScenePoints:
 def find_scene_points(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], rig: Rig, *, report: Callable[[float], None] = lambda share: None
 ) -> ScenePoints:
-    """All points that any two neighbouring views agree upon."""
+    """Returns all points that any two neighbouring views agree upon."""
     seen = {}
     for count, camera in enumerate(rig):
         report(0.5 * count / len(rig))
@@ -62,7 +63,7 @@ def find_scene_points(
 
 
 def neighbouring_pairs(rig: Rig) -> list[tuple[str, str]]:
-    """Each camera with those that look at the subject from nearly the same side."""
+    """Returns each camera with those that look at the subject from nearly the same side."""
     away = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(away @ away.T, -1, 1)))

@@ -22,9 +22,10 @@ LEAST_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tangency:
-    """One tangent plane of two cameras: in each camera the pixel where it touches, the unit normal of the epipolar line
-    (px), the plane's change of angle per pixel (rad), and by how many pixels its silhouette reaches along the normal
-    beyond the plane that touches the other's. ``outward``: 1.0 where normals point out of the subject, else -1.0."""
+    """Holds one tangent plane of two cameras: in each camera the pixel where it touches, the unit normal of the
+    epipolar line (px), the plane's change of angle per pixel (rad), and by how many pixels its silhouette reaches along
+    the normal beyond the plane that touches the other's. ``outward``: 1.0 where normals point out of the subject, else
+    -1.0."""
 
     cameras: tuple[str, str]
     pixels: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]
@@ -35,8 +36,8 @@ class Tangency:
 
 
 def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: float = 0.0) -> list[Tangency]:
-    """Every pair's outer tangent planes that both images hold whole; or of the lines ``inset_mm`` inside the outlines,
-    as long in space for every camera."""
+    """Returns every pair's outer tangent planes that both images hold whole; or of the lines ``inset_mm`` inside the
+    outlines, as long in space for every camera."""
     middle = rig.centre_world()
     insets_px = {camera.name: inset_mm / pixel_mm(camera, middle) if inset_mm else 0.0 for camera in rig}
     outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name], insets_px[camera.name]) for camera in rig}
@@ -48,7 +49,7 @@ def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: f
 
 
 def pixel_mm(camera: Camera, place_world: Float[np.ndarray, " 3"]) -> float:
-    """Width (mm) of what a pixel shows at a place's distance."""
+    """Returns the width (mm) of what a pixel shows at a place's distance."""
     return float(np.linalg.norm(place_world - camera.centre_world)) / camera.intrinsics.fx
 
 
@@ -71,8 +72,8 @@ class _Outline:
 
 
 def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarray, "n 2"]:
-    """Corners of the convex hull of a mask, on the sub-pixel contour (px); or of the line ``inset_px`` inside it, which
-    strands and specks thinner than twice that do not reach. Empty where nothing is."""
+    """Returns corners of the convex hull of a mask, on the sub-pixel contour (px); or of the line ``inset_px`` inside
+    it, which strands and specks thinner than twice that do not reach. Empty where nothing is."""
     inside = silhouette.distance < -inset_px if inset_px else silhouette.mask
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -82,7 +83,7 @@ def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarra
 
 
 def on_contour(pixels: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
-    """Outermost pixel centres moved along the gradient of the signed distance onto the contour itself."""
+    """Returns outermost pixel centres moved along the gradient of the signed distance onto the contour itself."""
     height, width = distance.shape
     x, y = pixels.astype(int).T
     left, right = np.maximum(x - 1, 0), np.minimum(x + 1, width - 1)
@@ -115,7 +116,7 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
 def epipolar_plane_axes(
     one: Camera, two: Camera, towards: Float[np.ndarray, " 3"]
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Two unit vectors (world) across the line through both centres: its planes are told apart by their angle
+    """Returns two unit vectors (world) across the line through both centres: its planes are told apart by their angle
     ``arctan2(ray @ v, ray @ u)``, counted from the direction ``towards``."""
     axis = two.centre_world - one.centre_world
     axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
@@ -125,7 +126,7 @@ def epipolar_plane_axes(
 
 
 def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 4 3"]:
-    """Unit rays (world) a pixel to the right, left, below and above of each pixel."""
+    """Returns unit rays (world) a pixel to the right, left, below and above of each pixel."""
     around = pixels[..., None, :] + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     return camera.rays_world(around.reshape(-1, 2)).reshape(*around.shape[:-1], 3)
 
@@ -133,7 +134,7 @@ def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.nd
 def angle_slopes(
     around: Float[np.ndarray, "*n 4 3"], u: Float[np.ndarray, " 3"], v: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "*n 2"]:
-    """Change of a ray's angle in a pencil of epipolar planes per pixel (rad), by x and by y; ``around``: of
+    """Returns the change of a ray's angle in a pencil of epipolar planes per pixel (rad), by x and by y; ``around``: of
     ``rays_about``."""
     angle = np.arctan2(around @ v, around @ u)
     return np.stack([angle[..., 0] - angle[..., 1], angle[..., 2] - angle[..., 3]], axis=-1) / 2.0
@@ -146,8 +147,8 @@ def tangency(
     difference: float,
     outward: float,
 ) -> Tangency:
-    """Two contour points that one plane should touch, by ``angle_slopes`` there and the difference (rad) of their
-    planes' angles, first less second; ``outward``: 1.0 where the angle grows out of the subject, else -1.0."""
+    """Returns two contour points that one plane should touch, by ``angle_slopes`` there and the difference (rad) of
+    their planes' angles, first less second; ``outward``: 1.0 where the angle grows out of the subject, else -1.0."""
     steepness = float(np.linalg.norm(slopes[0])), float(np.linalg.norm(slopes[1]))
     normals = slopes[0] / steepness[0], slopes[1] / steepness[1]
     excess_px = difference / steepness[0], -difference / steepness[1]

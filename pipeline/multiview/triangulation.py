@@ -24,7 +24,7 @@ RAYS_APART_LEAST = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1
 
 
 class NoPoint(EigenheadError):
-    """Pixels that determine no point."""
+    """Reports pixels that determine no point."""
 
     def __init__(self, why: Message) -> None:
         super().__init__(compose("point-refused", reason=why))
@@ -32,20 +32,22 @@ class NoPoint(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedPoint:
-    """A world point (mm), its covariance (mm^2), and what each view says against it (measured minus projected, px)."""
+    """Holds a world point (mm), its covariance (mm^2), and what each view says against it (measured minus projected,
+    px)."""
 
     position_world: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "3 3"]
     residuals_px: Mapping[str, Float[np.ndarray, " 2"]]
 
     def misfit(self, noise_px: float) -> float:
-        """Sum of squared residuals in units of the noise: chi-square with ``2 * views - 3`` degrees of freedom."""
+        """Returns the sum of squared residuals in units of the noise: chi-square with ``2 * views - 3`` degrees of
+        freedom."""
         return sum(float(r @ r) for r in self.residuals_px.values()) / noise_px**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReprojectionTerm:
-    """``(projected - picked) / noise`` of a world point (mm), by view; NaN behind a camera."""
+    """Holds ``(projected - picked) / noise`` of a world point (mm), by view; NaN behind a camera."""
 
     pixels: Float[np.ndarray, "n 2"]
     cameras: CameraStack
@@ -63,7 +65,7 @@ def triangulate(
     noise_px: float,
     rays_world: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
 ) -> TriangulatedPoint:
-    """The point that minimises the sum of squared reprojection errors over the cameras in ``pixels``.
+    """Returns the point that minimises the sum of squared reprojection errors over the cameras in ``pixels``.
 
     Args:
         pixels: the picked pixel by camera.
@@ -88,13 +90,15 @@ def triangulate(
 
 
 def rays_of(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig) -> dict[str, Float[np.ndarray, " 3"]]:
-    """The unit direction in the world of each view's ray; taking the lens off it costs most of a triangulation."""
+    """Returns the unit direction in the world of each view's ray; taking the lens off it costs most of a
+    triangulation."""
     return {name: rig[name].rays_world(np.asarray(pixel, float)[None])[0] for name, pixel in pixels.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedPoints:
-    """World points (mm), their covariances (mm^2), and what each view says against them (measured minus projected)."""
+    """Holds the world points (mm), their covariances (mm^2), and what each view says against them (measured minus
+    projected)."""
 
     positions_world: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]

@@ -11,13 +11,13 @@ from rig.rig import Rig
 
 
 def quarter_turns(rig: Rig) -> Int[np.ndarray, " c"]:
-    """By how many quarter turns each camera's frame must be turned for up to be up in its image."""
+    """Returns by how many quarter turns each camera's frame must be turned for up to be up in its image."""
     axes = _image_axes(rig)
     return np.argmin(_downs(axes) @ _nearest_up(rig, axes), axis=1)
 
 
 def guessed_up(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """The world's direction that is up in the photographs, as they would be had all been held upright."""
+    """Returns the world's direction that is up in the photographs, as they would be had all been held upright."""
     downs = _downs(_image_axes(rig))[np.arange(len(rig)), quarter_turns(rig)]
     up = -downs.mean(axis=0)
     return up / max(float(np.linalg.norm(up)), 1e-9)

@@ -27,19 +27,20 @@ LEAST_SHARE = 0.5  # of the views must see a point of the hull; where fewer look
 
 
 class NoHull(EigenheadError):
-    """The silhouettes have no common body."""
+    """Reports that the silhouettes have no common body."""
 
     def __init__(self) -> None:
         super().__init__(compose("no-common-hull"))
 
 
 def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """``mask_extent`` of the usable silhouettes."""
+    """Returns ``mask_extent`` of the usable silhouettes."""
     return mask_extent({camera.name: silhouettes[camera.name].mask for camera in _believed(silhouettes, rig)}, rig)
 
 
 def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Centre (world, mm) and edge (mm) of a cube that holds what the masks show; they may be smaller than the images.
+    """Returns the centre (world, mm) and edge (mm) of a cube that holds what the masks show; they may be smaller than
+    the images.
 
     The centre is where the rays through the masks' middles cross, the edge the largest mask's diagonal at that depth.
     Without a mask it is the place that the cameras look at, and 400 mm.
@@ -62,14 +63,14 @@ def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple
 
 
 def depth_of(camera: Camera, point: Float[np.ndarray, " 3"]) -> float:
-    """Camera z of a point, at least 1 mm."""
+    """Returns the camera z of a point, at least 1 mm."""
     return max(1.0, float(camera.camera_from_world.apply(point)[2]))
 
 
 def visual_hull(
     silhouettes: Mapping[str, Silhouette], rig: Rig, *, spacing_mm: float = SPACING_MM, cells: int = 192
 ) -> Mesh:
-    """The hull of the usable silhouettes, closed, world frame, mm. Raises NoHull.
+    """Returns the hull of the usable silhouettes, closed, world frame, mm. Raises NoHull.
 
     ``cells`` a side at most: a larger subject gets a coarser grid.
     """

@@ -37,7 +37,7 @@ ENCODINGS = {
 
 
 def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
-    """head.ply, and what ``settings.outputs`` names beside it. Raises NoUsd, OSError.
+    """Writes head.ply, and what ``settings.outputs`` names beside it. Raises NoUsd, OSError.
 
     Args:
         folder: of the result.
@@ -113,7 +113,7 @@ def _write_obj(folder: Path, result: Reconstruction) -> None:
 
 
 def encoded(atlas: Atlas, kind: str) -> bytes:
-    """The texture as a file: ``kind`` of ``ENCODINGS``."""
+    """Returns the texture as a file: ``kind`` of ``ENCODINGS``."""
     suffix, _, options = ENCODINGS[kind]
     stored: UInt8[np.ndarray, "s s 3"] = np.ascontiguousarray(atlas.image[:, :, ::-1])  # it is kept blue first
     _, data = cv2.imencode(suffix, stored, list(options))

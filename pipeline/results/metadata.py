@@ -10,7 +10,7 @@ from rig.digest import document_sha256
 
 
 def ply_comments(result: Reconstruction) -> list[str]:
-    """Comment lines of head.ply and bust.ply."""
+    """Returns comment lines of head.ply and bust.ply."""
     return [
         "unit mm",
         "frame world",
@@ -23,7 +23,7 @@ def ply_comments(result: Reconstruction) -> list[str]:
 
 
 def asset_extras(result: Reconstruction) -> dict[str, Any]:
-    """``asset.extras`` of head.glb and bust.glb."""
+    """Returns ``asset.extras`` of head.glb and bust.glb."""
     return {
         "unit": "m",
         "frame": "head",

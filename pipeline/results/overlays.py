@@ -42,7 +42,7 @@ def overlay(
     label: str = "",
     parts: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> ImageRgb:
-    """The image with the input contour (sky blue) and the fitted head's contour (vermilion), and tinted by the
+    """Returns the image with the input contour (sky blue) and the fitted head's contour (vermilion), and tinted by the
     probability of skin, hair and clothes where that is known: what is unknown keeps its colour."""
     line = max(1.0, 1.5 * image.shape[1] / 1024)
     painted = image.copy() if parts is None else tinted(image, parts)
@@ -57,14 +57,15 @@ def overlay(
 
 
 def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
-    """Each pixel moved towards the parts' colours by their probabilities."""
+    """Returns each pixel moved towards the parts' colours by their probabilities."""
     colours, out = np.array(list(PART_COLOURS.values()), np.float32), np.empty_like(image)
     tint(np.ascontiguousarray(image), parts, colours, np.float32(TINT), out)
     return out
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:
-    """Eq. (4) at a panel's size, over a pale image: sky blue where only the input is, vermilion only the model."""
+    """Draws eq. (4) at a panel's size, over a pale image: sky blue where only the input is, vermilion only the
+    model."""
     size = _fitted_size(image)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     observed, model = (
@@ -80,7 +81,7 @@ def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[n
 
 
 def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
-    """Lines of text in the top left corner, each in its colour on a darkened ground."""
+    """Returns lines of text in the top left corner, each in its colour on a darkened ground."""
     if not entries:
         return image
     scale = max(0.5, image.shape[1] / 1280)
@@ -98,7 +99,8 @@ def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]])
 def turntable(
     mesh_head: Mesh, colours: UInt8[np.ndarray, "v 3"], panel: tuple[int, int] = (280, 360)
 ) -> list[ImageRgb]:
-    """The head from ``AZIMUTHS_DEG`` around its own y axis, as drawn panels (width, height); twice supersampled."""
+    """Returns the head from ``AZIMUTHS_DEG`` around its own y axis, as drawn panels (width, height); twice
+    supersampled."""
     low, high = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     width, height = 2 * panel[0], 2 * panel[1]
@@ -117,7 +119,7 @@ def turntable(
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]]) -> Resized:
-    """Rows of labelled pictures, each fitted into a panel of ``PANEL``."""
+    """Returns rows of labelled pictures, each fitted into a panel of ``PANEL``."""
     width = max(len(row) for row in rows)
     blank = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
     drawn = [[legend(_panel(image), [(text, (255, 255, 255))] if text else []) for text, image in row] for row in rows]

@@ -24,7 +24,7 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """A textured head in the world frame with its evidence, by the stages that made it."""
+    """Holds a textured head in the world frame with its evidence, by the stages that made it."""
 
     model_name: str
     model_sha256: str
@@ -45,5 +45,5 @@ class Reconstruction:
 
     @property
     def mesh_world(self) -> Mesh:
-        """The head as delivered, full level, mm."""
+        """Returns the head as delivered, full level, mm."""
         return self.refined.mesh_world

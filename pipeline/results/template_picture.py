@@ -15,8 +15,8 @@ AZIMUTHS_DEG = (0.0, 55.0)
 
 
 def template_picture(template: Template, found: Registration, model: HeadModel) -> ImageRgb:
-    """From the front and the side: the mesh as it came, the model made like it, the mesh drawn onto that (blue: follows
-    the skin about it; green: moves as a whole), the mesh on the model's mean head, and that head."""
+    """Draws, from the front and the side: the mesh as it came, the model made like it, the mesh drawn onto that (blue:
+    follows the skin about it; green: moves as a whole), the mesh on the model's mean head, and that head."""
     faces, triangles = model.levels["full"].faces, template.mesh.triangles()
     mean = model.vertices(np.zeros(0))
     kinds = np.tile(np.array(DEEP), (len(found.surface_binding.rest), 1))

@@ -82,8 +82,8 @@ def _write_meshes(folder: Path, result: Reconstruction, head: Mesh) -> None:
 
 
 def head_mesh(result: Reconstruction) -> Mesh:
-    """The result mesh in the head frame, at its true size: the pose is undone, the scale is not, so that the GLB's
-    metres are metres."""
+    """Returns the result mesh in the head frame, at its true size: the pose is undone, the scale is not, so that the
+    GLB's metres are metres."""
     head_from_world = _head_from_world(result.head.fit.world_from_head)
     mesh = result.mesh_world
     return Mesh(head_from_world.apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)

@@ -24,7 +24,7 @@ STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """The plate as it would look now, its noise against the image, and how sure that is."""
+    """Holds the plate as it would look now, its noise against the image, and how sure that is."""
 
     plates: UInt8[np.ndarray, "p h w 3"]
     field: Float32[np.ndarray, "hc wc 3"]  # what their mean is multiplied by
@@ -35,7 +35,8 @@ class Background:
 
 
 def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
-    """Width and height of the coarse level: the integer reduction that comes nearest to ``width`` columns."""
+    """Returns the width and height of the coarse level: the integer reduction that comes nearest to ``width``
+    columns."""
     factor = max(1, round(shape[1] / width))
     return max(1, shape[1] // factor), max(1, shape[0] // factor)
 

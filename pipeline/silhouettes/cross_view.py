@@ -20,8 +20,8 @@ from rig.rig import Rig
 def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
-    """How many of the other cameras deny the subject at each doubtful pixel of camera ``name`` (at most ``MOST``); -1
-    where nobody was asked or too few can see.
+    """Tells how many of the other cameras deny the subject at each doubtful pixel of camera ``name`` (at most
+    ``MOST``); -1 where nobody was asked or too few can see.
 
     Masks may be smaller than the images; all are evenly reduced.
     """

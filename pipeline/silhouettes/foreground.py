@@ -46,7 +46,7 @@ UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must le
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """What one image says by itself. All arrays are at the coarse level; without a subject the mask is empty."""
+    """Holds what one image says by itself. All arrays are at the coarse level; without a subject the mask is empty."""
 
     coarse: Float32[np.ndarray, "h w 3"]  # the image
     background: Background
@@ -62,14 +62,14 @@ class Decision:
 
     @property
     def reduction(self) -> float:
-        """Pixels of the image along a side of a coarse one."""
+        """Returns pixels of the image along a side of a coarse one."""
         return self.background.plates.shape[2] / self.mask.shape[1]
 
 
 def decide(
     image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...], settings: SegmentationSettings
 ) -> Decision:
-    """One image against its clean plates."""
+    """Judges one image against its clean plates."""
     size = coarse_size(image.shape, settings.coarse_columns)
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     background = estimate_background(image, coarse, empty_plates(plates), settings)
@@ -99,14 +99,14 @@ def decide(
 
 
 def doubtful(decision: Decision) -> Bool[np.ndarray, "h w"]:
-    """Where another camera's word could make a pixel the subject's."""
+    """Returns where another camera's word could make a pixel the subject's."""
     near = dilated(decision.mask, REACH) & ~decision.mask
     return near & ~decision.clear & (decision.own_odds > -ALLOWED)
 
 
 def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: SegmentationSettings) -> Decision:
-    """The decision after other cameras spoke: ``dissent`` is how many of them deny that a doubtful pixel shows the
-    subject, negative where they were not asked."""
+    """Returns the decision after other cameras spoke: ``dissent`` is how many of them deny that a doubtful pixel shows
+    the subject, negative where they were not asked."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
     revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MOST_ODDS, MOST_ODDS)
     odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
@@ -142,8 +142,9 @@ def _own_odds(
 def find_mixtures(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], background: Background
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Squared difference to the plate (mean of the channels), and how far a coarse pixel is a mixture of subject and
-    plate: where strands cross the plate, pixels differ within it by as much as their mean differs from the plate."""
+    """Returns the squared difference to the plate (mean of the channels), and how far a coarse pixel is a mixture of
+    subject and plate: where strands cross the plate, pixels differ within it by as much as their mean differs from the
+    plate."""
     half = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
@@ -169,7 +170,7 @@ def _against_plate(
 def colours_apart(
     colour: Float32[np.ndarray, "h w 3"], other: Float32[np.ndarray, "h w 3"], variance: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
-    """How far (standard deviations) a colour is from another, in the shade that brings it nearest."""
+    """Tells how far (standard deviations) a colour is from another, in the shade that brings it nearest."""
     sigma = np.sqrt(variance)
     f, b = colour / sigma, other / sigma
     shade = np.clip(((f * b) @ CHANNEL_SUM) / np.maximum((f * f) @ CHANNEL_SUM, 1e-6), *SHADES)
@@ -211,7 +212,7 @@ def whole_subject(
     plain: Bool[np.ndarray, "h w"],
     settings: SegmentationSettings,
 ) -> tuple[Bool[np.ndarray, "h w"], tuple[float, ...]]:
-    """The largest component with its small gaps and holes filled, and the areas of the others by its own."""
+    """Returns the largest component with its small gaps and holes filled, and the areas of the others by its own."""
     mask = mask | (_closed(mask) & ~plain)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
     if count < 2:

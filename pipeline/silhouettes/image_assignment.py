@@ -44,8 +44,8 @@ Segmentation = Callable[[Capture], dict[str, Silhouette]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageAssignment:
-    """A capture and its silhouettes with every picture under its own camera; ``pictures`` and ``plates`` say, for each
-    camera that was given another's, the name under which its own is filed."""
+    """Holds a capture and its silhouettes with every picture under its own camera; ``pictures`` and ``plates`` say, for
+    each camera that was given another's, the name under which its own is filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -55,7 +55,7 @@ class ImageAssignment:
 
 
 class ExchangedPictures(EigenheadError):
-    """Pictures filed under other cameras' names, and no leave or not enough evidence to file them back."""
+    """Reports pictures filed under other cameras' names, and no leave or not enough evidence to file them back."""
 
     def __init__(self, found: Sequence[Message], *, doubtful: bool) -> None:
         reason = compose("exchange-doubtful") if doubtful else compose("exchange-not-wanted")
@@ -63,7 +63,7 @@ class ExchangedPictures(EigenheadError):
 
 
 class WrongRig(EigenheadError):
-    """Pictures that these cameras cannot have taken."""
+    """Reports pictures that these cameras cannot have taken."""
 
 
 def assign_images(
@@ -105,7 +105,7 @@ def assign_images(
 
 
 def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
-    """For cameras whose clean plate is another camera's, the name under which their own is filed.
+    """Returns, for cameras whose clean plate is another camera's, the name under which their own is filed.
 
     Asked only where pictures hardly look like their plates; a permutation is believed where every plate in it explains
     clearly more of the picture that it is given to.
@@ -143,7 +143,7 @@ def _common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarr
 
 
 def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
-    """Cameras that hold, pixel for pixel, the picture of another one, and that other: noise never repeats.
+    """Returns cameras that hold, pixel for pixel, the picture of another one, and that other: noise never repeats.
 
     The picture is left to the camera whose silhouette contradicts the others least, if any.
     """

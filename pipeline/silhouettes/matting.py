@@ -46,7 +46,8 @@ MARGIN_PX = 12  # around the band: beyond every window here and in what follows
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matte:
-    """Alpha (about 0 to 1, smoothed) in the box that holds the subject, and how far it stands out along its contour."""
+    """Holds the alpha (about 0 to 1, smoothed) in the box that holds the subject, and how far it stands out along its
+    contour."""
 
     alpha: Float32[np.ndarray, "hb wb"]
     box: tuple[slice, slice]  # rows and columns of the image; a margin without subject but at the image's own border
@@ -54,7 +55,7 @@ class Matte:
 
 
 def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings: SegmentationSettings) -> Matte:
-    """Alpha of the subject that was decided upon.
+    """Returns the alpha of the subject that was decided upon.
 
     Where its colour is nothing like the plate, pixels are asked in a band that is wide enough for hair, which is sparse
     far inside its outline. Elsewhere the decision, which has seen more pixels, is believed but for its border.

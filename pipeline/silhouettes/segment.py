@@ -48,8 +48,8 @@ LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot;
 
 
 def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress) -> dict[str, Silhouette]:
-    """The silhouette of every camera of the rig; without any plate or mask the subject is found from the photographs.
-    Raises InputError where only some cameras have neither."""
+    """Returns the silhouette of every camera of the rig; without any plate or mask the subject is found from the
+    photographs. Raises InputError where only some cameras have neither."""
     if not capture.backgrounds and not capture.masks:
         return _without_plates(capture, rig, settings, report)
     blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
@@ -161,7 +161,7 @@ def _operators(
 
 
 def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Silhouette:
-    """The silhouette of one image against its clean plates, without the other cameras' help."""
+    """Returns the silhouette of one image against its clean plates, without the other cameras' help."""
     return _refined(image, decide(image, plates, settings), settings)
 
 

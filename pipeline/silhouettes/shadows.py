@@ -21,8 +21,8 @@ def find_shadows(
     odds: Float32[np.ndarray, "h w"],
     settings: SegmentationSettings,
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Chi-squared against the plate in the shade that suits a pixel best, and where that explains one that differs, and
-    does so softly."""
+    """Returns chi-squared against the plate in the shade that suits a pixel best, and where that explains one that
+    differs, and does so softly."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
     depth = 1 - np.clip(ratio, settings.darkest_shadow, 1.0)
     shaded = (1 - depth)[:, :, None] * plate

@@ -24,7 +24,7 @@ VIEWS_LEAST = 3
 
 
 class TooFewViews(EigenheadError):
-    """Not enough usable silhouettes."""
+    """Reports that there are not enough usable silhouettes."""
 
     def __init__(self, silhouettes: Mapping[str, Silhouette], capture: Capture) -> None:
         poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
@@ -46,8 +46,8 @@ class TooFewViews(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsableViews:
-    """A capture with every picture under its own camera and its silhouettes; those that take no part are not usable.
-    ``pictures``: for each camera that was given another's picture, the name under which its own is filed."""
+    """Holds a capture with every picture under its own camera and its silhouettes; those that take no part are not
+    usable. ``pictures``: for each camera that was given another's picture, the name under which its own is filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -87,7 +87,7 @@ def usable_views(
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], list[ReportWarning]]:
-    """Views of cameras that no longer stand where they were calibrated take no part; each is named, and so are those
+    """Leaves out the views of cameras that no longer stand where they were calibrated; each is named, and so are those
     whose mask may be loose instead."""
     kept, warnings = dict(silhouettes), []
     for drift in find_drift(silhouettes, rig):
@@ -103,7 +103,7 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    """What the views' qualities say, as warnings of the report."""
+    """Returns what the views' qualities say, as warnings of the report."""
     found = []
     for name, silhouette in silhouettes.items():
         for remark in silhouette.quality.warnings:

@@ -37,7 +37,7 @@ CONTRADICTED_MOST = 0.5  # ... which contradicts less than this share of what th
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
-    """What each camera says of each voxel."""
+    """Holds what each camera says of each voxel."""
 
     pixels: Float[np.ndarray, "k n 2"]
     radius_px: Float[np.ndarray, " k"]  # of a voxel in each camera
@@ -53,7 +53,7 @@ def voxel_grid(centre: Float[np.ndarray, " 3"], edge: float, count: int) -> Floa
 
 
 def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRID) -> Votes:
-    """Every camera's vote on every voxel of a coarse grid around the subject."""
+    """Returns every camera's vote on every voxel of a coarse grid around the subject."""
     centre, edge = hull_extent(silhouettes, rig)
     voxels = voxel_grid(centre, edge, count)
 

@@ -24,7 +24,7 @@ from rig.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The pose of the mean head, the camera that the subject faces, and what the pose came from.
+    """Holds the pose of the mean head, the camera that the subject faces, and what the pose came from.
 
     ``landmarks``: of the face that was found, where the pose came from them. ``rival``: how much more the best other
     pose costs, as a share, where silhouettes decided.

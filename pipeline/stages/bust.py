@@ -22,8 +22,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bust:
-    """A closed surface of all that the cameras see, with its colours (sRGB). ``views`` are the images that coloured a
-    vertex, 0 = filled from its neighbours."""
+    """Holds a closed surface of all that the cameras see, with its colours (sRGB). ``views`` are the images that
+    coloured a vertex, 0 = filled from its neighbours."""
 
     surface: BustSurface
     normals: Float[np.ndarray, "v 3"]
@@ -55,9 +55,9 @@ def fuse_bust(
             views.silhouettes,
             rig,
             refined.mesh_world,
-            depth.votes,
-            depth.window_bias,
-            settings.bust,
+            votes=depth.votes,
+            bias=depth.window_bias,
+            settings=settings.bust,
             head_skin_world=None if displaced is None else part_of(refined.mesh_world, displaced.observed),
             report=context.progress,
         )
@@ -65,5 +65,5 @@ def fuse_bust(
         return Staged(None, [compose("no-bust", reason=reason.message)])
     mesh = surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings.texture)
+    colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
     return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm), surface.warnings)

@@ -19,7 +19,7 @@ Segment = Callable[..., dict[str, Silhouette]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReconstructionContext:
-    """One capture with all that decides its reconstruction, and the resources that the caller owns.
+    """Holds one capture with all that decides its reconstruction, and the resources that the caller owns.
 
     Attributes:
         capture: the shot as it was read.

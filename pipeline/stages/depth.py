@@ -24,7 +24,7 @@ from pipeline.stages.views import Views
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depth:
-    """Depth maps with what their pixels show, and the same as oriented points beside the fitted face."""
+    """Holds the depth maps with what their pixels show, and the same as oriented points beside the fitted face."""
 
     maps: tuple[DepthMap, ...]  # none where no stage needs them
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]  # as they were matched, without highlights

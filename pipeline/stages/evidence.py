@@ -42,7 +42,7 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Figures of the delivered head. Mappings by camera have every camera of the rig."""
+    """Holds figures of the delivered head. Mappings by camera have every camera of the rig."""
 
     start_masks: Masks  # of the head that the fit started from
     fitted_masks: Masks
@@ -61,6 +61,7 @@ def judge_head(
     alignment: Alignment,
     head: HeadFit,
     refined: RefinedHead,
+    *,
     texturing: Texturing,
     pose: PoseEvidence,
 ) -> Staged[Evidence]:

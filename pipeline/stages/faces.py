@@ -12,7 +12,7 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Faces:
-    """What the networks found; None where the settings do not ask them.
+    """Holds what the networks found; None where the settings do not ask them.
 
     ``eye_openings``: how far the lids of each eye stand apart (``faces.eyes``), where the subject's face was found.
     """

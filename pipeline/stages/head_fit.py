@@ -28,7 +28,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlineFit:
-    """A head fitted to the outlines alone: the simplex's fit, or the contour solver's state, from which it goes on."""
+    """Holds a head fitted to the outlines alone: the simplex's fit, or the contour solver's state, from which it goes
+    on."""
 
     solution: ContourSolution | Fit
     model: HeadModel  # with the modes that the solution has
@@ -37,7 +38,7 @@ class OutlineFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadFit:
-    """A fit with its posterior, the model with the modes that it has, and how deep it went."""
+    """Holds a fit with its posterior, the model with the modes that it has, and how deep it went."""
 
     fit: Fit
     model: HeadModel
@@ -45,7 +46,7 @@ class HeadFit:
 
     @property
     def mesh_world(self) -> Mesh:
-        """The fitted head, full level, mm."""
+        """Returns the fitted head, full level, mm."""
         return fitted_mesh(self.model, self.fit)
 
 

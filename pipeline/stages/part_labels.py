@@ -18,7 +18,7 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels:
-    """By camera; empty where no stage needs them."""
+    """Holds maps by camera; empty where no stage needs them."""
 
     maps: Mapping[str, PartMap]
 
@@ -41,7 +41,7 @@ def label_parts(context: ReconstructionContext, views: Views, model: HeadModel, 
         head_world,
         model.levels["full"].face_region,
         landmarks_world,
-        settings.parts,
+        settings=settings.parts,
         report=context.progress,
     )
     return Staged(PartLabels(maps))

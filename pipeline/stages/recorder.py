@@ -15,7 +15,7 @@ P = ParamSpec("P")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Staged(Generic[T]):
-    """A stage's product and what an operator should know of it."""
+    """Holds a stage's product and what an operator should know of it."""
 
     product: T
     warnings: Sequence[ReportWarning] = ()
@@ -26,7 +26,7 @@ StageFunction = Callable[Concatenate[ReconstructionContext, P], Staged[T]]
 
 @dataclass(frozen=True, slots=True)
 class Stage(Generic[P, T]):
-    """A stage's function, and the name under which progress and seconds are reported."""
+    """Holds a stage's function, and the name under which progress and seconds are reported."""
 
     name: str
     function: StageFunction[P, T]

@@ -25,7 +25,7 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedHead:
-    """The head as delivered: the fit's, or that deformed to the dense surface, without spoilt triangles.
+    """Holds the head as delivered: the fit's, or that deformed to the dense surface, without spoilt triangles.
 
     ``deviation_mm``: posterior standard deviation of each vertex; ``displaced``: None where the fit's own head is it.
     """
@@ -55,7 +55,7 @@ def refine_head(
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,
         eyes=measure_eye_appearance(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
-        patches=patch_search(model, fit, depth.images, distances, hair, context.rig, settings.photo),
+        patches=patch_search(model, fit, depth.images, distances, hair, context.rig, settings=settings.photo),
         report=context.progress,
     )
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), settings.fine.least_share

@@ -23,7 +23,7 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texturing:
-    """The delivered head's colours, and what of a texture the settings ask for."""
+    """Holds the delivered head's colours, and what of a texture the settings ask for."""
 
     normals: Float[np.ndarray, "v 3"]
     depths: Mapping[str, Float32[np.ndarray, "_ _"]]  # mm, of the head in each camera; inf beside it
@@ -53,7 +53,7 @@ def texture_head(
         views.silhouettes,
         rig,
         depths,
-        settings.texture,
+        settings=settings.texture,
         around=around,
         dim_share=DIM_SHARE if settings.outputs.delit else None,
     )
@@ -61,6 +61,6 @@ def texture_head(
     reduced = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo, albedo_warnings = None, []
     if settings.outputs.delit:
-        albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart)
+        albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
     warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings)
     return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo), warnings)

@@ -12,7 +12,8 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """The capture with every picture under its own camera, and its silhouettes; those that take no part are not usable.
+    """Holds the capture with every picture under its own camera, and its silhouettes; those that take no part are not
+    usable.
 
     ``assignment``: for each camera that was given another's picture, the name under which its own is filed.
     """

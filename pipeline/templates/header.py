@@ -22,7 +22,7 @@ DAMAGE = (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.Bad
 
 
 class BadTemplate(EigenheadError):
-    """A file that is no template of this project, or a damaged one."""
+    """Reports a file that is no template of this project, or a damaged one."""
 
     def __init__(self, path: Path, why: Message | str) -> None:
         super().__init__(compose("template-unusable", path=str(path), why=why, name=path.stem))
@@ -30,7 +30,7 @@ class BadTemplate(EigenheadError):
 
 
 class OtherModel(EigenheadError):
-    """A template that another model carries than the one in use."""
+    """Reports a template that another model carries than the one in use."""
 
     def __init__(self, template: "TemplateHeader", model_name: str) -> None:
         same = template.model_name == model_name
@@ -49,7 +49,7 @@ class OtherModel(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class TemplateHeader:
-    """Whose mesh was registered to which model, and how well."""
+    """Says whose mesh was registered to which model, and how well."""
 
     name: str
     source: str  # the OBJ file's name
@@ -77,7 +77,7 @@ def read_header(path: Path) -> TemplateHeader:
 
 
 def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The decoded ``meta`` of an open template file. Raises BadTemplate for another kind of file."""
+    """Returns the decoded ``meta`` of an open template file. Raises BadTemplate for another kind of file."""
     if "meta" not in file:
         raise BadTemplate(path, compose("template-without-format"))
     meta = json.loads(file["meta"].tobytes())
@@ -91,7 +91,7 @@ def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
 
 
 def check_template(name: str | None, model: str) -> None:
-    """Whether a job with this model, a name or a file, may ask for the template of this name, or for none.
+    """Checks whether a job with this model, a name or a file, may ask for the template of this name, or for none.
 
     Raises UnknownTemplate, BadTemplate, OtherModel, UnknownModel."""
     path = model_path(model)

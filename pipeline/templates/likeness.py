@@ -25,7 +25,7 @@ from rig.mesh import vertex_normals
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Some steps of the search. Lengths in mm."""
+    """Holds some steps of the search. Lengths in mm."""
 
     steps: int
     modes: int | None  # the first ones; None: all, the smooth deformations too
@@ -52,7 +52,7 @@ ROWS = 6000  # vertices of the model that look for the mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likeness:
-    """The model as the mesh has it."""
+    """Holds the model as the mesh has it."""
 
     vertices: Float[np.ndarray, "v 3"]  # of the full level, in the frame that the search began in
     distances: Float[np.ndarray, " s"]  # mm, of some vertices of the model from the mesh; inf where nothing was met
@@ -64,7 +64,7 @@ class Likeness:
 def fit_model_to_mesh(
     model: HeadModel, mesh: Surface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] = MappingProxyType({})
 ) -> Likeness:
-    """The model fitted to a mesh that lies about where the model does (mm), and to landmarks of the mesh."""
+    """Returns the model fitted to a mesh that lies about where the model does (mm), and to landmarks of the mesh."""
     wide = with_kernel(model, len(model.modes))
     full, count = model.levels["full"], len(model.modes)
     rows = np.arange(0, len(model.mean), max(1, len(model.mean) // ROWS))  # of the cage: even over the surface
@@ -86,7 +86,7 @@ def fit_model_to_mesh(
             )
             met = np.concatenate([met, np.repeat(marks, 3, axis=0)])
             planes = np.concatenate([planes, np.tile(np.eye(3), (len(marked), 1))])  # a landmark is three planes
-            z, place = _gauss_newton_step(modes[:, :, :active], head[every], met, planes, information, z, place)
+            z, place = _gauss_newton_step(modes[:, :, :active], head[every], met, planes, information, z=z, place=place)
     head = place.apply(wide.vertices(z))
     normals = vertex_normals(head, full.faces)[rows]
     _, _, off, weight = target.meet(head[rows], normals, replace(STAGES[-1], reach_mm=MET_MM))
@@ -105,8 +105,8 @@ class _Mesh:
     def meet(
         self, points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], stage: Stage
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Where points meet the mesh, its normals there, the distances, and weights: 0 where it faces another way, is
-        too far, or ends (there the nearest point lies sideways)."""
+        """Returns where points meet the mesh, its normals there, the distances, and weights: 0 where it faces another
+        way, is too far, or ends (there the nearest point lies sideways)."""
         places, planes = self._nearest(points, normals, stage.normal_mm)
         apart = places - points
         off = np.linalg.norm(apart, axis=1)
@@ -144,6 +144,7 @@ def _gauss_newton_step(
     met: Float[np.ndarray, "s 3"],
     planes: Float[np.ndarray, "s 3"],
     information: Float[np.ndarray, " s"],
+    *,
     z: Float[np.ndarray, " k"],
     place: Similarity,
 ) -> tuple[Float[np.ndarray, " k"], Similarity]:

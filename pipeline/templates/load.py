@@ -16,7 +16,7 @@ from rig.progress import Progress
 
 
 def load_template(name: str | None, model: HeadModel) -> Template | None:
-    """The template of this name for a job with this model; None for none.
+    """Returns the template of this name for a job with this model; None for none.
 
     Raises UnknownTemplate, BadTemplate, OtherModel."""
     if name is None:
@@ -34,7 +34,7 @@ def make_template(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> tuple[Template, Registration]:
-    """The mesh of an OBJ file, registered to a model. Raises InputError naming every fault of the file."""
+    """Returns the mesh of an OBJ file, registered to a model. Raises InputError naming every fault of the file."""
     mesh = read_polygons(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()

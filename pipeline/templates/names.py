@@ -12,7 +12,7 @@ from rig.messages.message import compose
 
 
 class UnknownTemplate(EigenheadError):
-    """A name that no template has."""
+    """Refuses a name that no template has."""
 
     def __init__(self, name: str) -> None:
         known = [*list_templates()] or ["none"]
@@ -20,7 +20,7 @@ class UnknownTemplate(EigenheadError):
 
 
 class WrongName(EigenheadError):
-    """A name that no template can have."""
+    """Refuses a name that no template can have."""
 
     def __init__(self, name: str) -> None:
         super().__init__(compose("template-name-wrong", name=f"{name!r:.60}"))
@@ -31,19 +31,19 @@ def is_name(name: str) -> bool:
 
 
 def templates_folder() -> Path:
-    """The folder of registered templates. It need not exist."""
+    """Returns the folder of registered templates. It need not exist."""
     return data_folder() / "templates"
 
 
 def list_templates() -> dict[str, Path]:
-    """Templates at hand by name."""
+    """Returns templates at hand by name."""
     folder = templates_folder()
     found = sorted(folder.glob("*.npz")) if folder.is_dir() else []
     return {path.stem: path for path in found if is_name(path.stem)}
 
 
 def template_path(name: str) -> Path:
-    """The file behind a name. Raises UnknownTemplate."""
+    """Returns the file behind a name. Raises UnknownTemplate."""
     found = list_templates().get(name)
     if found is None:
         raise UnknownTemplate(name)
@@ -51,7 +51,7 @@ def template_path(name: str) -> Path:
 
 
 def new_path(name: str) -> Path:
-    """Where a template of this name lies, or would. Raises WrongName."""
+    """Returns where a template of this name lies, or would. Raises WrongName."""
     if not is_name(name):
         raise WrongName(name)
     return templates_folder() / f"{name}.npz"

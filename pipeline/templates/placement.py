@@ -35,7 +35,7 @@ UNLIKE_MM = 8.0  # mean distance of the face beyond which a place is none
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A triangle mesh with its unit normals, mm once it is placed."""
+    """Holds a triangle mesh with its unit normals, mm once it is placed."""
 
     vertices: Float[np.ndarray, "t 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -46,7 +46,7 @@ class Surface:
 
 
 def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
-    """The mesh with faces that look outwards: those of a file that has them inside out are turned over."""
+    """Returns the mesh with faces that look outwards: those of a file that has them inside out are turned over."""
     corners = vertices[faces] - vertices[np.unique(faces)].mean(axis=0)
     if np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1]
@@ -54,7 +54,7 @@ def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:
-    """head_from_template from landmarks of the mesh. Raises InputError."""
+    """Returns head_from_template from landmarks of the mesh. Raises InputError."""
     names = [each for each in landmarks if each in model.landmarks]
     if len(names) < 4:
         raise InputError(name, [compose("template-landmarks-too-few", count=len(names), names=names or ["none"])])
@@ -66,7 +66,7 @@ def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarra
 
 
 def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
-    """head_from_template by search. Raises InputError where the mesh looks like no head."""
+    """Returns head_from_template by search. Raises InputError where the mesh looks like no head."""
     used = mesh.vertices[np.unique(mesh.faces)]
     extent = float(np.ptp(used, axis=0).max())
     factors = [f for f in UNITS.values() if EXTENT_MM[0] < extent * f < EXTENT_MM[1]]
@@ -80,12 +80,12 @@ def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
     for factor, turn in product(factors, _axis_turns()):
         for start in _starts(model, points, Similarity(factor, turn, np.zeros(3)), used):
             found = _closest_points(
-                mesh, tree, factors[0], points[some], normals[some], weights[some], start, COARSE_STEPS
+                mesh, tree, factors[0], points[some], normals[some], weights[some], place=start, steps=COARSE_STEPS
             )
             coarse.append(found)
     coarse.sort(key=lambda found: found[0])
     fine = [
-        _closest_points(mesh, tree, factors[0], points, normals, weights, place, FINE_STEPS)
+        _closest_points(mesh, tree, factors[0], points, normals, weights, place=place, steps=FINE_STEPS)
         for _, place in coarse[:TRIED]
     ]
     off_mm, place = min(fine, key=lambda found: found[0])
@@ -105,7 +105,8 @@ def _model_points(model: HeadModel, count: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def samples(mesh: Surface) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Points of a mesh and its unit normals there: the vertices that faces use, and the middles of the faces."""
+    """Returns points of a mesh and its unit normals there: the vertices that faces use, and the middles of the
+    faces."""
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     normal = mesh.normals[mesh.faces].sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -143,6 +144,7 @@ def _closest_points(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     weights: Float[np.ndarray, " n"],
+    *,
     place: Similarity,
     steps: int,
 ) -> tuple[float, Similarity]:

@@ -46,12 +46,12 @@ LIKE_MM = 2.0  # median distance of the fitted face from the mesh
 
 
 class NotRegistered(InputError):
-    """A mesh that cannot be registered; ``faults`` says why and what to do."""
+    """Reports a mesh that cannot be registered; ``faults`` says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """A mesh on a model's surface, and how well it lies there."""
+    """Holds a mesh on a model's surface, and how well it lies there."""
 
     surface_binding: SurfaceBinding
     place: Similarity  # head_from_template, from the start
@@ -62,7 +62,7 @@ class Registration:
     covered: float  # share of the model's face region that the mesh shows
 
     def figures(self) -> dict[str, float]:
-        """What is printed of it."""
+        """Returns what is printed of it."""
         return {
             "vertices": float(len(self.surface_binding.rest)),
             "skin_share": len(self.surface_binding.skin) / len(self.surface_binding.rest),
@@ -134,8 +134,8 @@ def _check(like: Likeness, name: str, *, marked: bool) -> float:
 
 
 def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
-    """Vertices at one place made one where the surface ends there, for files tear it along texture seams; and which one
-    each became. Lashes that begin on a lid stay parts of their own: the lid does not end there."""
+    """Returns vertices at one place made one where the surface ends there, for files tear it along texture seams; and
+    which one each became. Lashes that begin on a lid stay parts of their own: the lid does not end there."""
     ends = np.zeros(len(mesh.vertices), bool)
     ends[boundary_edges(mesh.faces)] = True
     identity = np.where(ends, -1, np.arange(len(ends)))[:, None]
@@ -149,7 +149,7 @@ def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
 
 
 def components(mesh: Surface) -> Int[np.ndarray, " t"]:
-    """The connected part that each vertex belongs to."""
+    """Returns the connected part that each vertex belongs to."""
     return connected_components(_graph(mesh.faces, len(mesh.vertices)), directed=False)[1]
 
 
@@ -159,7 +159,7 @@ def _graph(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_array:
 
 
 def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bool[np.ndarray, " p"]:
-    """Which parts are skin: those that enough of the head's area meets before anything else of the mesh."""
+    """Returns which parts are skin: those that enough of the head's area meets before anything else of the mesh."""
     rows = slice(None, None, max(1, len(head.vertices) // 6000))
     hits = SurfaceIndex(mesh.vertices, mesh.faces).closest(head.vertices[rows], CANDIDATES, facing=head.normals[rows])
     part = parts[mesh.faces[hits.triangles, 0]]
@@ -169,7 +169,8 @@ def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bo
 
 
 def balls(mesh: Surface, parts: Int[np.ndarray, " t"], among: Bool[np.ndarray, " p"]) -> Int[np.ndarray, " t"]:
-    """A number for every vertex of a closed, round part of those ``among`` which are looked at; -1 for all others."""
+    """Returns a number for every vertex of a closed, round part of those ``among`` which are looked at; -1 for all
+    others."""
     closed = among.copy()
     closed[parts[boundary_edges(mesh.faces).ravel()]] = False
     closed[parts[~_used(mesh)]] = False
@@ -198,8 +199,8 @@ def parting(
     faces: Int[np.ndarray, "f 3"],
     model: HeadModel,
 ) -> Bool[np.ndarray, " t"]:
-    """Vertices that leave their neighbours on some head: they were attached to another sheet of the surface, the inside
-    of a lid or the eyeball, than these."""
+    """Returns vertices that leave their neighbours on some head: they were attached to another sheet of the surface,
+    the inside of a lid or the eyeball, than these."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]
@@ -212,8 +213,8 @@ def parting(
 
 
 def without_edge(skin: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
-    """The skin less its vertices next to what lies deeper: where a lid turns inwards it is a matter of chance which
-    vertex still meets the model's, and all of them follow more evenly."""
+    """Returns the skin less its vertices next to what lies deeper: where a lid turns inwards it is a matter of chance
+    which vertex still meets the model's, and all of them follow more evenly."""
     out = skin.copy()
     for _ in range(EDGE_RINGS):
         out[faces[~out[faces].all(axis=1)]] = False
@@ -221,7 +222,7 @@ def without_edge(skin: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) ->
 
 
 def without_specks(mask: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
-    """The mask without its small connected patches."""
+    """Returns the mask without its small connected patches."""
     inside = faces[mask[faces].all(axis=1)]
     _, patch = connected_components(_graph(inside, len(mask)), directed=False)
     size = np.bincount(patch[mask], minlength=int(patch.max()) + 1)
@@ -243,7 +244,7 @@ def _drawn(
     for here, there in marks:
         nearest = int(np.linalg.norm(vertices - here, axis=1).argmin())
         pulled[nearest] = there + vertices[nearest] - here
-    out[rows] = refined(vertices, faces, target, DRAWN, STIFFNESS, pulled, MARK_WEIGHT)
+    out[rows] = refined(vertices, faces, target, DRAWN, STIFFNESS, marks=pulled, mark_weight=MARK_WEIGHT)
     return out
 
 

@@ -22,7 +22,7 @@ CARRIER = {"rest": "f", "skin": "i", "anchors": "i", "wholes": "i", "whole_ancho
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Template(TemplateHeader):
-    """A mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``."""
+    """Holds a mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``."""
 
     mesh: PolygonMesh
     surface_binding: SurfaceBinding
@@ -54,7 +54,7 @@ def _stored(kind: str) -> type:
 
 
 def read_template(path: Path) -> Template:
-    """A template from its file. Raises BadTemplate."""
+    """Returns a template from its file. Raises BadTemplate."""
     try:
         with np.load(path, allow_pickle=False) as file:
             meta = read_meta(path, file)

@@ -37,7 +37,7 @@ CODES = 65535
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Albedo:
-    """The image, sRGB, in the texture's layout, and the light that was taken off."""
+    """Holds the image, sRGB, in the texture's layout, and the light that was taken off."""
 
     atlas: Atlas
     light: Light
@@ -50,10 +50,11 @@ def estimate_albedo(
     atlas: Atlas | None,
     face_region: Bool[np.ndarray, " v"],
     around: Neighbourhood | None,
+    *,
     chart: ChartColours | None = None,
 ) -> tuple[Albedo | None, list[ReportWarning]]:
-    """The albedo of a textured head; a warning where it cannot be told. With a ``chart`` it is the skin's own in level
-    and colour, too; else by convention (``pipeline.texture.light``)."""
+    """Returns the albedo of a textured head; a warning where it cannot be told. With a ``chart`` it is the skin's own
+    in level and colour, too; else by convention (``pipeline.texture.light``)."""
     if atlas is None or around is None or coloured.dim is None:
         return None, [compose("no-albedo", reason=compose("albedo-without-texture"))]
     seen = coloured.views > 0
@@ -79,8 +80,8 @@ def shine_left(
     seen: Bool[np.ndarray, " v"],
     around: Neighbourhood,
 ) -> Float[np.ndarray, " v"]:
-    """Share of each vertex' light that is no highlight, ``MOST_SHINE`` to 1. By brightness: highlights of skin have
-    their lamp's colour, but a dim view's own colour is noise."""
+    """Returns the share of each vertex' light that is no highlight, ``MOST_SHINE`` to 1. By brightness: highlights of
+    skin have their lamp's colour, but a dim view's own colour is noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
     ratio = around.calmed(ratio[:, None], CALM)[:, 0]
@@ -90,7 +91,7 @@ def shine_left(
 
 
 def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
-    """The texture's image, each texel by the factor of its triangle's corners, in linear light."""
+    """Returns the texture's image, each texel by the factor of its triangle's corners, in linear light."""
     image, size = atlas.image, len(atlas.image)
     coarse = _factor_image(atlas.layout, factors)
     linear = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)

@@ -34,7 +34,7 @@ def fill_unobserved_patches(
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
     settings: TextureSettings,
 ) -> Decision:
-    """The decision with a view for the corners of every patch that one sees, but not by its corners."""
+    """Returns the decision with a view for the corners of every patch that one sees, but not by its corners."""
     rows = np.flatnonzero(_blind(decision.weights, mesh_world.faces))
     faces, normals, area = _parts(mesh_world, rows)
     rows = rows[_wide(faces, area)]

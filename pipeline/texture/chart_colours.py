@@ -31,21 +31,21 @@ ENCODED = np.rint(255 * srgb_from_linear(np.arange(CODES + 1) / CODES)).astype(n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartColours:
-    """The corrections by camera, and the mean way that the charts face (unit vector, world frame)."""
+    """Holds the corrections by camera, and the mean way that the charts face (unit vector, world frame)."""
 
     cameras: Mapping[str, ChartCorrection]
     normal_world: Float[np.ndarray, " 3"]
 
 
 def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """What the charts in all clean plates say of the cameras; a warning where none is found."""
+    """Returns what the charts in all clean plates say of the cameras; a warning where none is found."""
     with ThreadPoolExecutor(thread_count()) as pool:
         charts = pool.map(charts_in, [capture.backgrounds.get(name, ()) for name in rig.names])
         return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
 
 
 def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """The same of charts that were found, by camera."""
+    """Returns the same of charts that were found, by camera."""
     found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:
@@ -56,7 +56,7 @@ def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[Char
 
 
 def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
-    """The capture with corrected photographs; its plates stay."""
+    """Returns the capture with corrected photographs; its plates stay."""
     mean = np.mean([correction.matrix for correction in colours.cameras.values()], axis=0)
 
     def corrected(name: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -75,6 +75,6 @@ def in_true_colours(
 
 
 def levelled_by_chart(light: Light, normal_world: Float[np.ndarray, " 3"]) -> Light:
-    """The light as strong, and of the colour, as it fell on the chart: there white is white."""
+    """Returns the light as strong, and of the colour, as it fell on the chart: there white is white."""
     on_chart = (harmonics(normal_world[None]) * BAND_FACTORS) @ light.coefficients
     return replace(light, coefficients=light.coefficients / on_chart[0], on_chart=True)

@@ -18,8 +18,8 @@ CODES = np.arange(256) / 255.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """The views of each vertex (-1: none), the first the chosen one, their shares, what is added to them (codes), and
-    what the cameras see."""
+    """Holds the views of each vertex (-1: none), the first the chosen one, their shares, what is added to them (codes),
+    and what the cameras see."""
 
     views: Rig
     slots: Int32[np.ndarray, "v s"]
@@ -29,14 +29,14 @@ class Decision:
     pictures: Pictures
 
     def choice(self, colours: UInt8[np.ndarray, "v 3"]) -> Choice:
-        """For the compiled loops; ``colours`` where no view sees a triangle."""
+        """Returns it for the compiled loops; ``colours`` where no view sees a triangle."""
         filled = np.zeros((len(colours), 4), np.float32)
         filled[:, :3] = colours
         return Choice(self.slots, self.shares, self.corrections, filled, self.weights)
 
 
 def window_table(sigma: float) -> Float32[np.ndarray, "_ _"]:
-    """Weights of four pixels for every place between the middle two: a Gaussian."""
+    """Returns weights of four pixels for every place between the middle two: a Gaussian."""
     phase = np.arange(PHASES + 1) / PHASES
     weights = np.exp(-0.5 * ((np.arange(TAPS) - 1 - phase[:, None]) / sigma) ** 2)
     return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -48,10 +48,11 @@ def pack_pictures(
     masks: Mapping[str, np.ndarray],
     gains: Float[np.ndarray, "k 3"],
     offsets: Float[np.ndarray, "k 3"],
+    *,
     mesh_world: Mesh,
     footprint_px: float,
 ) -> Pictures:
-    """The photographs' parts about the silhouettes, gains and offsets applied, one behind the other."""
+    """Returns the photographs' parts about the silhouettes, gains and offsets applied, one behind the other."""
     boxes = [box_around(masks[camera.name], TAPS) for camera in views]
     parts = [image[box] for image, box in zip(images, boxes, strict=True)]
     first = np.cumsum([0] + [part.size for part in parts])

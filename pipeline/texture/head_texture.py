@@ -15,7 +15,8 @@ from rig.messages.message import compose
 
 
 def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
-    """The model's texture layout where a file of the result has a texture, and warnings of settings and model."""
+    """Returns the model's texture layout where a file of the result has a texture, and warnings of settings and
+    model."""
     outputs = settings.outputs
     old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
     warnings = [compose("old-setting", setting=name) for name, is_set in old.items() if is_set]
@@ -30,7 +31,7 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
 def paint_head(
     layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: Bool[np.ndarray, " v"], settings: Settings
 ) -> Atlas | None:
-    """The head's texture; None where there is no layout, or no camera saw it."""
+    """Returns the head's texture; None where there is no layout, or no camera saw it."""
     if layout is None or coloured.decision is None:
         return None
     region = np.flatnonzero(face_region)

@@ -13,15 +13,15 @@ from pipeline.texture.uv_unwrap import Layout, unwrap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelLayout:
-    """Of the model's full level: texture coordinates, and which vertices lie beside each other."""
+    """Holds of the model's full level: texture coordinates, and which vertices lie beside each other."""
 
     layout: Layout
     around: Neighbourhood
 
 
 def model_layout(model: HeadModel) -> ModelLayout:
-    """Laid out from the mean head, so that texels of any two subjects correspond. Raises NoLayout for a model whose
-    surface is not one piece with one open border."""
+    """Returns the layout made from the mean head, so that texels of any two subjects correspond. Raises NoLayout for a
+    model whose surface is not one piece with one open border."""
     faces = model.levels["full"].faces
     mean = model.vertices(np.zeros(0))
 

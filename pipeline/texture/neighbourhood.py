@@ -9,7 +9,7 @@ from jaxtyping import Float, Int32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Vertices about each vertex, in compressed rows, and the place of the same edge seen from its other end."""
+    """Holds vertices about each vertex, in compressed rows, and the place of the same edge seen from its other end."""
 
     starts: Int32[np.ndarray, " s"]
     indices: Int32[np.ndarray, " e"]
@@ -17,7 +17,7 @@ class Neighbourhood:
 
     @classmethod
     def of(cls, starts: Int32[np.ndarray, " s"], indices: Int32[np.ndarray, " e"]) -> "Neighbourhood":
-        """``starts`` and sorted ``indices`` of a symmetric adjacency."""
+        """Builds it from ``starts`` and sorted ``indices`` of a symmetric adjacency."""
         rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
         # Rows are sorted: ordered by the other end first, the edges of its row come in the same order.
         opposite = np.empty(len(indices), np.int32)
@@ -29,7 +29,7 @@ class Neighbourhood:
         return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
 
     def calmed(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:
-        """Values of the vertices, in each round half their own, half the mean of those beside them."""
+        """Returns values of the vertices, in each round half their own, half the mean of those beside them."""
         count = len(self.starts) - 1
         share = 0.5 / np.maximum(np.diff(self.starts), 1)
         means = sparse.csr_array((np.repeat(share, np.diff(self.starts)), self.indices, self.starts), (count, count))

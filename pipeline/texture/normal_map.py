@@ -28,7 +28,7 @@ SIZE_PX = 1024  # 4.5 texels from a vertex of the full level to the next; the bu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalMapped:
-    """A reduced mesh, mm; its vertices are ``rows`` of the full one."""
+    """Holds a reduced mesh, mm; its vertices are ``rows`` of the full one."""
 
     mesh: Mesh
     rows: Int[np.ndarray, " n"]
@@ -45,7 +45,7 @@ def normal_mapped(
     reduced: ReducedLayout,
     size: int = SIZE_PX,
 ) -> NormalMapped:
-    """The head's full mesh (mm, unit normals) as a reduced one with its normal map."""
+    """Returns the head's full mesh (mm, unit normals) as a reduced one with its normal map."""
     rows = layout.source[reduced.rows]
     places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
     tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)
@@ -72,7 +72,7 @@ def vertex_tangents(
     uv: Float[np.ndarray, "n 2"],
     faces: Int[np.ndarray, "f 3"],
 ) -> Float[np.ndarray, "n 4"]:
-    """MikkTSpace's tangents, of a layout whose faces all turn the same way; v points downwards."""
+    """Returns MikkTSpace's tangents, of a layout whose faces all turn the same way; v points downwards."""
     corners, flat = vertices[faces], uv[faces]
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (s, t), (p, q) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
@@ -125,5 +125,5 @@ def _in_frame(
 
 
 def png(image: UInt8[np.ndarray, "s s 3"]) -> bytes:
-    """The map as a file: no loss, which would be seen in highlights."""
+    """Returns the map as a file: no loss, which would be seen in highlights."""
     return cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()

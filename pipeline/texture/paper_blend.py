@@ -21,9 +21,10 @@ def paper_texture(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+    *,
     filled: UInt8[np.ndarray, "s s 3"],
 ) -> UInt8[np.ndarray, "s s 3"]:
-    """Every texel the weighted mean of the images that see it; ``filled`` where none does, and its size."""
+    """Returns every texel the weighted mean of the images that see it; ``filled`` where none does, and its size."""
     texels, ones = len(filled) * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, len(filled), len(filled))
     values = np.concatenate([mesh_world.vertices, mesh_world.normals()], axis=1)[layout.source].astype(np.float32)

@@ -21,14 +21,14 @@ FACE_WEIGHT = 8.0  # of an error in the face region
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedLayout:
-    """``rows``: the layout's vertices that are left; ``faces`` among them."""
+    """Holds a layout on fewer triangles. ``rows``: the layout's vertices that are left; ``faces`` among them."""
 
     rows: Int[np.ndarray, " n"]
     faces: Int[np.ndarray, "f 3"]
 
 
 def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
-    """Of the model's full level."""
+    """Returns that of the model's full level."""
     mean, region = model.vertices(np.zeros(0)), model.levels["full"].face_region
 
     def make() -> dict[str, np.ndarray]:
@@ -43,7 +43,7 @@ def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
 def reduce(
     layout: Layout, vertices: Float[np.ndarray, "v 3"], importance: Float[np.ndarray, " v"], count: int = FACES
 ) -> ReducedLayout:
-    """The layout of a mesh with these vertices (mm) on ``count`` of its faces or a few more; ``importance``
+    """Returns the layout of a mesh with these vertices (mm) on ``count`` of its faces or a few more; ``importance``
     multiplies the error of a vertex."""
     source = layout.source
     ((rows, faces),) = decimate(

@@ -35,8 +35,8 @@ class NoLayout(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """The mesh with its cut open. ``source`` is the vertex that each of the layout's vertices was; ``uv`` lies in the
-    unit square, v downwards as in glTF."""
+    """Holds the mesh with its cut open. ``source`` is the vertex that each of the layout's vertices was; ``uv`` lies in
+    the unit square, v downwards as in glTF."""
 
     uv: Float[np.ndarray, "n 2"]
     faces: Int[np.ndarray, "f 3"]
@@ -45,7 +45,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas:
-    """A layout and its image."""
+    """Holds a layout and its image."""
 
     layout: Layout
     image: UInt8[np.ndarray, "s s 3"]

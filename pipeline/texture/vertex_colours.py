@@ -52,7 +52,7 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """sRGB colours, the number of images behind each (0 = filled), and what was found of the cameras."""
+    """Holds sRGB colours, the number of images behind each (0 = filled), and what was found of the cameras."""
 
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
@@ -71,12 +71,12 @@ def texture(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
-    settings: TextureSettings,
     *,
+    settings: TextureSettings,
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
 ) -> Texture:
-    """Colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them. With
+    """Returns colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them. With
     ``around``, the mesh's edges, a view is also chosen for every vertex; with ``dim_share``, the
     colour below which that share of a vertex' weight lies is told, too."""
     views = usable_views(capture, silhouettes, rig)
@@ -88,7 +88,15 @@ def texture(
     def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
-        sight = see_points(camera, image, silhouettes[name], depths[name], mesh_world.vertices, normals, settings)
+        sight = see_points(
+            camera,
+            image,
+            silhouettes[name],
+            depths[name],
+            points=mesh_world.vertices,
+            normals=normals,
+            settings=settings,
+        )
         return sight, image
 
     with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
@@ -106,8 +114,10 @@ def texture(
     if around is not None:
         images = [image for _, image in found]
         masks = {name: silhouettes[name].mask for name in views.names}
-        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world, settings.footprint_px)
-        decision = decide(views, weights, balanced, agreed, gains, pictures, around, settings)
+        pictures = pack_pictures(
+            views, images, masks, gains, offsets, mesh_world=mesh_world, footprint_px=settings.footprint_px
+        )
+        decision = decide(views, weights, balanced, agreed, gains, pictures, around=around, settings=settings)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, settings)
     shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
@@ -120,7 +130,8 @@ def texture(
 def underexposed_views(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"], share: float
 ) -> Float32[np.ndarray, "v 3"]:
-    """The colour of the view that is as bright as ``share`` of each vertex' weight; black where no view sees it."""
+    """Returns the colour of the view that is as bright as ``share`` of each vertex' weight; black where no view sees
+    it."""
     order = np.argsort(np.where(weights > 0, colours.sum(axis=2), np.inf), axis=0)
     passed = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
     rank = np.argmax(passed >= share * passed[-1], axis=0)
@@ -130,8 +141,8 @@ def underexposed_views(
 
 
 def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """Share that a camera's word has left: what had to be made much brighter brings its noise along, and a dim view is
-    often a shadowed one."""
+    """Returns the share that a camera's word has left: what had to be made much brighter brings its noise along, and a
+    dim view is often a shadowed one."""
     return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
 
 
@@ -142,23 +153,24 @@ def decide(
     agreed: Float[np.ndarray, "v 3"],
     gains: Float[np.ndarray, "k 3"],
     pictures: Pictures,
+    *,
     around: Neighbourhood,
     settings: TextureSettings,
 ) -> Decision:
-    """A view for each vertex, and what levels the seams between them."""
+    """Returns a view for each vertex, and what levels the seams between them."""
     chosen = settings.selection
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
     fields = level_views(weights, codes, level_to, around, chosen.levelling)
     detail = codes + fields[:, :, :3]
-    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around, chosen)
-    slots, shares = add_similar_views(labels, options, quality, detail, weights, around, chosen)
+    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around=around, settings=chosen)
+    slots, shares = add_similar_views(labels, options, quality, detail, weights, around=around, settings=chosen)
     corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
     return Decision(views, slots, shares, corrections, weights, pictures)
 
 
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
-    """The cameras that may colour a head."""
+    """Returns the cameras that may colour a head."""
     return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
 
 
@@ -209,7 +221,8 @@ def reference_colours(
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
-    """The paper's codes of points of a surface, the weight behind each (0: nobody sees it) and the number of images."""
+    """Returns the paper's codes of points of a surface, the weight behind each (0: nobody sees it) and the number of
+    images."""
     total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
     views = np.zeros(len(normals), np.uint8)
     for camera in rig:

@@ -34,10 +34,11 @@ def select_views(
     levelled: Float32[np.ndarray, "k v 3"],
     agreed: Float32[np.ndarray, "v 3"],
     gains: Float[np.ndarray, "k 3"],
+    *,
     around: Neighbourhood,
     settings: SelectionSettings,
 ) -> tuple[Int32[np.ndarray, " v"], Int32[np.ndarray, "v c"], Float32[np.ndarray, "v c"]]:
-    """A view for each vertex, -1 where none sees it; the views that came into question, and their quality.
+    """Returns a view for each vertex, -1 where none sees it; the views that came into question, and their quality.
 
     Args:
         weights: of the views by angle and distance, 0 = not seen.
@@ -83,11 +84,12 @@ def add_similar_views(
     quality: Float32[np.ndarray, "v c"],
     detail: Float32[np.ndarray, "k v 3"],
     weights: Float32[np.ndarray, "k v"],
+    *,
     around: Neighbourhood,
     settings: SelectionSettings,
 ) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
-    """The chosen views, and beside them others that differ from them by noise alone: their mean has less of it. Where
-    they differ by more, in eyes, brows and lips, blending would blur.
+    """Returns the chosen views, and beside them others that differ from them by noise alone: their mean has less of it.
+    Where they differ by more, in eyes, brows and lips, blending would blur.
 
     Args:
         labels: the chosen view of each vertex, -1 = none.

@@ -30,7 +30,7 @@ NOISE_MARGIN = 2.0  # by which the median power is multiplied: its own scatter i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """One camera's view of every point: weight (0 = not seen) and linear colour (0 to 1)."""
+    """Holds one camera's view of every point: weight (0 = not seen) and linear colour (0 to 1)."""
 
     weights: Float32[np.ndarray, " v"]
     colours: Float32[np.ndarray, "v 3"]
@@ -41,11 +41,12 @@ def see_points(
     image: UInt8[np.ndarray, "h w 3"],
     silhouette: Silhouette,
     depth: Float32[np.ndarray, "h w"],
+    *,
     points: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
     settings: TextureSettings,
 ) -> Sight:
-    """What ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
+    """Returns what ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
     weights = see_weights(camera, silhouette, depth, points, normals, settings)
     pixels = project_points(camera, points)
     colours = sample_colours(image, pixels, weights, LINEAR, settings.footprint_px)
@@ -53,8 +54,9 @@ def see_points(
 
 
 def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
-    """1 below the end of the scale, next to nothing at it: how much brighter a place is no camera says there, and one
-    that is exposed longer than the others makes it darker than it is. Where all are clipped it is white all the same.
+    """Returns 1 below the end of the scale, next to nothing at it: how much brighter a place is no camera says there,
+    and one that is exposed longer than the others makes it darker than it is. Where all are clipped it is white all the
+    same.
     """
     past = (colours.max(axis=1) - CLIPS[0]) / (CLIPS[1] - CLIPS[0])
     return np.clip(1.0 - past, POOR, 1.0).astype(np.float32)
@@ -68,7 +70,7 @@ def see_weights(
     normals: Float[np.ndarray, "v 3"],
     settings: TextureSettings,
 ) -> Float32[np.ndarray, " v"]:
-    """How well ``camera`` sees each point of a surface; 0 where it does not."""
+    """Tells how well ``camera`` sees each point of a surface; 0 where it does not."""
     pixels, depths = project_points(camera, points), camera_depths(camera, points)
     towards = camera.centre_world - points
     facing = np.einsum("vi,vi->v", normals, towards) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
@@ -86,7 +88,8 @@ def see_weights(
 def sharpened(
     image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], settings: TextureSettings
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The photograph with some of the lens's blur, and of the sampling window's, taken back where there is detail.
+    """Returns the photograph with some of the lens's blur, and of the sampling window's, taken back where there is
+    detail.
 
     An unsharp mask would lift noise with it, so that it is held back as a Wiener filter does: by the share of what it
     would lift, over some pixels, that is more than noise. Most of a head is smooth: the median over it is noise.

@@ -38,7 +38,8 @@ NOT_THIS_MM = 5.0  # RMS over the face after the best fit: beyond any fault of a
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Of the search: iterations of closest points, with so many points of the head; the best starts are kept."""
+    """Holds a round of the search: iterations of closest points, with so many points of the head; the best starts are
+    kept."""
 
     points: int
     iterations: int
@@ -51,7 +52,7 @@ ROUNDS = (Round(50, 6, 0.7, 60), Round(100, 12, 0.7, 16), Round(240, 25, 0.6, 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BestFit:
-    """``start``: landmarks or search. ``scale``: the measured head's size by the reference's, 1 = right.
+    """Holds the fit. ``start``: landmarks or search. ``scale``: the measured head's size by the reference's, 1 = right.
     ``rms_mm``: distance of the fitted points after the rigid motion; ``points`` of them had a counterpart."""
 
     reference_from_world: RigidTransform
@@ -87,7 +88,7 @@ def best_fit(measured: Measured, reference: Reference) -> BestFit:
 
 
 def counted(hits: Hits, reference: Reference) -> Bool[np.ndarray, " n"]:
-    """Which closest points are counterparts: near, and not at the rim of the scan."""
+    """Returns which closest points are counterparts: near, and not at the rim of the scan."""
     return (hits.distances < FAR_MM) & ~reference.beside(hits)
 
 
@@ -160,7 +161,7 @@ def _searched(measured: Measured, reference: Reference, rng: np.random.Generator
     for stage in ROUNDS:
         some = slice(0, stage.points)
         means, rotations, translations = _closest_points(
-            points[some], normals[some], surface, tree, rotations, translations, stage
+            points[some], normals[some], surface, tree, rotations=rotations, translations=translations, stage=stage
         )
         best = np.argsort(means)[: stage.kept]
         rotations, translations = rotations[best], translations[best]
@@ -172,6 +173,7 @@ def _closest_points(
     normals: Float[np.ndarray, "n 3"],
     surface: Float[np.ndarray, "m 3"],
     tree: KDTree,
+    *,
     rotations: Float[np.ndarray, "k 3 3"],
     translations: Float[np.ndarray, "k 3"],
     stage: Round,

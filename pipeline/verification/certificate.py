@@ -56,7 +56,7 @@ class _Page(FPDF):
     def table_of(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], widths_mm: Sequence[float], inks: dict[int, tuple]
     ) -> None:
-        """``inks``: colour of the last cell, by row."""
+        """Draws a table. ``inks``: colour of the last cell, by row."""
         for number, row in enumerate([header, *rows], -1):
             self.set_font("Helvetica", style="B" if number < 0 else "", size=8.5)
             for column, (text, width) in enumerate(zip(row, widths_mm, strict=True)):
@@ -69,7 +69,7 @@ class _Page(FPDF):
 
 
 def certificate_pdf(report: VerificationReport, judgement: Judgement, pictures: Pictures) -> bytes:
-    """The two pages. The same report and pictures give the same bytes on the same day of the report."""
+    """Returns the two pages. The same report and pictures give the same bytes on the same day of the report."""
     pdf = _Page()
     pdf.set_creation_date(datetime.fromisoformat(report["date"]).replace(tzinfo=UTC))
     pdf.set_title("eigenhead: verification of a studio")
@@ -186,5 +186,5 @@ def _encoded(image: Resized) -> bytes:
 
 
 def latin(text: str) -> str:
-    """The PDF's own fonts know Latin-1 alone."""
+    """Keeps the characters that the PDF's own fonts know: Latin-1 alone."""
     return text.encode("latin-1", "replace").decode("latin-1")

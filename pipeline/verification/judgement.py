@@ -46,7 +46,7 @@ class RegionError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """One capture. ``deviation_mm`` is NaN where nothing can be said."""
+    """Holds one capture. ``deviation_mm`` is NaN where nothing can be said."""
 
     name: str
     fit: BestFit
@@ -68,7 +68,7 @@ class Judged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judgement:
-    """All captures together. ``repeatability`` has the regions' figures of ``Scatter``, empty for one capture;
+    """Holds all captures together. ``repeatability`` has the regions' figures of ``Scatter``, empty for one capture;
     ``repeated`` the errors of the mean deviation over the captures."""
 
     captures: tuple[Judged, ...]
@@ -79,7 +79,7 @@ class Judgement:
 
     @property
     def passed(self) -> bool:
-        """No limit is missed. What could not be judged (landmarks, one capture alone) is no failure."""
+        """Tells whether no limit is missed. What could not be judged (landmarks, one capture alone) is no failure."""
         return all(check.passed is not False for check in self.checks)
 
 
@@ -103,7 +103,8 @@ def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) ->
 
 
 def judge_one(measured: Measured, reference: Reference) -> Judged:
-    """One head against the reference. Raises InputError where the reference is not of this head, or inside out."""
+    """Judges one head against the reference. Raises InputError where the reference is not of this head, or inside
+    out."""
     fit = best_fit(measured, reference)
     there = fit.reference_from_world.apply(measured.mesh_world.vertices)
     hits = reference.index.closest(there)
@@ -120,7 +121,7 @@ def judge_one(measured: Measured, reference: Reference) -> Judged:
 
 
 def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> dict[str, RegionError]:
-    """Errors of every region of which the reference covers enough."""
+    """Returns errors of every region of which the reference covers enough."""
     found = {}
     known = np.isfinite(deviation_mm)
     for name in REGIONS:
@@ -143,7 +144,7 @@ def _region_error(deviation_mm: Float[np.ndarray, " n"], areas: Float[np.ndarray
 
 
 def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], share: float) -> float:
-    """From the lowest to the highest value once the tails' weight is cut off, half on each side."""
+    """Returns the range from the lowest to the highest value once the tails' weight is cut off, half on each side."""
     low, high = weighted_quantiles(values, weights, (0.5 - share / 2, 0.5 + share / 2))
     return high - low
 
@@ -157,7 +158,7 @@ def weighted_quantiles(
 
 
 def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[float, float]]:
-    """The anthropometric distances whose two landmarks both have: measured, and of the reference (mm)."""
+    """Returns the anthropometric distances whose two landmarks both have: measured, and of the reference (mm)."""
     found = {}
     for name, (one, other) in DISTANCES.items():
         if all(mark in marks for mark in (one, other) for marks in (measured.landmarks, reference.landmarks)):

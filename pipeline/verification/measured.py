@@ -20,7 +20,7 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """One reconstructed head. ``stated_mm`` is the standard deviation that it states along its normals."""
+    """Holds one reconstructed head. ``stated_mm`` is the standard deviation that it states along its normals."""
 
     name: str
     mesh_world: Mesh
@@ -34,7 +34,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class ResultIdentity:
-    """Which model made a result; what it is called there and the digest of its file."""
+    """Holds which model made a result; what it is called there and the digest of its file."""
 
     model: str
     sha256: str
@@ -54,7 +54,7 @@ def identity_of(folder: Path) -> ResultIdentity:
 
 
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
-    """A result folder made with ``model``. Raises InputError naming what does not fit."""
+    """Returns a result folder made with ``model``. Raises InputError naming what does not fit."""
     report = _report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]

@@ -29,7 +29,7 @@ ON_EDGE = 1e-9  # a corner's share of a closest point that lies on the edge acro
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """A scan (mm, own frame), made ready for closest points. ``landmarks`` may be empty."""
+    """Holds a scan (mm, own frame), made ready for closest points. ``landmarks`` may be empty."""
 
     name: str
     sha256: str
@@ -50,7 +50,7 @@ class Reference:
         return cls(name, sha256, mesh, dict(landmarks), SurfaceIndex(mesh.vertices, mesh.faces, SPACING_MM), rim)
 
     def beside(self, hits: Hits) -> Bool[np.ndarray, " n"]:
-        """Which closest points lie on an open edge: the scan says nothing of what they belong to."""
+        """Returns which closest points lie on an open edge: the scan says nothing of what they belong to."""
         corners, off = self.mesh.faces[hits.triangles], hits.weights < ON_EDGE
         found = np.zeros(len(corners), bool)
         for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -60,7 +60,7 @@ class Reference:
 
 
 def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
-    """A reference with the landmarks of the given file, or of one of the same name beside it, or none.
+    """Returns a reference with the landmarks of the given file, or of one of the same name beside it, or none.
 
     Raises InputError naming every fault.
     """

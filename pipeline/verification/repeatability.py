@@ -21,8 +21,8 @@ STILL_MM = 1e-7  # a mean that moves by less is the mean
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """Standard deviations (mm) over the shots of every vertex about the mean head, which has the first head's place:
-    ``position_mm`` in all three directions together, ``normal_mm`` along the mean head's normal."""
+    """Holds the standard deviations (mm) over the shots of every vertex about the mean head, which has the first head's
+    place: ``position_mm`` in all three directions together, ``normal_mm`` along the mean head's normal."""
 
     mean: Float[np.ndarray, "v 3"]
     position_mm: Float[np.ndarray, " v"]
@@ -31,9 +31,10 @@ class Scatter:
     def figures(
         self, stated_mm: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"], kept: Bool[np.ndarray, " v"]
     ) -> dict[str, float]:
-        """Over the ``kept`` vertices, by weight: RMS of the scatter, and beside it the stated deviation (mm, along the
-        normal). ``scatter_over_stated`` is 1 where the stated deviation is all scatter, less where part of it is an
-        error that each shot repeats; ``rank_correlation`` says whether vertices stated as worse scatter more."""
+        """Returns figures over the ``kept`` vertices, by weight: RMS of the scatter, and beside it the stated deviation
+        (mm, along the normal). ``scatter_over_stated`` is 1 where the stated deviation is all scatter, less where part
+        of it is an error that each shot repeats; ``rank_correlation`` says whether vertices stated as worse scatter
+        more."""
         share = weights[kept] / weights[kept].sum()
         position, normal, stated = self.position_mm[kept], self.normal_mm[kept], stated_mm[kept]
         rms, along, said = (float(np.sqrt(share @ values**2)) for values in (position, normal, stated))
@@ -54,7 +55,8 @@ class Scatter:
 def scatter(
     heads: Float[np.ndarray, "n v 3"], faces: Int[np.ndarray, "f 3"], laid_on: Bool[np.ndarray, " v"]
 ) -> Scatter:
-    """Scatter of two or more heads (mm, any frames) with the same vertices, laid on each other over ``laid_on``."""
+    """Returns scatter of two or more heads (mm, any frames) with the same vertices, laid on each other over
+    ``laid_on``."""
     if len(heads) < 2:
         raise ValueError(f"{len(heads)} heads have no scatter; two are needed")
     mean = heads[0]
@@ -78,5 +80,5 @@ def by_region(
     weights: Float[np.ndarray, " v"],
     regions: Mapping[str, Bool[np.ndarray, " v"]],
 ) -> dict[str, dict[str, float]]:
-    """``Scatter.figures`` of every region that has vertices."""
+    """Returns ``Scatter.figures`` of every region that has vertices."""
     return {name: found.figures(stated_mm, weights, kept) for name, kept in regions.items() if kept.any()}

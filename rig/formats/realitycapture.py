@@ -108,7 +108,18 @@ def read_csv(path: Path) -> CamerasRead:
         focal = values["f"] / FILM_MM * side
         offset = values["px"] / FILM_MM * side, values["py"] / FILM_MM * side
         position = np.array([values["x"], values["y"], values["alt"]])
-        entries.append(_entry(name, size, (focal, focal), offset, values, DOWN @ _attitude(values).T, position, faults))
+        entries.append(
+            _entry(
+                name,
+                size,
+                (focal, focal),
+                offset,
+                values,
+                DOWN @ _attitude(values).T,
+                position_m=position,
+                faults=faults,
+            )
+        )
     return reading.finish(entries)
 
 
@@ -171,7 +182,7 @@ def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[
     lens = numbers("DistortionCoeficients", 6, "0 0 0 0 0 0")
     rotation, position = np.array(numbers("Rotation", 9)).reshape(3, 3), np.array(numbers("Position", 3))
     named: dict[str, float] = dict(zip(("k1", "k2", "k3", "k4", "t1", "t2"), lens, strict=True))
-    return _entry(name, size, (focal, focal * aspect), offset, named, rotation, position, faults)
+    return _entry(name, size, (focal, focal * aspect), offset, named, rotation, position_m=position, faults=faults)
 
 
 def _entry(
@@ -181,6 +192,7 @@ def _entry(
     offset: tuple[float, float],
     lens: Mapping[str, float],
     rotation: np.ndarray,
+    *,
     position_m: np.ndarray,
     faults: list[Message],
 ) -> dict[str, object]:

@@ -54,7 +54,7 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
     }
     used = {path for kind in owned.values() for paths in kind.values() for path in _flat(paths)}
     strays = {kind: _strays(place, used, names, kind) for kind, place in places.items()}
-    missing, cause = _missing(folder, rig, images, masks, plates, places, strays)
+    missing, cause = _missing(folder, rig, images, masks, plates, places=places, strays=strays)
     if places["images"] != folder:
         strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
     stray_names = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
@@ -151,6 +151,7 @@ def _missing(
     images: Mapping[str, Path],
     masks: Mapping[str, Path],
     plates: Mapping[str, tuple[Path, ...]],
+    *,
     places: Mapping[str, Path],
     strays: Mapping[str, Sequence[Path]],
 ) -> tuple[list[Message], bool]:

@@ -76,7 +76,9 @@ def draw_photographs(
         program = context.program("studio.vert", "studio.frag")
         pieces = [(part, _upload(gl, owned, part, origin)) for part in parts]
         for camera in rig:
-            found[camera.name] = _draw(context, program, camera, pieces, gallery, origin, box, samples)
+            found[camera.name] = _draw(
+                context, program, camera, pieces, gallery, origin=origin, box=box, samples=samples
+            )
     return found
 
 
@@ -136,6 +138,7 @@ def _draw(
     camera: Camera,
     pieces: Sequence[tuple[Part, list[moderngl.Buffer]]],
     gallery: Gallery,
+    *,
     origin: Float[np.ndarray, " 3"],
     box: Float[np.ndarray, "p 3"],
     samples: int,

@@ -58,6 +58,7 @@ def batch(
             exists=True,
         ),
     ],
+    *,
     out: Annotated[
         Path, typer.Option(help="The folder of all results, with table and contact sheet.", file_okay=False)
     ],

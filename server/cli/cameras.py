@@ -79,6 +79,7 @@ def calibrate(
         ),
     ],
     out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
+    *,
     board: Annotated[Path | None, typer.Option(help="The board.toml.", exists=True, dir_okay=False)] = None,
     source: Annotated[str, chosen("board, or scene: photographs of anything.", _sources, "--from")] = "board",
     scale: Annotated[

@@ -24,6 +24,7 @@ def experiments(
             "people, planted, surfaces, texture, light, templates or real."
         ),
     ],
+    *,
     folders: Annotated[
         list[Path] | None,
         typer.Argument(

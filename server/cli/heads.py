@@ -75,6 +75,7 @@ def format_names(value: str | None) -> str | None:
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
+    *,
     method: Annotated[str | None, chosen("contour (the default) or simplex.", of_setting("method"))] = None,
     model: Annotated[
         str | None,
@@ -167,6 +168,7 @@ def verify(
     out: Annotated[Path, typer.Option(help="Where report.json and certificate.pdf go.", file_okay=False)] = Path(
         "out/verify"
     ),
+    *,
     landmarks: Annotated[
         Path | None, typer.Option(help="Of the scan, in its frame; by default the file beside it.", exists=True)
     ] = None,
@@ -203,6 +205,7 @@ def simulate(
         Path | None,
         typer.Argument(help="The capture folder to write (--serve: the rig's); the truth goes to OUT.truth."),
     ] = None,
+    *,
     subject: Annotated[str, typer.Option(help="random, mean, or a mesh file (head frame, mm).")] = "random",
     seed: Annotated[int, typer.Option(help="Of subject, looks, pose and noise.", min=0)] = 0,
     noise: Annotated[float | None, number("Sensor noise, share of full scale.", min=0, max=1)] = None,

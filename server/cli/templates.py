@@ -18,6 +18,7 @@ def template_add(
     file: Annotated[Path, typer.Argument(help="The mesh, an OBJ file of a human head.", exists=True, dir_okay=False)],
     name: Annotated[str | None, typer.Option(help="What to call it; by default the file's name.")] = None,
     model: Annotated[str, typer.Option(help="The head model that carries it, a name or file.")] = "default",
+    *,
     landmarks: Annotated[
         Path | None,
         typer.Option(

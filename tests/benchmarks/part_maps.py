@@ -106,9 +106,11 @@ def measure(
     done = reconstruct(ReconstructionContext(capture, rig, model, Settings(), renderer))
     landmarks = {name: point.position_mm for name, point in done.evidence.landmarks.items()}
     region = model.levels["full"].face_region
-    inputs = capture.images, done.views.silhouettes, rig, done.mesh_world, region, landmarks, PartSettings()
-    started = time.process_time()
-    maps = classify_parts(*inputs, report=lambda stage, share: None)
+    images, silhouettes, head = capture.images, done.views.silhouettes, done.mesh_world
+    settings, started = PartSettings(), time.process_time()
+    maps = classify_parts(
+        images, silhouettes, rig, head, region, landmarks, settings=settings, report=lambda stage, share: None
+    )
     seconds = time.process_time() - started
     counts = np.zeros((4, 4))
     for name, found in maps.items():

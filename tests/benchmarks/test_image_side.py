@@ -39,8 +39,8 @@ def test_texture(benchmark: BenchmarkFixture, scan: tuple[Capture, Rig, dict[str
     model = load_model()
     head = Mesh(model.vertices(np.zeros(1)) + hull_extent(silhouettes, rig)[0], model.levels["full"].faces)
     normals = head.normals()
-    arguments = (head, normals, capture, silhouettes, rig, depth_maps(rig, head), TextureSettings())
-    benchmark.pedantic(texture, arguments, rounds=5, warmup_rounds=1)
+    arguments = (head, normals, capture, silhouettes, rig, depth_maps(rig, head))
+    benchmark.pedantic(texture, arguments, {"settings": TextureSettings()}, rounds=5, warmup_rounds=1)
 
 
 def test_visual_hull(benchmark: BenchmarkFixture, scan: tuple[Capture, Rig, dict[str, Silhouette]]) -> None:

@@ -136,7 +136,7 @@ def compared(
     depths = depth_maps(scene.rig, mesh)
     for blend in BLENDS:
         chosen = replace(settings, blend=blend)
-        found = texture(mesh, mesh.normals(), capture, silhouettes, scene.rig, depths, chosen)
+        found = texture(mesh, mesh.normals(), capture, silhouettes, scene.rig, depths, settings=chosen)
         seen &= (found.views[corners] > 0).all(axis=1)
         colours[blend] = np.einsum("vk,vkc->vc", at.weights, found.colours[corners].astype(float))
     figures: dict[str, float] = {"vertices": int(seen.sum())}
@@ -179,7 +179,7 @@ def background_share(
         dark = replace(scene, views=views, preset=replace(scene.preset, light_drift=0.0))
         noiseless = replace(dark, views={n: replace(v, sensor=replace(v.sensor, noise=0.0)) for n, v in views.items()})
         shot = shoot(noiseless, np.random.default_rng(0))
-        found = texture(mesh, mesh.normals(), shot, silhouettes, scene.rig, depths, plain)
+        found = texture(mesh, mesh.normals(), shot, silhouettes, scene.rig, depths, settings=plain)
         light.append(linear_from_srgb(found.colours / 255.0).mean(axis=1))
     known = found.views > 0
     return np.where(known, np.abs(light[1] - light[0]) / SCREEN, 0.0)

@@ -199,7 +199,7 @@ def main() -> None:
     import cv2  # noqa: F401  before the forks: what every one of them needs
     import numba  # noqa: F401
     import pytest  # noqa: F401
-    import scipy.ndimage
+    import scipy.ndimage  # noqa: F401
     import scipy.spatial  # noqa: F401
 
     sys.dont_write_bytecode = True

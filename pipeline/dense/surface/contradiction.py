@@ -21,7 +21,7 @@ SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
 
 def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
-    """The views without the outlines that others contradict, and by view the share of its crop that was."""
+    """Returns the views without the outlines that others contradict, and by view the share of its crop that was."""
 
     def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
         height, width = views.sizes[v]

@@ -18,7 +18,7 @@ HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of
 def crossing_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Triangles that cross another one, among pairs of which one is ``active`` (all of them, if None)."""
+    """Returns triangles that cross another one, among pairs of which one is ``active`` (all of them, if None)."""
     faces = faces.astype(np.int32)  # a copy: a model's own are read-only, which is another type
     if active is None:
         return _crossing_by_size(vertices, faces)
@@ -71,8 +71,8 @@ def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bo
 
 
 def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh, int]:
-    """The mesh without self-intersections, and how many of its vertices moved; with all vertices in their ``safe``
-    places it has none."""
+    """Returns the mesh without self-intersections, and how many of its vertices moved; with all vertices in their
+    ``safe`` places it has none."""
     vertices, faces = mesh.vertices.copy(), mesh.faces
     moved = np.zeros(len(vertices), bool)
     active: Bool[np.ndarray, " f"] | None = None

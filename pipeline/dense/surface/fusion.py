@@ -42,7 +42,7 @@ CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BustSurface:
-    """The whole visible surface: closed, two-manifold, wound outwards, one piece, without self-intersections."""
+    """Holds the whole visible surface: closed, two-manifold, wound outwards, one piece, without self-intersections."""
 
     mesh_world: Mesh
     deviation_mm: Float[np.ndarray, " v"]  # standard deviation along the normal
@@ -52,7 +52,7 @@ class BustSurface:
 
     @property
     def seen(self) -> Bool[np.ndarray, " v"]:
-        """Vertices that some photograph measures."""
+        """Returns vertices that some photograph measures."""
         return self.views > 0
 
 
@@ -61,14 +61,14 @@ def fuse(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     head_world: Mesh | None,
+    *,
     votes: PartVotes | None,
     bias: WindowBias,
     settings: BustSettings,
-    *,
     head_skin_world: Mesh | None = None,
     report: Progress,
 ) -> BustSurface:
-    """The closed surface that the views agree on.
+    """Returns the closed surface that the views agree on.
 
     Args:
         depth_maps: one a view; those that know nothing are left out.
@@ -116,8 +116,8 @@ def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) 
 
 
 def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
-    """The subject's piece of the zero level, and places of its vertices at which it cannot cross itself: the corners of
-    the cubes about the inner nodes."""
+    """Returns the subject's piece of the zero level, and places of its vertices at which it cannot cross itself: the
+    corners of the cubes about the inner nodes."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     net = surface_net(field, grid.index, grid.neighbours)

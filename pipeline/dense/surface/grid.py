@@ -15,8 +15,8 @@ from pipeline.geometry.surface_nets import link_nodes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Nodes at ``corner + step_mm * index``, world frame. ``neighbours`` are rows towards -x +x -y +y -z +z, -1 where
-    there is none; ``outer`` nodes lack one of their 26 neighbours."""
+    """Holds nodes at ``corner + step_mm * index``, world frame. ``neighbours`` are rows towards -x +x -y +y -z +z, -1
+    where there is none; ``outer`` nodes lack one of their 26 neighbours."""
 
     corner: Float[np.ndarray, " 3"]
     step_mm: float
@@ -30,28 +30,29 @@ class Grid:
 
 
 def whole_box(corner: Float[np.ndarray, " 3"], edges_mm: Float[np.ndarray, " 3"], step_mm: float) -> Grid:
-    """Every node of a box."""
+    """Returns every node of a box."""
     shape = tuple(int(n) for n in np.ceil(edges_mm / step_mm).astype(int) + 1)
     index = np.stack(np.meshgrid(*(np.arange(n, dtype=np.int32) for n in shape), indexing="ij"), axis=-1)
     return _linked(corner, step_mm, (shape[0], shape[1], shape[2]), index.reshape(-1, 3))
 
 
 def refined(coarse: Grid, wanted: Bool[np.ndarray, "nx ny nz"]) -> Grid:
-    """Nodes of half the step: eight for every wanted node of the coarse grid's box, itself the lowest of them."""
+    """Returns nodes of half the step: eight for every wanted node of the coarse grid's box, itself the lowest of
+    them."""
     nx, ny, nz = coarse.shape
     shape = (2 * nx - 1, 2 * ny - 1, 2 * nz - 1)
     return _linked(coarse.corner, coarse.step_mm / 2, shape, kernels.halved(wanted))
 
 
 def everywhere(grid: Grid, values: Float32[np.ndarray, " n"], box: Float32[np.ndarray, "_ _ _"]) -> np.ndarray:
-    """A volume over the grid's whole box: its nodes' values, beyond them those of the coarser ``box``."""
+    """Returns a volume over the grid's whole box: its nodes' values, beyond them those of the coarser ``box``."""
     fine = kernels.doubled(box)
     fine[tuple(grid.index.T)] = values
     return fine
 
 
 def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "nx ny nz"]:
-    """The chosen nodes as a volume over the whole box."""
+    """Returns the chosen nodes as a volume over the whole box."""
     box = np.zeros(grid.shape, bool)
     box[tuple(grid.index[chosen].T)] = True
     return box

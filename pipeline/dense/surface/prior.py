@@ -16,7 +16,8 @@ NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance
 def distance_to_head(
     places: Float[np.ndarray, "n 3"], head_world: Mesh, seen: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Signed distance (mm, positive outside) of places to the head with its hair; -inf where the model ends.
+    """Returns the signed distance (mm, positive outside) of places to the head with its hair; -inf where the model
+    ends.
 
     Hair is as thick over each vertex as the ``seen`` points of the surface say, and evenly so between them.
     """
@@ -51,7 +52,7 @@ def _thickness(
 
 
 def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Which places lie near the open rim of the head."""
+    """Returns which places lie near the open rim of the head."""
     rim = np.unique(boundary_edges(head_world.faces))
     if not len(rim):
         return np.zeros(len(places), bool)

@@ -20,7 +20,7 @@ ISLAND_MM2 = 100.0
 
 
 def without_islands(mesh: Mesh, measured: Measured) -> Measured:
-    """The same, where a patch of seen triangles below ``ISLAND_MM2`` counts as seen by nobody."""
+    """Returns the same, where a patch of seen triangles below ``ISLAND_MM2`` counts as seen by nobody."""
     seen = measured.views > 0
     faces = mesh.faces[seen[mesh.faces].all(axis=1)]
     piece = component_of(faces, len(seen))
@@ -30,8 +30,8 @@ def without_islands(mesh: Mesh, measured: Measured) -> Measured:
 
 
 def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
-    """Standard deviation along the normal: of the views' mean where some see the vertex (their own deviations, or their
-    scatter where that is larger), of a guess elsewhere, by the distance to what is seen."""
+    """Returns the standard deviation along the normal: of the views' mean where some see the vertex (their own
+    deviations, or their scatter where that is larger), of a guess elsewhere, by the distance to what is seen."""
     seen = measured.views > 0
     out = np.full(len(seen), MOST_MM)
     if not seen.any():

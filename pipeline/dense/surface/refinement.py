@@ -20,7 +20,7 @@ ROUNDS, SWEEPS = 2, 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """What the views say of every vertex: ``information`` (1/mm2) and ``scatter`` (mm2) as in
+    """Holds what the views say of every vertex: ``information`` (1/mm2) and ``scatter`` (mm2) as in
     ``refinement_kernels.measure``, and how many ``views`` see it."""
 
     offset_mm: Float[np.ndarray, " v"]
@@ -30,7 +30,7 @@ class Measured:
 
 
 def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple[Mesh, Measured]:
-    """The mesh with its vertices moved along their normals, and what the views say of the result."""
+    """Returns the mesh with its vertices moved along their normals, and what the views say of the result."""
     starts, indices = neighbours(mesh_world.faces, len(mesh_world.vertices))
     mesh = mesh_world
     for _ in range(ROUNDS):
@@ -43,14 +43,15 @@ def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple
 
 
 def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]]:
-    """Vertices next to each one of a closed mesh, in compressed rows: starts (count + 1) and indices."""
+    """Returns vertices next to each one of a closed mesh, in compressed rows: starts (count + 1) and indices."""
     starts = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
     order = np.argsort(faces.ravel(), kind="stable")  # a closed mesh has each edge once in either direction
     return starts, np.roll(faces, -1, axis=1).ravel()[order].astype(np.int32)
 
 
 def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewStack, gate_mm: float) -> Measured:
-    """Every vertex against the depth maps; a view that is farther off than ``gate_mm`` shows another surface."""
+    """Measures every vertex against the depth maps; a view that is farther off than ``gate_mm`` shows another
+    surface."""
     count = len(mesh.vertices)
     offset, information, scatter = (np.zeros(count) for _ in range(3))
     seen = np.zeros(count, np.uint8)

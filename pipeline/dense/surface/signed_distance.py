@@ -51,13 +51,13 @@ UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
 
 
 class NoSurface(EigenheadError):
-    """Photographs that do not tell where the surface is."""
+    """Reports photographs that do not tell where the surface is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
-    """At every node of a grid: signed distance (mm), its weight (0: nobody sees the place), and the distance (mm) by
-    which the body's outline leaves the node out at least. See ``vote_kernels.vote``."""
+    """Holds at every node of a grid: signed distance (mm), its weight (0: nobody sees the place), and the distance (mm)
+    by which the body's outline leaves the node out at least. See ``vote_kernels.vote``."""
 
     value: Field
     weight: Field
@@ -66,7 +66,7 @@ class Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """The field on one grid: signed distance (mm, negative inside), and the weight of the votes behind it."""
+    """Holds the field on one grid: signed distance (mm, negative inside), and the weight of the votes behind it."""
 
     grid: Grid
     field: Field
@@ -74,7 +74,7 @@ class Level:
 
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
-    """The field that the votes, the silhouettes and, where nothing is known, ``start`` make."""
+    """Returns the field that the votes, the silhouettes and, where nothing is known, ``start`` make."""
     reach = np.float32(REACH * grid.step_mm)
     start = np.clip(start, -reach, reach)
     unseen = votes.weight <= 0
@@ -94,7 +94,7 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
 
 
 def votes_at(grid: Grid, views: ViewStack) -> Votes:
-    """What the views say of every node."""
+    """Returns what the views say of every node."""
     value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
     step = grid.step_mm
     limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
@@ -108,7 +108,7 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
 
 
 def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | None, spacing_mm: float) -> Level:
-    """The field about the surface, on a grid of ``spacing_mm``."""
+    """Returns the field about the surface, on a grid of ``spacing_mm``."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
@@ -164,7 +164,7 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> F
 
 
 def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
-    """The guess (mm, negative inside) on a whole box, without what no ball of ``HORN_MM`` fits into: beyond the
+    """Returns the guess (mm, negative inside) on a whole box, without what no ball of ``HORN_MM`` fits into: beyond the
     photographs cones of sight that no outline bounds end in fins and horns. Beside what is seen the guess stays."""
     from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
 

@@ -27,14 +27,14 @@ CANDIDATES = 3  # triangles looked at for each vertex: twice as fast as six, off
 
 
 def part_of(head_world: Mesh, measured: Bool[np.ndarray, " v"]) -> Mesh:
-    """The head's triangles whose corners are all ``measured``."""
+    """Returns the head's triangles whose corners are all ``measured``."""
     return Mesh(head_world.vertices, head_world.faces[measured[head_world.faces].all(axis=1)])
 
 
 def drawn_to_skin(
     mesh_world: Mesh, skin: Float[np.ndarray, " v"], head_skin_world: Mesh, deviation_mm: Float[np.ndarray, " v"]
 ) -> Mesh:
-    """The surface with its vertices moved to the mean of both.
+    """Returns the surface with its vertices moved to the mean of both.
 
     Args:
         mesh_world: the surface, mm.

@@ -20,7 +20,7 @@ ALONE_FACTOR = 3.0  # ... and has its deviation multiplied: 28 % of them are 2 m
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewStack:
-    """Pixels of all the views' crops, one view after the other, each with all that it says in one place.
+    """Holds pixels of all the views' crops, one view after the other, each with all that it says in one place.
 
     ``cameras`` holds, a view: rotation (9), translation (3), fx fy cx cy, and the centre in the world frame (3).
     ``pixels`` holds, a pixel: depth (mm), normal (3, world frame, towards the camera), standard deviation (mm; inf
@@ -34,12 +34,12 @@ class ViewStack:
     pixels: Float32[np.ndarray, "p 8"]
 
     def packed(self) -> Pixels:
-        """For compiled loops."""
+        """Packs them for compiled loops."""
         return Pixels(self.cameras, self.sizes, self.starts, self.pixels)
 
 
 def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhouette], rig: Rig) -> ViewStack:
-    """The views of the depth maps, in their order."""
+    """Returns the views of the depth maps, in their order."""
     sizes = np.array([depth_map.depth_mm.shape for depth_map in depth_maps], np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     pixels = np.zeros((starts[-1], 8), np.float32)

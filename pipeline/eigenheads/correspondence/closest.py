@@ -13,7 +13,8 @@ _CANDIDATES = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """For each query point: its closest point, the triangle that holds it, barycentric weights, and the distance."""
+    """Holds for each query point: its closest point, the triangle that holds it, barycentric weights, and the
+    distance."""
 
     points: Float[np.ndarray, "N 3"]
     triangles: Int[np.ndarray, " N"]  # row of ``faces``
@@ -23,7 +24,7 @@ class Hits:
 
 
 class SurfaceIndex:
-    """A triangle surface prepared for closest-point queries. ``spacing`` (mm) bounds the gap between samples."""
+    """Holds a triangle surface prepared for closest-point queries. ``spacing`` (mm) bounds the gap between samples."""
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], spacing: float = 2.0) -> None:
         self.faces = faces
@@ -39,8 +40,8 @@ class SurfaceIndex:
         facing: Float[np.ndarray, "N 3"] | None = None,
         facing_mm: float = 10.0,
     ) -> Hits:
-        """Closest surface point of each query point. With unit normals ``facing`` of the points, a triangle that faces
-        the other way is chosen only where it is nearer by ``facing_mm``: lips that meet are told apart."""
+        """Returns the closest surface point of each query point. With unit normals ``facing`` of the points, a triangle
+        that faces the other way is chosen only where it is nearer by ``facing_mm``: lips that meet are told apart."""
         count = min(candidates, len(self._owner))
         nearest = self._tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)
         triangle, weights = closest_candidates(points, self._owner[nearest], self.corners, facing, facing_mm)
@@ -48,7 +49,7 @@ class SurfaceIndex:
         return Hits(found, triangle, weights, np.linalg.norm(points - found, axis=1), self.normals(triangle))
 
     def normals(self, triangles: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
-        """Unit normals of the given triangles."""
+        """Returns unit normals of the given triangles."""
         corners = self.corners[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

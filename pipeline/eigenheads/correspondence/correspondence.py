@@ -38,7 +38,7 @@ _SMOOTHINGS = 4  # of both: noise of single points falls to half; with 8, fine s
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """One stage of looking for a head's points on a scan. Lengths in mm."""
+    """Holds one stage of looking for a head's points on a scan. Lengths in mm."""
 
     steps: int
     reach_mm: float  # a match farther than this is another part of the head
@@ -48,7 +48,7 @@ class Search:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matching:
-    """How correspondence is found. Lengths in mm."""
+    """Says how correspondence is found. Lengths in mm."""
 
     refine: bool = True
     reach_mm: float = 15.0  # a sample farther than this from the warped vertex is another part of the head: void
@@ -66,7 +66,7 @@ class Matching:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondence:
-    """Heads with the same vertices: row k is scan k, moved into the common frame by ``frame_from_scan``."""
+    """Holds heads with the same vertices: row k is scan k, moved into the common frame by ``frame_from_scan``."""
 
     heads: Float[np.ndarray, "N V 3"]
     void: Bool[np.ndarray, "N V"]
@@ -76,7 +76,7 @@ class Correspondence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """A scan in the common frame, prepared for refinement."""
+    """Holds a scan in the common frame, prepared for refinement."""
 
     vertices: Float[np.ndarray, "S 3"]
     normals: Float[np.ndarray, "S 3"]
@@ -86,7 +86,7 @@ class Target:
 def correspond(
     scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
 ) -> Correspondence:
-    """Corresponded heads on the template's cage connectivity. Scans must have passed ``scan_checks.check``."""
+    """Returns corresponded heads on the template's cage connectivity. Scans must have passed ``scan_checks.check``."""
     matching = matching or Matching()
     frames = common_frame(scans, template)
     placed_scans = list(zip(scans, frames, strict=True))
@@ -106,7 +106,7 @@ def correspond(
 
 
 def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransform]:
-    """Rigid motions into the head frame: landmarks aligned with each other, their mean with the template's."""
+    """Returns rigid motions into the head frame: landmarks aligned with each other, their mean with the template's."""
     marks = np.array([stacked(scan.landmarks) for scan in scans])
     ours = template.vertices(np.zeros(0))[[template.landmarks[name] for name in NAMES]]
     weights = np.ones(len(NAMES))
@@ -116,7 +116,8 @@ def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransf
 
 
 def prepared(scan: Scan, frame_from_scan: RigidTransform) -> Target:
-    """The scan in the common frame, its noise smoothed away without shrinking it (Taubin 1995), and smooth normals."""
+    """Returns the scan in the common frame, its noise smoothed away without shrinking it (Taubin 1995), and smooth
+    normals."""
     vertices = frame_from_scan.apply(scan.vertices)
     averaging = _averaging(scan.faces, len(vertices))
     for factor in _TAUBIN * _SMOOTHINGS:
@@ -138,12 +139,12 @@ def _averaging(faces: Int[np.ndarray, "F 3"], count: int) -> sparse.csr_array:
 
 
 def nearest_mean(shapes: Float[np.ndarray, "N L 3"]) -> int:
-    """The shape closest to the mean of all (step 1 of section 3.2)."""
+    """Returns the shape closest to the mean of all (step 1 of section 3.2)."""
     return int(((shapes - shapes.mean(0)) ** 2).sum((1, 2)).argmin())
 
 
 def on_reference(target: Target, template: HeadModel, matching: Matching) -> Float[np.ndarray, "V 3"]:
-    """The reference scan's surface on the template's cage vertices."""
+    """Returns the reference scan's surface on the template's cage vertices."""
     surface = template.vertices(np.zeros(0))[: len(template.mean)]
     index = _landmark_rows(template)
     warped = landmark_warp(surface[index], target.marks, surface)
@@ -154,8 +155,8 @@ def on_reference(target: Target, template: HeadModel, matching: Matching) -> Flo
         target,
         matching.broad,
         matching.reference_stiffness,
-        fixed,
-        matching.mark_weight,
+        marks=fixed,
+        mark_weight=matching.mark_weight,
     )
 
 
@@ -166,7 +167,8 @@ def warp_and_resample(
     cylinder: CylinderIndex,
     matching: Matching,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
-    """Steps 3 and 4: the warped reference, its resampling on the target, and where that is void (there: warped)."""
+    """Runs steps 3 and 4: the warped reference, its resampling on the target, and where that is void (there:
+    warped)."""
     warped = landmark_warp(shape[index], marks, shape, smoothing=matching.landmark_smoothing_mm)
     angles, heights, radii = coordinates(warped)
     cast = cylinder.cast(angles, heights, radii)
@@ -231,7 +233,7 @@ def statistical(
     target: Target,
     matching: Matching,
 ) -> Float[np.ndarray, "V 3"]:
-    """The most probable head under the prior for the scan's landmarks and surface: broad modes first, then all.
+    """Returns the most probable head under the prior for the scan's landmarks and surface: broad modes first, then all.
 
     Smoothness cannot tell where on a plain cheek a vertex belongs; what is known of other heads helps. Residuals are
     point-to-plane, counted per cm2 of surface, landmarks in all three axes; six columns carry the pose.
@@ -244,7 +246,7 @@ def statistical(
         for _ in range(search.steps):
             near, weight = _matched(shape, faces, target, tree, search)
             information = weight * areas / 100.0 / search.plane_mm**2
-            shape = _posterior_mean(prior.mean, modes, index, target, near, information, matching.mark_mm)
+            shape = _posterior_mean(prior.mean, modes, index, target, near, information, mark_mm=matching.mark_mm)
     return shape
 
 
@@ -255,6 +257,7 @@ def _posterior_mean(
     target: Target,
     near: Int[np.ndarray, " V"],
     information: Float[np.ndarray, " V"],
+    *,
     mark_mm: float,
 ) -> Float[np.ndarray, "V 3"]:
     """The posterior mean for vertices on the planes of their matches. Single precision: the prior keeps it tame."""
@@ -280,10 +283,11 @@ def refined(
     target: Target,
     search: Search,
     stiffnesses: Sequence[float],
+    *,
     marks: Mapping[int, Float[np.ndarray, " 3"]] = MappingProxyType({}),
     mark_weight: float = 0.0,
 ) -> Float[np.ndarray, "V 3"]:
-    """Non-rigid closest-point refinement of a warped reference onto a target.
+    """Refines a warped reference onto a target by non-rigid closest points.
 
     Each step solves (W + k L^T L) u = W d for the displacements u from ``start`` (all three axes share the matrix; L is
     the graph Laplacian, so affine-like motions stay cheap), with d the pull towards the match along its normal: in the

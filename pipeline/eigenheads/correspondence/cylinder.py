@@ -14,26 +14,26 @@ from pipeline.eigenheads.correspondence.cylinder_kernels import CELL_MM, bin_tri
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cast:
-    """Where rays meet a surface; NaN and -1 where they do not."""
+    """Says where rays meet a surface; NaN and -1 where they do not."""
 
     radii: Float[np.ndarray, " N"]
     triangles: Int[np.ndarray, " N"]
 
 
 def coordinates(points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, " _"], ...]:
-    """Angle (-pi to pi), height and radius of points about the axis x = z = 0."""
+    """Returns the angle (-pi to pi), height and radius of points about the axis x = z = 0."""
     return np.arctan2(points[:, 0], points[:, 2]), points[:, 1], np.hypot(points[:, 0], points[:, 2])
 
 
 def points_at(
     angles: Float[np.ndarray, " N"], heights: Float[np.ndarray, " N"], radii: Float[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N 3"]:
-    """The inverse of ``coordinates``."""
+    """Returns the inverse of ``coordinates``."""
     return np.stack([radii * np.sin(angles), heights, radii * np.cos(angles)], 1)
 
 
 class CylinderIndex:
-    """A triangle surface (mm, axis x = z = 0) prepared for rays from the axis."""
+    """Holds a triangle surface (mm, axis x = z = 0) prepared for rays from the axis."""
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
         self._vertices = np.ascontiguousarray(vertices, float)
@@ -48,7 +48,7 @@ class CylinderIndex:
         heights: Float[np.ndarray, " N"],
         near: Float[np.ndarray, " N"] | None = None,
     ) -> Cast:
-        """The hit nearest in radius to ``near``, or the outermost one, of each ray."""
+        """Returns the hit nearest in radius to ``near``, or the outermost one, of each ray."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
         found, triangles = cast_rays(
             self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted

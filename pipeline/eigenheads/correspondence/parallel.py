@@ -20,14 +20,15 @@ _CHUNK = 4  # what a task carries besides its item (a prior of 40 MB) travels on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workers:
-    """``over`` runs a module-level function (or a partial of one) over items, in order; results come as a list."""
+    """Runs work in processes: ``over`` runs a module-level function (or a partial of one) over items, in order; results
+    come as a list."""
 
     pool: ProcessPoolExecutor | None
 
     def over(
         self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Progress | None
     ) -> list[Result]:
-        """An exception of ``work`` is raised here, the earliest item's first."""
+        """Runs ``work`` over the items, in order; an exception of it is raised here, the earliest item's first."""
         results = map(work, items) if self.pool is None else self.pool.map(work, items, chunksize=_CHUNK)
         out = []
         for result in results:
@@ -39,7 +40,7 @@ class Workers:
 
 @contextmanager
 def workers(count: int, items: int) -> Iterator[Workers]:
-    """``count`` processes for ``items`` pieces of work, or none where one process does as well."""
+    """Yields ``count`` processes for ``items`` pieces of work, or none where one process does as well."""
     if count < 2 or items < FEW:
         yield Workers(None)
         return

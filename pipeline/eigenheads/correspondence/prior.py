@@ -29,7 +29,8 @@ _SYMMETRIC = 0.99  # share of edges that must be edges on the other side too: qu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Heads mean + z modes, z ~ N(0, I), in mm; modes need not be orthogonal. The first ``broad`` ones are global."""
+    """Holds heads mean + z modes, z ~ N(0, I), in mm; modes need not be orthogonal. The first ``broad`` ones are
+    global."""
 
     mean: Float[np.ndarray, "V 3"]
     modes: Float32[np.ndarray, "K V 3"]
@@ -39,7 +40,8 @@ class Prior:
 def registration_prior(
     mean: Float[np.ndarray, "V 3"], modes: Float[np.ndarray, "M V 3"], faces: Int[np.ndarray, "F 3"], *, seed: int = 0
 ) -> Prior:
-    """The mixture for a model's mean and modes (mm per standard deviation), mirrored where the mesh allows it."""
+    """Returns the mixture for a model's mean and modes (mm per standard deviation), mirrored where the mesh allows
+    it."""
     opposite = mirror_images(mean, faces)
     if opposite is not None:
         mean = (mean + mean[opposite] * _MIRROR) / 2
@@ -50,7 +52,8 @@ def registration_prior(
 
 
 def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " V"] | None:
-    """The vertex on the other side of the median plane x = 0 for each vertex; None where the mesh has no two sides.
+    """Returns the vertex on the other side of the median plane x = 0 for each vertex; None where the mesh has no two
+    sides.
 
     The cheapest one-to-one assignment: a mean head is not quite symmetric, and the nearest vertex of the mirrored one
     would serve some twice.
@@ -65,7 +68,7 @@ def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"])
 def localised(
     mean: Float[np.ndarray, "V 3"], modes: Float32[np.ndarray, "M V 3"], *, seed: int = 0
 ) -> Float32[np.ndarray, "K V 3"]:
-    """The ``KEPT`` strongest modes of the covariance times a Gaussian of the distance on the mean head.
+    """Returns the ``KEPT`` strongest modes of the covariance times a Gaussian of the distance on the mean head.
 
     Their product K is too large to hold (400 MB), so its rows are made block by block and meet a random sketch once:
     K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5).

@@ -31,7 +31,7 @@ _OUTWARD_SHARE = 0.7  # of the area: folds of ear and nostril look inwards even 
 
 
 class BadScan(InputError):
-    """A scan that must not be averaged in; ``faults`` says all that is wrong with it."""
+    """Reports a scan that must not be averaged in; ``faults`` says all that is wrong with it."""
 
     def __init__(self, name: str, faults: Iterable[str]) -> None:
         super().__init__(f"scan {name}", faults)
@@ -39,14 +39,14 @@ class BadScan(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """A scan fit for correspondence, and what was put right in it."""
+    """Holds a scan fit for correspondence, and what was put right in it."""
 
     scan: Scan
     repairs: tuple[str, ...]
 
 
 def check(scan: Scan, template: HeadModel) -> Checked:
-    """The scan in millimetres with sides and windings put right. Raises BadScan with every fault found."""
+    """Returns the scan in millimetres with sides and windings put right. Raises BadScan with every fault found."""
     _check_complete(scan)
     scan, repairs = _in_millimetres(scan, template)
     scan, side_repairs = _sides_and_windings(scan, template)
@@ -140,7 +140,7 @@ def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Bool[np.ndarray, "H A"]]:
-    """Cells of 4 mm (height, angle) from chin to above the brow where no surface is, and those of the face."""
+    """Returns cells of 4 mm (height, angle) from chin to above the brow where no surface is, and those of the face."""
     marks, placed = stacked(scan.landmarks), _placed(scan, template)
     at = dict(zip(NAMES, rigid_fit(marks, _mean_marks(template)).apply(marks), strict=True))
     heights = np.arange(at["gnathion"][1] + 4, at["glabella"][1] + 35, _CELL_MM)
@@ -152,7 +152,7 @@ def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Boo
 
 
 def outward_share(scan: Scan, template: HeadModel) -> float:
-    """Share of the scan's area whose faces look away from the head's axis."""
+    """Returns the share of the scan's area whose faces look away from the head's axis."""
     corners = _placed(scan, template)[scan.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = (doubled * (corners.mean(1) * [1, 0, 1])).sum(1) > 0

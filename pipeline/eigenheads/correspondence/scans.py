@@ -26,7 +26,7 @@ LANDMARK_SUFFIXES = (".json", ".pp", ".ljson")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """One head as a scanner delivers it: any vertex count, holes, its own frame; landmarks in the same frame."""
+    """Holds one head as a scanner delivers it: any vertex count, holes, its own frame; landmarks in the same frame."""
 
     name: str
     vertices: Float[np.ndarray, "V 3"]
@@ -35,7 +35,8 @@ class Scan:
 
 
 def find_scans(folder: Path) -> list[Path]:
-    """Mesh files of a folder, by name. Raises InputError where there is none, or a head would count twice."""
+    """Returns the mesh files of a folder, by name. Raises InputError where there is none, or a head would count
+    twice."""
     found = sorted(p for p in folder.glob("*") if p.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
     if not found:
         raise InputError(str(folder), ["holds no .ply, .obj or .glb scans"])
@@ -47,7 +48,7 @@ def find_scans(folder: Path) -> list[Path]:
 
 
 def read_scan(path: Path) -> Scan:
-    """A scan with its landmarks. Raises InputError."""
+    """Returns a scan with its landmarks. Raises InputError."""
     vertices, faces = welded(read_mesh(path))
     landmarks_path = landmark_file(path)
     if landmarks_path is None:
@@ -57,14 +58,14 @@ def read_scan(path: Path) -> Scan:
 
 
 def landmark_file(mesh: Path) -> Path | None:
-    """The landmarks that lie beside a mesh file, if any do."""
+    """Returns the landmarks that lie beside a mesh file, if any do."""
     beside = (mesh.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES)
     return next((path for path in beside if path.is_file()), None)
 
 
 def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Each place once, and only places that triangles use: files repeat vertices along texture seams, or for each
-    triangle, and a surface torn there has no neighbours to tell noise by."""
+    """Returns each place once, and only places that triangles use: files repeat vertices along texture seams, or for
+    each triangle, and a surface torn there has no neighbours to tell noise by."""
     _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     corners = index.ravel()[mesh.faces]
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
@@ -73,7 +74,7 @@ def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]
 
 
 def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Landmarks by our names; other points of the file are left out. Raises InputError."""
+    """Returns landmarks by our names; other points of the file are left out. Raises InputError."""
     readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
     try:
         named = readers[path.suffix.lower()](path.read_text(encoding="utf-8-sig"))
@@ -93,13 +94,13 @@ def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
 
 
 def write_landmarks(path: Path, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> None:
-    """The ``.json`` form."""
+    """Writes the ``.json`` form."""
     points = {name: [round(float(x), 4) for x in point] for name, point in landmarks.items()}
     path.write_text(json.dumps({"format": "eigenhead-landmarks/1", "points": points}, indent=1), encoding="utf-8")
 
 
 def plain_name(name: str) -> str:
-    """Lower case with underscores."""
+    """Returns the name in lower case with underscores."""
     return "_".join(name.strip().lower().replace("-", " ").replace("_", " ").split())
 
 

@@ -19,7 +19,7 @@ _STEP_MM = 5e-3  # a mean move smaller than this ends the iteration
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceFit:
-    """A model's best likeness of a surface."""
+    """Holds a model's best likeness of a surface."""
 
     coefficients: Float[np.ndarray, " m"]  # standard deviations
     target_from_head: RigidTransform
@@ -27,11 +27,11 @@ class SurfaceFit:
     iterations: int
 
     def vertices(self, model: HeadModel, level: str = "full") -> Float[np.ndarray, "V 3"]:
-        """The fitted head in the target's frame."""
+        """Returns the fitted head in the target's frame."""
         return self.target_from_head.apply(model.vertices(self.coefficients, level))
 
     def measured(self, model: HeadModel, points: Float[np.ndarray, "N 3"], level: str = "full") -> "SurfaceFit":
-        """The same fit with the distances of other points."""
+        """Returns the same fit with the distances of other points."""
         index = SurfaceIndex(self.vertices(model, level), model.levels[level].faces)
         return replace(self, distances=index.closest(points).distances)
 
@@ -48,7 +48,7 @@ def fit_surface(
     level: str = "full",
     iterations: int = 40,
 ) -> SurfaceFit:
-    """Pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
+    """Returns the pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
 
     ``weights`` are the areas the points stand for (mm²). Residuals of neighbouring points are not independent: one of
     standard deviation ``sigma_mm`` is counted per ``spread_mm`` squared of surface. The first iterations fit the pose
@@ -65,7 +65,7 @@ def fit_surface(
         scale = max(3.0 * float(np.median(hits.distances)), 3.0 * sigma_mm) if step < 12 else np.inf
         robust = (1 + (hits.distances / scale) ** 2) ** -2
         moved, z, pose = _gauss_newton_step(
-            basis[: min(active, count)], faces, hits, points, information * robust, z, pose
+            basis[: min(active, count)], faces, hits, points, information * robust, z=z, pose=pose
         )
         used = step + 1
         if step > 12 and moved < _STEP_MM:
@@ -90,6 +90,7 @@ def _gauss_newton_step(
     hits: Hits,
     points: Float[np.ndarray, "N 3"],
     information: Float[np.ndarray, " N"],
+    *,
     z: Float[np.ndarray, " M"],
     pose: RigidTransform,
 ) -> tuple[float, Float[np.ndarray, " M"], RigidTransform]:

@@ -20,7 +20,7 @@ _STEEPEST = 4.0  # ... unless the grid is coarse: 4 mm apart, the side of a nose
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scanner:
-    """One scanner's habits. Lengths in mm."""
+    """Holds one scanner's habits. Lengths in mm."""
 
     spacing_mm: float = 1.0
     noise_mm: float = 0.1
@@ -40,7 +40,7 @@ def scan_head(
     scanner: Scanner,
     rng: np.random.Generator,
 ) -> Scan:
-    """A raw scan of a head (head frame, mm), in the scanner's own frame: turned and shifted a little."""
+    """Returns a raw scan of a head (head frame, mm), in the scanner's own frame: turned and shifted a little."""
     angles, heights = _grid(vertices, scanner, rng)
     columns, rows = np.meshgrid(angles, heights)
     cast = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())

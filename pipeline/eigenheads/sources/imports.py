@@ -64,8 +64,8 @@ _BASEL_NAMES = {
 
 
 def import_model(path: Path, *, name: str | None = None, report: Progress | None = None) -> ModelParts:
-    """Read a foreign model and make it one of ours (or a model file of ours, renamed). Of a folder that holds one model
-    file, that file. Raises CannotImport."""
+    """Reads a foreign model and makes it one of ours (or a model file of ours, renamed). Of a folder that holds one
+    model file, that file. Raises CannotImport."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
     files = [f for f in files if not f.name.endswith(ICT_EXPRESSIONS)]  # read with the identities beside it
     path = files[0] if len(files) == 1 else path
@@ -86,7 +86,7 @@ def import_model(path: Path, *, name: str | None = None, report: Progress | None
 
 
 def read_ict_compact(path: Path) -> Foreign:
-    """The one-file copy of ICT-FaceKit Light: mean, modes, faces, landmarks68, in mm. Raises CannotImport."""
+    """Returns the one-file copy of ICT-FaceKit Light: mean, modes, faces, landmarks68, in mm. Raises CannotImport."""
     with np.load(path, allow_pickle=False) as file:
         mean, modes, faces = (file[key] for key in ("mean", "modes", "faces"))
         points = file["landmarks68"]
@@ -106,7 +106,8 @@ def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
 
 
 def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Foreign:
-    """ICT-FaceKit as its repository lays it out: generic_neutral_mesh.obj and identity000.obj ... (centimetres)."""
+    """Returns ICT-FaceKit as its repository lays it out: generic_neutral_mesh.obj and identity000.obj ...
+    (centimetres)."""
     inside = next((f for f in (folder, folder / "FaceXModel") if (f / "generic_neutral_mesh.obj").is_file()), None)
     if inside is None:
         raise CannotImport(folder, "it has no FaceXModel/generic_neutral_mesh.obj")
@@ -159,7 +160,7 @@ def _ict(mean: np.ndarray, modes: np.ndarray, faces: np.ndarray, points: np.ndar
 
 
 def read_statismo(path: Path) -> Foreign:
-    """A statismo file (also Basel Face Model 2017 and 2019): shape/model/{mean, pcaBasis, pcaVariance}, mm.
+    """Returns a statismo file (also Basel Face Model 2017 and 2019): shape/model/{mean, pcaBasis, pcaVariance}, mm.
 
     Basel models look along +z with y up, as our head frame does. Landmarks are read from metadata/landmarks/json.
     """
@@ -200,7 +201,8 @@ def _basel_landmarks(listed: list[dict], mean: Float[np.ndarray, "V 3"]) -> dict
 
 
 def read_plain(path: Path) -> Foreign:
-    """npz with mean (V, 3), modes (M, V, 3) per standard deviation, faces (F, 3), mm; docs/models.md has the rest.
+    """Returns npz with mean (V, 3), modes (M, V, 3) per standard deviation, faces (F, 3), mm; docs/models.md has the
+    rest.
 
     Optional: sigma (M,) multiplies unit modes; landmark_names and landmark_vertices; name, licence, source, notice;
     subjects (total, male, female).
@@ -239,7 +241,8 @@ def _check_plain(path: Path, mean: np.ndarray, modes: np.ndarray, faces: np.ndar
 
 
 def adopt(foreign: Foreign, *, report: Progress | None = None) -> ModelParts:
-    """Orthogonal modes, all 26 landmarks, head frame, face region, closed openings, levels. Raises CannotImport."""
+    """Returns orthogonal modes, all 26 landmarks, head frame, face region, closed openings, levels. Raises
+    CannotImport."""
     say = report or (lambda stage, fraction: None)
     extent = float(np.ptp(foreign.mean, axis=0).max())
     if not 100 < extent < 600:
@@ -274,7 +277,8 @@ def largest_miss(
     *,
     draws: int = 10,
 ) -> float:
-    """The largest distance (mm) by which ours misses a vertex of random draws of the original, after the best fit."""
+    """Returns the largest distance (mm) by which ours misses a vertex of random draws of the original, after the best
+    fit."""
     theirs, ours = (m.reshape(len(m), -1).astype(float) for m in (original, rounded(modes)))
     heads = np.random.default_rng(11).standard_normal((draws, len(theirs))) @ theirs
     missed = heads - (heads @ ours.T / sigma**2) @ ours
@@ -284,7 +288,7 @@ def largest_miss(
 def close_openings(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], largest_mm: float = 90.0
 ) -> Int[np.ndarray, "G 3"]:
-    """Faces with every opening up to ``largest_mm`` closed by a strip, the widest one (the neck) never."""
+    """Returns faces with every opening up to ``largest_mm`` closed by a strip, the widest one (the neck) never."""
     loops = boundary_loops(faces)
     if not loops:
         return faces
@@ -300,7 +304,8 @@ def close_openings(
 def complete_landmarks(
     mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], known: Mapping[str, int]
 ) -> dict[str, int]:
-    """All 26 landmarks: the known ones, the others from the default model fitted and warped onto this mean head."""
+    """Returns all 26 landmarks: the known ones, the others from the default model fitted and warped onto this mean
+    head."""
     if set(known) >= set(NAMES):
         return {name: int(known[name]) for name in NAMES}
     default = load_model()

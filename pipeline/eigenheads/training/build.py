@@ -26,7 +26,7 @@ _SHARPENINGS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Built:
-    """A model made of scans, and what became of each of them."""
+    """Holds a model made of scans, and what became of each of them."""
 
     parts: ModelParts
     used: tuple[str, ...]
@@ -44,7 +44,7 @@ def build_model(
     matching: Matching | None = None,
     report: Progress | None = None,
 ) -> Built:
-    """Build a model from the scans of a folder and save it as ``out``.
+    """Builds a model from the scans of a folder and saves it as ``out``.
 
     Every scan is checked before any work is done. ``on_bad="stop"`` raises InputError naming all bad scans,
     ``"skip"`` leaves them out. Raises InputError too where fewer than 3 sound scans remain.
@@ -77,7 +77,8 @@ def build_model(
 def read_checked(
     folder: Path, template: HeadModel, *, report: Progress | None = None
 ) -> tuple[list[Checked], dict[str, str]]:
-    """The sound scans of a folder, and what is wrong with the others by name. Raises InputError for an empty folder."""
+    """Returns the sound scans of a folder, and what is wrong with the others by name. Raises InputError for an empty
+    folder."""
     paths = find_scans(folder)
     with workers(2, len(paths)) as crew:
         found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)

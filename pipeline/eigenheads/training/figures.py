@@ -42,7 +42,7 @@ _BEHIND_RAD = 2.4
 
 
 def show_model(model: HeadModel, folder: Path, *, modes: int = 5, report: Progress | None = None) -> list[Path]:
-    """Write modes.png, correspondence.png and curves.png (the last where training heads are known) into a folder."""
+    """Writes modes.png, correspondence.png and curves.png (the last where training heads are known) into a folder."""
     say = report or (lambda stage, fraction: None)
     say("drawing modes", 0.0)
     pictures = {"modes.png": modes_figure(model, modes)}
@@ -63,7 +63,7 @@ def shaded(
     marked: Bool[np.ndarray, " V"] | None = None,
     azimuth_rad: float = 0.45,
 ) -> Image:
-    """One head (head frame, mm) lit from the upper left; ``marked`` vertices are red."""
+    """Returns one head (head frame, mm) lit from the upper left; ``marked`` vertices are red."""
     turn = np.array([np.sin(azimuth_rad), 0.0, np.cos(azimuth_rad)])
     width, height = 2 * PANEL[0], 2 * PANEL[1]
     focal = height * _DISTANCE_MM / _FIELD_MM
@@ -79,7 +79,7 @@ def shaded(
 
 
 def modes_figure(model: HeadModel, modes: int = 5) -> Image:
-    """Figure 2: a row per mode, at -3, 0 and +3 standard deviations."""
+    """Draws figure 2: a row per mode, at -3, 0 and +3 standard deviations."""
     faces = model.levels["full"].faces
     rows = []
     for k in range(min(modes, len(model.modes))):
@@ -93,7 +93,7 @@ def modes_figure(model: HeadModel, modes: int = 5) -> Image:
 
 
 def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
-    """Figure 3: reference, target scan, warped reference, resampled head with its voids in red.
+    """Draws figure 3: reference, target scan, warped reference, resampled head with its voids in red.
 
     Seen from the front and from behind. The two heads are drawn from the model and scanned by the simulated scanner,
     holes and all.
@@ -125,7 +125,7 @@ def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
 
 
 def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
-    """Compactness, generalisation (leave one out) and specificity over the number of modes."""
+    """Returns compactness, generalisation (leave one out) and specificity over the number of modes."""
     counts = [
         c for c in (1, 2, 5, 10, 20, 40, USED_MODES, 100, 137) if c <= min(len(model.modes), len(model.scores) - 1)
     ]
@@ -146,7 +146,7 @@ def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
 
 
 def chart(title: str, values: Mapping[int, float], colour: tuple[int, int, int]) -> Image:
-    """A line over the number of modes, from zero up, with its axes."""
+    """Returns a line over the number of modes, from zero up, with its axes."""
     width, height, left, bottom, top = 420, 320, 55, 275, 40
     canvas = np.full((height, width, 3), PAPER, np.uint8)
     most, highest = max(values), max(values.values())

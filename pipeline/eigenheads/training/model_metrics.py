@@ -15,7 +15,7 @@ from rig.progress import Progress
 
 
 def compactness(sigma: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """Share of the total variance in the first m modes."""
+    """Returns the share of the total variance in the first m modes."""
     return np.cumsum(sigma.astype(float) ** 2) / np.sum(sigma.astype(float) ** 2)
 
 
@@ -26,7 +26,8 @@ def generalisation(
     *,
     report: Progress | None = None,
 ) -> dict[int, float]:
-    """Leave one out: mean vertex distance (mm, over ``region``) of each head to its best likeness in the others' PCA.
+    """Computes, leaving one out, the mean vertex distance (mm, over ``region``) of each head to its best likeness in
+    the others' PCA.
 
     Rotating into the components' own axes is exact for the training heads, so each PCA is one of N - 1 points in
     N - 1 dimensions and not in 3 V.
@@ -58,7 +59,8 @@ def specificity(
     draws: int = 200,
     seed: int = 0,
 ) -> float:
-    """Mean over random draws of the vertex distance (mm, over ``region``) to the nearest of the given heads."""
+    """Returns the mean over random draws of the vertex distance (mm, over ``region``) to the nearest of the given
+    heads."""
     rng = np.random.default_rng(seed)
     known = heads[:, region].astype(np.float32)
     total = 0.0
@@ -71,7 +73,8 @@ def specificity(
 def of_draws(
     model: HeadModel, *, heads: int = 138, used: int = 60, draws: int = 200, seed: int = 0
 ) -> dict[str, float]:
-    """Generalisation and specificity (mm) where a model's own Gaussian is the population: ``heads`` draws of it.
+    """Returns generalisation and specificity (mm) where a model's own Gaussian is the population: ``heads`` draws of
+    it.
 
     For models whose subjects are not published, and beside them for others: a Gaussian has no outliers and fills all
     its modes, so these are not the figures of real subjects.
@@ -90,6 +93,6 @@ def of_draws(
 
 
 def components_of(mean: np.ndarray, modes: np.ndarray, scores: np.ndarray) -> Components:
-    """A model's components in double precision."""
+    """Returns a model's components in double precision."""
     sigma = np.linalg.norm(modes.reshape(len(modes), -1).astype(float), axis=1)
     return Components(mean.astype(float), modes.astype(float), sigma, scores.astype(float))

@@ -20,7 +20,7 @@ USED_MODES = 60  # section 4.4
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Training:
-    """Corresponded heads (mm, any common pose, y up, z to the front) with what a model carries besides shape."""
+    """Holds corresponded heads (mm, any common pose, y up, z to the front) with what a model carries besides shape."""
 
     name: str
     licence: str
@@ -34,7 +34,7 @@ class Training:
 
 
 def train(training: Training, *, report: Progress | None = None) -> ModelParts:
-    """Rigid Procrustes (no scale), PCA, levels, generalisation and specificity. Raises NotAManifold."""
+    """Returns rigid Procrustes (no scale), PCA, levels, generalisation and specificity. Raises NotAManifold."""
     say = report or (lambda stage, fraction: None)
     check_manifold(training.faces)
     say("aligning", 0.0)
@@ -61,7 +61,7 @@ def finish(
     *,
     report: Progress | None = None,
 ) -> ModelParts:
-    """The parts of a model from its components: decimated levels are chosen on the mean head."""
+    """Returns the parts of a model from its components: decimated levels are chosen on the mean head."""
     say = report or (lambda stage, fraction: None)
     say("decimating", 0.0)
     decimated = levels_of(components.mean, training.faces, region, training.landmarks, training.subdivisions)
@@ -113,25 +113,27 @@ def levels_of(
 
 
 def in_head_frame(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, "N V 3"]:
-    """Every head moved (not turned) so that its mean tragion is the origin: inside the head, between the ears."""
+    """Returns every head moved (not turned) so that its mean tragion is the origin: inside the head, between the
+    ears."""
     ears = heads[:, [landmarks["tragion_right"], landmarks["tragion_left"]]].mean(1)
     return heads - ears[:, None]
 
 
 def centred(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, "N V 3"]:
-    """All heads moved together so that the mean head's ears lie level with the origin between them."""
+    """Returns all heads moved together so that the mean head's ears lie level with the origin between them."""
     return heads - heads.mean(0)[[landmarks["tragion_right"], landmarks["tragion_left"]]].mean(0)
 
 
 def above_neck(head: Float[np.ndarray, "V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, " V"]:
-    """Weight 1 above a plane from chin to nape, 0 below: how a neck is held must not turn the head."""
+    """Returns the weight 1 above a plane from chin to nape, 0 below: how a neck is held must not turn the head."""
     chin = head[landmarks["gnathion"]]
     slope = 0.35  # the line from under the chin to the nape rises towards the back
     return (head[:, 1] > chin[1] - 3 + slope * (chin[2] - head[:, 2])).astype(float)
 
 
 def face_region(mean: Float[np.ndarray, "V 3"], landmarks: Mapping[str, int]) -> Bool[np.ndarray, " V"]:
-    """Ear to ear, lower forehead to under the chin: in front of the ears, above the jaw line, below the hair."""
+    """Marks the face from ear to ear, lower forehead to under the chin: in front of the ears, above the jaw line, below
+    the hair."""
     at = {name: mean[index] for name, index in landmarks.items()}
     eye = (at["exocanthion_right"] + at["exocanthion_left"]) / 2
     jaw = (at["gonion_right"] + at["gonion_left"]) / 2

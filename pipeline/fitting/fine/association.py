@@ -18,7 +18,7 @@ CANDIDATES = 4  # vertices whose triangles are tried
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Associated:
-    """n points and their places on the head."""
+    """Holds n points and their places on the head."""
 
     row: Int[np.ndarray, " n"]  # of the points asked for
     triangle: Int[np.ndarray, " n"]
@@ -29,7 +29,7 @@ class Associated:
 def faces_at_vertices(
     faces: Int[np.ndarray, "f 3"], count: int
 ) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
-    """Where each vertex's faces begin, and the faces, vertex by vertex."""
+    """Returns where each vertex's faces begin, and the faces, vertex by vertex."""
     corner = np.argsort(faces.ravel(), kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
     return start.astype(np.int64), (corner // 3).astype(np.int64)
@@ -37,7 +37,7 @@ def faces_at_vertices(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """A head that points are asked for a place on, with what finds it."""
+    """Holds a head that points are asked for a place on, with what finds it."""
 
     head: FannedMesh
     tree: KDTree
@@ -47,7 +47,7 @@ class Target:
     def of(
         cls, vertices: Float[np.ndarray, "v 3"], vertex_normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
     ) -> "Target":
-        """Of a mesh (mm) with its unit vertex normals."""
+        """Builds it of a mesh (mm) with its unit vertex normals."""
         sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
         head = FannedMesh(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
         return cls(head, KDTree(vertices), float(np.max(sides, initial=0.0)))
@@ -60,7 +60,7 @@ class Target:
         reach_mm: float,
         least_agreement: float,
     ) -> Associated:
-        """The closest place on the head of every point that has one within reach.
+        """Returns the closest place on the head of every point that has one within reach.
 
         Args:
             points: of the dense surface, mm, in the head's frame.
@@ -96,11 +96,11 @@ def associate(
     reach_mm: float,
     least_agreement: float,
 ) -> Associated:
-    """``Target.closest`` of a head that is asked once; all in one frame, mm."""
+    """Returns ``Target.closest`` of a head that is asked once; all in one frame, mm."""
     target = Target.of(vertices, vertex_normals, faces)
     return target.closest(points, normals, reach_mm=reach_mm, least_agreement=least_agreement)
 
 
 def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Values at n places of triangles, from those at their corners."""
+    """Returns values at n places of triangles, from those at their corners."""
     return np.einsum("nk,nkc->nc", blend, corners)

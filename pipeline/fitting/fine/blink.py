@@ -34,7 +34,7 @@ OPEN = (
 
 
 def blinks_of(model: HeadModel) -> dict[str, int]:
-    """The coefficient that closes each eye (``right``, ``left``), where the model's modes have one."""
+    """Returns the coefficient that closes each eye (``right``, ``left``), where the model's modes have one."""
     found: dict[str, int] = {}
     for name, place in zip(model.expressions.names, model.posed, strict=False):
         if plain_name(name) in BLINKS:
@@ -49,8 +49,8 @@ def estimate_eyelid_closure(
     surface: SurfacePoints,
     eyes: Mapping[str, EyeEvidence],
 ) -> tuple[dict[str, float], frozenset[str]]:
-    """How far each eye is closed, 0 to 1, of those that the model can close, and the eyes that show nothing though no
-    blink of the model's lies nearer to the points: their lids are to be bridged.
+    """Tells how far each eye is closed, 0 to 1, of those that the model can close, and the eyes that show nothing
+    though no blink of the model's lies nearer to the points: their lids are to be bridged.
 
     Args:
         fit: of the photographs.
@@ -74,7 +74,7 @@ def estimate_eyelid_closure(
 
 
 def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
-    """What closes the fit's eyes that far, full level, world, mm."""
+    """Returns what closes the fit's eyes that far, full level, world, mm."""
     shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
     for side, share in lids.items():
         if (more := share - float(fit.coefficients[places[side]])) != 0.0:
@@ -89,7 +89,7 @@ def _moved(fit: Fit, model: HeadModel, place: int) -> Float[np.ndarray, "v 3"]:
 
 
 def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
-    """The fit with its eyes that far closed."""
+    """Returns the fit with its eyes that far closed."""
     coefficients, places = fit.coefficients.copy(), blinks_of(model)
     for side, share in lids.items():
         coefficients[places[side]] = share
@@ -97,7 +97,7 @@ def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
 
 
 def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray, "v 3"]:
-    """The fitted head (full level, world) as eigenheads and expressions alone have it."""
+    """Returns the fitted head (full level, world) as eigenheads and expressions alone have it."""
     plain = fit.coefficients.copy()
     plain[np.setdiff1d(np.arange(eigenheads, len(plain)), model.posed)] = 0.0
     return fit.world_from_head.apply(model.vertices(plain))

@@ -25,7 +25,8 @@ TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage com
 def dense_points(
     depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh, settings: FineSettings
 ) -> SurfacePoints:
-    """Every place that enough views agree on, as a point with its part; at most one for each side of a small cell.
+    """Returns every place that enough views agree on, as a point with its part; at most one for each side of a small
+    cell.
 
     Args:
         depth_maps: one a view.

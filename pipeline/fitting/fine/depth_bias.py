@@ -24,8 +24,8 @@ MOST_MM, SHARE_MOST = 0.3, 2.0  # of the common offset, and of the share: beyond
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnFace:
-    """Points of skin and the places of the fitted face that they show: how far (mm, along the ``normal`` there) they
-    lie off it, and how far its windowed mean does."""
+    """Holds points of skin and the places of the fitted face that they show: how far (mm, along the ``normal`` there)
+    they lie off it, and how far its windowed mean does."""
 
     row: Int[np.ndarray, " n"]  # of the points
     normal: Float[np.ndarray, "n 3"]
@@ -34,7 +34,7 @@ class OnFace:
 
 
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
-    """The points of skin near the fitted head's ``face`` (mm, world frame)."""
+    """Returns the points of skin near the fitted head's ``face`` (mm, world frame)."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
     skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
@@ -49,7 +49,8 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
 
 
 def measure_bias(seen: OnFace) -> WindowBias:
-    """The robust line of what points and fit differ by, over the windowed height; none where too few points tell."""
+    """Returns the robust line of what points and fit differ by, over the windowed height; none where too few points
+    tell."""
     if len(seen.row) < LEAST_POINTS:
         return WindowBias()
     columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)
@@ -61,8 +62,8 @@ def measure_bias(seen: OnFace) -> WindowBias:
 
 
 def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
-    """The points where they would be without the windows: off the face, whose shape alone is known so well, by what all
-    err alike."""
+    """Returns the points where they would be without the windows: off the face, whose shape alone is known so well, by
+    what all err alike."""
     points = surface.points - bias.common_mm * surface.normals
     points[seen.row] = (
         surface.points[seen.row] - (bias.common_mm + bias.share * seen.windowed_mm)[:, None] * seen.normal

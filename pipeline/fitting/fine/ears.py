@@ -32,7 +32,8 @@ AGREEMENT = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """A similarity about the middle of an ear, with its robust cost (per point) and how many points it puts on it."""
+    """Holds a similarity about the middle of an ear, with its robust cost (per point) and how many points it puts on
+    it."""
 
     cost: float
     scale: float
@@ -44,7 +45,7 @@ class Motion:
 def with_ears_in_place(
     vertices: Float[np.ndarray, "v 3"], model: HeadModel, surface: SurfacePoints
 ) -> Float[np.ndarray, "v 3"]:
-    """The head with each ear where the skin's points say, if enough of them do.
+    """Returns the head with each ear where the skin's points say, if enough of them do.
 
     Args:
         vertices: full level, world frame, mm.

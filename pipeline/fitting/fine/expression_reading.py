@@ -45,7 +45,7 @@ FIRST = 0.1  # weight at which the prior's tangent is taken first
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingBasis:
-    """What may move the places: E expressions behind the other modes, mm, head frame."""
+    """Holds what may move the places: E expressions behind the other modes, mm, head frame."""
 
     vertex: Int[np.ndarray, " n"]  # of the full level
     mean: Float[np.ndarray, "n 3"]
@@ -56,7 +56,7 @@ class ReadingBasis:
 
 @lru_cache(maxsize=1)  # 10 MB; studios work with one model
 def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> ReadingBasis:
-    """All eigenheads of ``population``, the smooth modes of ``model`` (of the fit) and the expressions."""
+    """Returns all eigenheads of ``population``, the smooth modes of ``model`` (of the fit) and the expressions."""
     full = population.levels["full"]
     inputs = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
 
@@ -83,7 +83,7 @@ def with_read_expression(
     eigenheads: int,
     median: float,
 ) -> Fit:
-    """The fit with the weights that the displaced head tells, and their deviations; all else as it was.
+    """Returns the fit with the weights that the displaced head tells, and their deviations; all else as it was.
 
     Args:
         fit: of the photographs.

@@ -38,8 +38,8 @@ MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.07, 0.1  # of lids that are half closed
 
 @dataclass(frozen=True, slots=True)
 class EyeEvidence:
-    """What the photographs show between the lids: shares of the opening, 0 to 1; and how far the lids stand apart where
-    a face was found (``faces.eyes.eye_openings``)."""
+    """Holds what the photographs show between the lids: shares of the opening, 0 to 1; and how far the lids stand apart
+    where a face was found (``faces.eyes.eye_openings``)."""
 
     white: float
     dark: float
@@ -48,24 +48,25 @@ class EyeEvidence:
 
     @property
     def is_surely_closed(self) -> bool:
-        """Whether the lids lie nearer to each other than any half closed ones."""
+        """Tells whether the lids lie nearer to each other than any half closed ones."""
         return self.opening is not None and self.opening < MIN_HALF_OPENING
 
     @property
     def is_surely_open(self) -> bool:
-        """Whether the lids stand farther apart than any closed ones."""
+        """Tells whether the lids stand farther apart than any closed ones."""
         return self.opening is not None and self.opening > MAX_CLOSED_OPENING
 
     @property
     def closed(self) -> bool:
-        """Skin, and nothing else, between lids that do not surely stand apart; or lids that surely meet."""
+        """Tells whether there is skin, and nothing else, between lids that do not surely stand apart; or lids that
+        surely meet."""
         nothing = self.views > 0 and self.white < WHITE_SHARE and self.dark < DARK_SHARE
         return self.is_surely_closed or (nothing and not self.is_surely_open)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fissure:
-    """The slit between the lids on the mean head: its middle, its length, and every vertex's place about it."""
+    """Holds the slit between the lids on the mean head: its middle, its length, and every vertex's place about it."""
 
     length_mm: float
     along: Float[np.ndarray, " v"]  # mm from the middle, towards the corners
@@ -73,13 +74,13 @@ class Fissure:
     front: Bool[np.ndarray, " v"]
 
     def ellipse(self, half_length: float, half_height: float, below: float = 0.0) -> Bool[np.ndarray, " v"]:
-        """Vertices inside an ellipse about the middle, or ``below`` it (mm)."""
+        """Returns vertices inside an ellipse about the middle, or ``below`` it (mm)."""
         inside = (self.along / half_length) ** 2 + ((self.above + below) / half_height) ** 2 < 1.0
         return self.front & inside
 
 
 def eye_fissure(model: HeadModel, side: str) -> Fissure:
-    """Of the ``right`` or ``left`` eye."""
+    """Returns the fissure of the ``right`` or ``left`` eye."""
     mean = model.vertices(np.zeros(0))
     outer, inner = (mean[model.landmarks[f"{corner}canthion_{side}"]] for corner in ("exo", "endo"))
     chord = inner - outer
@@ -97,7 +98,7 @@ def measure_eye_appearance(
     rig: Rig,
     openings: Mapping[str, float],
 ) -> dict[str, EyeEvidence]:
-    """What shows between the lids of each eye (``right``, ``left``).
+    """Returns what shows between the lids of each eye (``right``, ``left``).
 
     Args:
         model: the topology.
@@ -176,7 +177,7 @@ def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
 def with_plain_lids(
     vertices: Float[np.ndarray, "v 3"], shape: Float[np.ndarray, "v 3"], model: HeadModel
 ) -> Float[np.ndarray, "v 3"]:
-    """The head with the lids that ``shape`` has, moved as smoothly as their surroundings are.
+    """Returns the head with the lids that ``shape`` has, moved as smoothly as their surroundings are.
 
     Displacements along the normals tear lids apart: their margins' normals point at each other.
 
@@ -195,7 +196,7 @@ def with_plain_lids(
 def bridge_eyelids(
     vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]
 ) -> Float[np.ndarray, "v 3"]:
-    """The head with the lids of the named eyes closed.
+    """Returns the head with the lids of the named eyes closed.
 
     Args:
         vertices: full level, any frame, mm.

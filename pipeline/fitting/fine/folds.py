@@ -15,7 +15,7 @@ GIVING_WAY = 0.8  # what a sweep leaves of a displacement, in the second half of
 def folded(
     before: Float[np.ndarray, "v 3"], after: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " f"]:
-    """Triangles that a displacement turns over or squeezes to nothing."""
+    """Returns triangles that a displacement turns over or squeezes to nothing."""
     old, new = face_normals(before, faces), face_normals(after, faces)
     size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
     return ((old * new).sum(axis=1) <= MOST_TURN * size * length) | (length < LEAST_AREA * size)
@@ -24,7 +24,7 @@ def folded(
 def unfolded(
     before: Float[np.ndarray, "v 3"], after: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
-    """``after`` without folds: about each, the displacement is smoothed until there is none.
+    """Returns ``after`` without folds: about each, the displacement is smoothed until there is none.
 
     Where smoothing does not help (two displacements that meet), the place goes back towards ``before``.
     """

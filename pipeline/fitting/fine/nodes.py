@@ -22,7 +22,7 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeMesh:
-    """Control points of a displacement: ``full = operator @ nodes``."""
+    """Holds control points of a displacement: ``full = operator @ nodes``."""
 
     faces: Int[np.ndarray, "f 3"]
     operator: sparse.csr_array  # (v, n)
@@ -31,7 +31,7 @@ class NodeMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nodes:
-    """The two meshes."""
+    """Holds the two meshes."""
 
     coarse: NodeMesh
     fine: NodeMesh
@@ -39,7 +39,7 @@ class Nodes:
 
 @lru_cache(maxsize=2)  # models are few, jobs are many
 def solving_nodes(model: HeadModel) -> Nodes:
-    """Both meshes of a model."""
+    """Returns both meshes of a model."""
     full, cage = model.levels["full"], model.levels["cage"]
     if full.count == cage.count:
         full_nodes = node_mesh(full.faces, sparse.csr_array(sparse.identity(full.count, format="csr")))
@@ -53,7 +53,7 @@ def solving_nodes(model: HeadModel) -> Nodes:
 
 
 def node_mesh(faces: Int[np.ndarray, "f 3"], operator: sparse.csr_array) -> NodeMesh:
-    """The control mesh of a subdivision, which keeps old vertices first: node i is laid out by vertex i."""
+    """Returns the control mesh of a subdivision, which keeps old vertices first: node i is laid out by vertex i."""
     total, count = row_count(operator), row_count(sparse.csr_array(operator.T))
     shape = sparse.csr_array((np.ones(count), (np.arange(count), np.arange(count))), shape=(count, total))
     return NodeMesh(faces, sparse.csr_array(operator), shape)

@@ -34,7 +34,7 @@ SEARCH = Round(window_mm=1.2, blur_mm=0.3, reach_mm=0.8, steps=9)  # 1.6 and 2 m
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchPlaces:
-    """n vertices of the full level, and how far along their normals the photographs see the surface."""
+    """Holds n vertices of the full level, and how far along their normals the photographs see the surface."""
 
     vertex: Int[np.ndarray, " n"]
     place_mm: Float[np.ndarray, " n"]
@@ -43,7 +43,7 @@ class PatchPlaces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchSearch:
-    """The photographs, the cameras where the fit has them, and the patches of a model."""
+    """Holds the photographs, the cameras where the fit has them, and the patches of a model."""
 
     model: HeadModel
     patches: Patches
@@ -54,13 +54,15 @@ class PatchSearch:
     settings: PhotoSettings
 
     def places(self, vertices: Float[np.ndarray, "v 3"]) -> PatchPlaces:
-        """What the photographs say of a head (world, mm)."""
+        """Returns what the photographs say of a head (world, mm)."""
         level, coarse = self.model.levels["full"], self.model.levels[DEPTH_LEVEL]
         head, hiding = Mesh(vertices, level.faces), Mesh(vertices[coarse.rows], coarse.faces)
         speaks = self.photographs.speaks
-        seen_by = visibility_of(head, hiding, self.cameras, self.views, self.patches, speaks, self.settings)
+        seen_by = visibility_of(head, hiding, self.cameras, self.views, self.patches, speaks, settings=self.settings)
         scale = pixels_per_mm(self.cameras, vertices.mean(axis=0))
-        found = find_places(self.photographs, self.patches, seen_by, self.views, scale, SEARCH, self.settings)
+        found = find_places(
+            self.photographs, self.patches, seen_by, self.views, scale, each=SEARCH, settings=self.settings
+        )
         centres = self.model.vertices(np.zeros(0))[self.patches.centre]
         hidden = under_hair(self.patches, self.hair, self.views.names, seen_by.pixel, seen_by.facing > 0, centres)
         kept = np.flatnonzero(found.several & found.clear & ~hidden)
@@ -76,9 +78,10 @@ def patch_search(
     distances: Mapping[str, Float32[np.ndarray, "h w"]],
     hair: HairProbability,
     rig: Rig,
+    *,
     settings: PhotoSettings,
 ) -> PatchSearch:
-    """Patches of ``model`` in the photographs of the views that the fit has.
+    """Returns patches of ``model`` in the photographs of the views that the fit has.
 
     Args:
         model: whose full level the patches lie on.

@@ -47,7 +47,7 @@ SEED = 16
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One association and one solution. ``agreement``: least cosine between a point's normal and the head's."""
+    """Holds one association and one solution. ``agreement``: least cosine between a point's normal and the head's."""
 
     reach_mm: float
     loose_reach_mm: float
@@ -63,7 +63,7 @@ PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeformedSurface:
-    """The head in the world frame, mm, and what is known of it."""
+    """Holds the head in the world frame, mm, and what is known of it."""
 
     vertices: Float[np.ndarray, "v 3"]
     deviation_mm: Float[np.ndarray, " v"]  # along the normal
@@ -84,7 +84,7 @@ def refine_to_surface(
     patches: PatchSearch | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
-    """A fit's head drawn to the dense surface.
+    """Returns a fit's head drawn to the dense surface.
 
     Args:
         fit: with its posterior.
@@ -142,7 +142,7 @@ def deform_to_points(
     look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
-    """A surface displaced to points of another, as far as those speak.
+    """Returns a surface displaced to points of another, as far as those speak.
 
     Args:
         vertices: of the surface, mm.
@@ -167,14 +167,16 @@ def deform_to_points(
     directions = free_directions(nodes.coarse, nodes.coarse.shape @ amplitude)
     for i, each in enumerate(COARSE):
         report("fine", i / (len(COARSE) + 1))
-        observed, _ = observe(vertices, now, faces, few, loose, each, settings, settings.coarse_floor_mm)
+        observed, _ = observe(
+            vertices, now, faces, few, loose, each=each, settings=settings, floor_mm=settings.coarse_floor_mm
+        )
         now = vertices + directions.moved(solve_field(field, directions, observed).mean)
     base = now = unfolded(vertices, now, faces)
     normals = vertex_normals(base, faces)
     field = _laid_out(nodes.fine, base, settings.length_mm)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
-    observed, seen = observe(base, now, faces, many, loose, FINE, settings, settings.floor_mm)
+    observed, seen = observe(base, now, faces, many, loose, each=FINE, settings=settings, floor_mm=settings.floor_mm)
     posterior = solve_field(field, directions, observed)
     now = base + directions.moved(posterior.mean)
     for robust_mm in LOOKS_MM:
@@ -197,11 +199,13 @@ def observe(
     faces: Int[np.ndarray, "f 3"],
     surface: SurfacePoints,
     loose: Bool[np.ndarray, " v"],
+    *,
     each: Round,
     settings: FineSettings,
     floor_mm: float,
 ) -> tuple[Observed, Bool[np.ndarray, " v"]]:
-    """What the points say of the head as it stands ``now``, as offsets from ``base``; and the vertices that skin shows.
+    """Returns what the points say of the head as it stands ``now``, as offsets from ``base``; and the vertices that
+    skin shows.
 
     A normal is half the point's, half the head's (Rusinkiewicz 2019, *A symmetric objective function for ICP*): exact
     to second order where both are curved.
@@ -243,7 +247,7 @@ def with_patches(
     faces: Int[np.ndarray, "f 3"],
     robust_mm: float,
 ) -> Observed:
-    """What patches of the head as it stands ``now`` say, and dense points where no patch is near."""
+    """Returns what patches of the head as it stands ``now`` say, and dense points where no patch is near."""
     vertex, normals = found.vertex, vertex_normals(now, faces)[found.vertex]
     if not len(vertex):
         return observed
@@ -291,8 +295,8 @@ def field_deviation(
     observed: Bool[np.ndarray, " v"],
     settings: FineSettings,
 ) -> Float[np.ndarray, " v"]:
-    """Standard deviation along the normal: from draws about what was observed, the fit's own far from it; what all
-    points may err alike stands beside the former."""
+    """Returns the standard deviation along the normal: from draws about what was observed, the fit's own far from it;
+    what all points may err alike stands beside the former."""
     draws = posterior.draws(np.random.default_rng(SEED), settings.draws)
     square = np.full(len(normals), settings.common_mm**2)
     for k in range(settings.draws):

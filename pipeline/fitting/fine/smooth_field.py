@@ -23,7 +23,7 @@ MOST_COTANGENT = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothField:
-    """Unit-variance Matern field on the v vertices of a mesh."""
+    """Holds unit-variance Matern field on the v vertices of a mesh."""
 
     operator: sparse.csr_array  # K, (v, v), symmetric
     mass: Float[np.ndarray, " v"]  # mm^2
@@ -31,23 +31,23 @@ class SmoothField:
 
     @property
     def precision_scale(self) -> float:
-        """tau^2 of unit deviation."""
+        """Returns tau^2 of unit deviation."""
         return self.length_mm**2 / (4.0 * np.pi)
 
     def draw(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "v n"]:
-        """``n`` draws with the precision as their covariance: of ``tau K M^-1/2`` times white noise."""
+        """Returns ``n`` draws with the precision as their covariance: of ``tau K M^-1/2`` times white noise."""
         noise = rng.standard_normal((len(self.mass), count)) / np.sqrt(self.mass)[:, None]
         return np.sqrt(self.precision_scale) * (self.operator @ noise)
 
     def precision(self) -> sparse.csr_array:
-        """(v, v), tau^2 K M^-1 K."""
+        """Returns (v, v), tau^2 K M^-1 K."""
         return sparse.csr_array(
             self.precision_scale * (self.operator @ sparse.diags_array(1.0 / self.mass) @ self.operator)
         )
 
 
 def smooth_field(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], length_mm: float) -> SmoothField:
-    """The field on a mesh of the given shape (mm). Cotangents are held in bounds, so that it stays definite."""
+    """Returns the field on a mesh of the given shape (mm). Cotangents are held in bounds, so that it stays definite."""
     count = len(vertices)
     stiffness, mass = sparse.csr_array((count, count)), np.zeros(count)
     corners = vertices[faces]

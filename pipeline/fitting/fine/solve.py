@@ -23,7 +23,7 @@ from pipeline.fitting.fine.smooth_field import SmoothField
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """n observations of the surface, each between the three vertices of a triangle of the full level."""
+    """Holds n observations of the surface, each between the three vertices of a triangle of the full level."""
 
     corner: Int[np.ndarray, "n 3"]
     blend: Float[np.ndarray, "n 3"]
@@ -34,18 +34,19 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
-    """How the head moves with the field: (3 v, d n), coordinates of a vertex and directions of a node side by side."""
+    """Says how the head moves with the field: (3 v, d n), coordinates of a vertex and directions of a node side by
+    side."""
 
     matrix: sparse.csr_array
     count: int  # d
 
     def moved(self, field: Float[np.ndarray, " u"]) -> Float[np.ndarray, "v 3"]:
-        """The displacement, mm."""
+        """Returns the displacement, mm."""
         return (self.matrix @ field).reshape(-1, 3)
 
 
 def free_directions(mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"]) -> Directions:
-    """Every node moves as it likes."""
+    """Lets every node move as it likes."""
     scaled = mesh.operator @ sparse.diags_array(amplitude_mm)
     return Directions(sparse.csr_array(sparse.kron(scaled, sparse.identity(3), format="csr")), 3)
 
@@ -53,7 +54,7 @@ def free_directions(mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"]) -> Di
 def normal_directions(
     mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"], normals: Float[np.ndarray, "v 3"]
 ) -> Directions:
-    """Every vertex moves along its own normal, by the blend of its nodes."""
+    """Moves every vertex along its own normal, by the blend of its nodes."""
     scaled = sparse.csr_array(mesh.operator @ sparse.diags_array(amplitude_mm))
     vertices = len(normals)
     along = sparse.csr_array(
@@ -65,7 +66,7 @@ def normal_directions(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """A Gaussian over the field's nodes: its mean, and its precision's factor."""
+    """Holds a Gaussian over the field's nodes: its mean, and its precision's factor."""
 
     mean: Float[np.ndarray, " u"]
     factor: SuperLU
@@ -82,7 +83,7 @@ class Posterior:
 
 
 def solve_field(field: SmoothField, directions: Directions, observed: Observed) -> Posterior:
-    """The field's posterior.
+    """Returns the field's posterior.
 
     Args:
         field: the unit field's prior on the nodes.

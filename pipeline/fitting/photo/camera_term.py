@@ -26,7 +26,8 @@ from rig.camera import Camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSensitivity:
-    """Of n patches: the derivative of depth with respect to camera pose, and what they say of the cameras alone."""
+    """Holds, of n patches: the derivative of depth with respect to camera pose, and what they say of the cameras
+    alone."""
 
     by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
     view: Int[np.ndarray, "n v"]
@@ -35,7 +36,7 @@ class CameraSensitivity:
     slides: Float[np.ndarray, "n a 6"]  # d(image shifts of a view) / d(its camera)
 
     def cameras(self, information: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
-        """Matrix and gradient (towards the minimum) in the cameras."""
+        """Returns the matrix and gradient (towards the minimum) in the cameras."""
         size = self.by_camera.shape[1]
         matrix, gradient = np.zeros((size, size)), np.zeros(size)
         add_cameras(self.view, self.stiff, self.slope, self.slides, information, matrix, gradient)
@@ -50,7 +51,8 @@ def camera_sensitivity(
     axes: Float[np.ndarray, "n 3"],
     cameras: tuple[Camera, ...],
 ) -> CameraSensitivity:
-    """Of patches whose surface lies at ``places`` and moves along ``axes``; ``grams``: of ``gram_matrices``."""
+    """Computes it of patches whose surface lies at ``places`` and moves along ``axes``; ``grams``: of
+    ``gram_matrices``."""
     slopes, mixed = grams
     axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes
     total = np.maximum(value.sum(axis=1), 1e-12)[:, None]
@@ -83,11 +85,12 @@ def gram_matrices(
     weights: Float[np.ndarray, " e"],
     view: Int[np.ndarray, "n v"],
     shifts: Float[np.ndarray, " n"],
+    *,
     samples: Samples,
     pictures: Pictures,
 ) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
-    """<g, g> of the slopes of a patch's views, two axes each, and <g, f> of slopes and grey values, with the surface
-    moved by ``shifts`` (mm along the normals)."""
+    """Returns <g, g> of the slopes of a patch's views, two axes each, and <g, f> of slopes and grey values, with the
+    surface moved by ``shifts`` (mm along the normals)."""
     count, views = view.shape
     slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))
     members = Members(patches.start, patches.member, weights)

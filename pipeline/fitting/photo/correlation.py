@@ -13,8 +13,8 @@ LEAST_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
 def choose_views(
     patches: Patches, weights: Float[np.ndarray, " e"], facing: Float32[np.ndarray, "k s"], least_seen: float, most: int
 ) -> tuple[Int[np.ndarray, "c n"], Float[np.ndarray, "c n"]]:
-    """The views that see a patch whole and most frontally, at most ``most``, and the squared cosine of each; -1 and 0
-    where there are fewer."""
+    """Returns the views that see a patch whole and most frontally, at most ``most``, and the squared cosine of each; -1
+    and 0 where there are fewer."""
     total = patches.sums(weights, np.ones((facing.shape[1], 1)))
     seen = patches.sums(weights, (facing > 0).T.astype(float))
     cosine = patches.sums(weights, facing.T.astype(float)) / np.maximum(seen, 1e-9)
@@ -26,7 +26,7 @@ def choose_views(
 
 
 def sweep(samples: Samples, pictures: Pictures, steps: Float[np.ndarray, " d"]) -> Float32[np.ndarray, "s k d"]:
-    """Grey values of every sample moved along its normal by ``steps`` (mm), as each camera shows it."""
+    """Returns grey values of every sample moved along its normal by ``steps`` (mm), as each camera shows it."""
     cameras, count = samples.seen.shape
     out = np.zeros((count, cameras, len(steps)), np.float32)
     in_threads(count, lambda a, b: sweep_pictures(a, b, samples, pictures, steps, out))
@@ -39,10 +39,12 @@ def correlate(
     view: Int[np.ndarray, "c n"],
     value: Float[np.ndarray, "c n"],
     seen: Bool[np.ndarray, "k s"],
+    *,
     grey: Float32[np.ndarray, "s k d"],
     noise: Float[np.ndarray, " k"],
 ) -> Float32[np.ndarray, "c d"]:
-    """Mean normalised cross-correlation over the pairs of the chosen views of each patch; 0 where there is no pair.
+    """Returns the mean normalised cross-correlation over the pairs of the chosen views of each patch; 0 where there is
+    no pair.
 
     Gain and offset of a view drop out of it. ``noise`` is the standard deviation of grey values: it stands in the norm,
     so that a patch without texture is like nothing, however alike its noise may look.

@@ -42,7 +42,7 @@ SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One pass over all patches."""
+    """Holds one pass over all patches."""
 
     window_mm: float  # standard deviation of the patch's window
     blur_mm: float  # of the images, on the head
@@ -52,7 +52,7 @@ class Round:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampleVisibility:
-    """The head as it stands, and who sees what of it."""
+    """Holds the head as it stands, and who sees what of it."""
 
     cameras: tuple[Camera, ...]  # where the state has them
     vertices: Float[np.ndarray, "v 3"]  # full level, world
@@ -71,7 +71,7 @@ def sample_visibility(
     cage = model.cage(state.coefficients)
     head = Mesh(pose.apply(model.levels["full"].operator @ cage), model.levels["full"].faces)
     coarse = Mesh(pose.apply(model.levels[DEPTH_LEVEL].operator @ cage), model.levels[DEPTH_LEVEL].faces)
-    return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks, settings)
+    return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks, settings=settings)
 
 
 def visibility_of(
@@ -81,9 +81,10 @@ def visibility_of(
     views: Views,
     patches: Patches,
     speaks: Bool[np.ndarray, " k"],
+    *,
     settings: PhotoSettings,
 ) -> SampleVisibility:
-    """Who sees what of a head; a mesh that is ``coarse`` is drawn for what hides it.
+    """Returns who sees what of a head; a mesh that is ``coarse`` is drawn for what hides it.
 
     Args:
         head_world: the patches' mesh, mm.
@@ -118,7 +119,7 @@ def visibility_of(
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
-    """The cameras where the state has them."""
+    """Returns the cameras where the state has them."""
     views = moved_views(problem, state)
     return tuple(
         replace(camera, camera_from_world=RigidTransform(rotation, translation))
@@ -134,7 +135,7 @@ def facing_of(
     distance: Float32[np.ndarray, "h w"],
     settings: PhotoSettings,
 ) -> Float32[np.ndarray, " s"]:
-    """Cosine between normal and line of sight for every sample that the camera sees; 0 where it does not.
+    """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 where it does not.
 
     ``depth`` is the z-buffer of the head, ``distance`` the silhouette's signed distance.
     """
@@ -164,22 +165,25 @@ def observe(
     patches: Patches,
     visibility: SampleVisibility,
     hair: Bool[np.ndarray, " c"],
+    *,
     basis: Float32[np.ndarray, "m c 3"],
     each: Round,
     settings: PhotoSettings,
 ) -> tuple[SurfaceObservations, Int[np.ndarray, " u"]]:
-    """Where the photographs see the surface, by the vertices at the patches' centres, and the vertices that they see
-    without knowing where they are; a patch of ``hair`` says only that the head is no farther out than that. ``basis``:
-    the model's modes at the centres."""
+    """Returns where the photographs see the surface, by the vertices at the patches' centres, and the vertices that
+    they see without knowing where they are; a patch of ``hair`` says only that the head is no farther out than that.
+    ``basis``: the model's modes at the centres."""
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
-    found = find_places(photographs, patches, visibility, problem.views, scale, each, settings)
+    found = find_places(photographs, patches, visibility, problem.views, scale, each=each, settings=settings)
     several, clear, view, value = found.several, found.clear, found.view, found.value
     kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > BOUND_HEIGHT))))
     # Patches overlap: what they say together is worth their area, not their number.
     overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / settings.centre_mm**2)
     information = 1.0 / (overlap * found.variance[kept])
     rows, place = patches.centre[kept], found.place[kept]
-    grams = gram_matrices(patches, kept, found.weights, view[kept], place, found.samples, found.pictures)
+    grams = gram_matrices(
+        patches, kept, found.weights, view[kept], place, samples=found.samples, pictures=found.pictures
+    )
     stood, normal = visibility.vertices[rows], visibility.normals[rows]
     sensitivity = camera_sensitivity(
         view[kept], value[kept], grams, stood + place[:, None] * normal, normal, visibility.cameras
@@ -205,7 +209,7 @@ def observe(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Where c patches look most alike, and what that was read from."""
+    """Says where c patches look most alike, and what that was read from."""
 
     place: Float[np.ndarray, " c"]  # mm along the normal
     height: Float[np.ndarray, " c"]  # the correlation there
@@ -225,10 +229,12 @@ def find_places(
     visibility: SampleVisibility,
     views: Views,
     scale: Float[np.ndarray, " k"],
+    *,
     each: Round,
     settings: PhotoSettings,
 ) -> Places:
-    """Every patch moved along its normal through the photographs of the views that see it; ``scale``: px a mm."""
+    """Returns every patch moved along its normal through the photographs of the views that see it; ``scale``: px a
+    mm."""
     steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
     image, noise = blurred(photographs, each.blur_mm * scale)
     weights, seen = patches.weights(each.window_mm), visibility.facing > 0
@@ -236,7 +242,7 @@ def find_places(
     pictures = Pictures(views.size, views.offset, image, noise)
     grey = sweep(samples, pictures, steps)
     view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
-    peaks = find_peaks(correlate(patches, weights, view, value, seen, grey, noise), steps)
+    peaks = find_peaks(correlate(patches, weights, view, value, seen, grey=grey, noise=noise), steps)
     blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
     variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
     clear = peaks.inside & (peaks.height > settings.least_correlation)
@@ -246,9 +252,9 @@ def find_places(
 def metric_rig(
     cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"], spread: float
 ) -> Float[np.ndarray, "c c"]:
-    """Information that cameras do not all err towards the head alike: their distances come from one board, whose size
-    is known. Images alone cannot tell; a contour that lies a tenth of a pixel too far out would otherwise move every
-    camera closer, and the surface with them."""
+    """Returns information that cameras do not all err towards the head alike: their distances come from one board,
+    whose size is known. Images alone cannot tell; a contour that lies a tenth of a pixel too far out would otherwise
+    move every camera closer, and the surface with them."""
     depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
     nearer = np.zeros((len(depth), 6))
     nearer[:, 5] = 1.0 / (len(depth) * depth)
@@ -256,13 +262,13 @@ def metric_rig(
 
 
 def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
-    """How large each camera sees a mm at the head's place."""
+    """Tells how large each camera sees a mm at the head's place."""
     return np.array([c.intrinsics.fx / c.camera_from_world.apply(at_world)[2] for c in cameras])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """The highest point of each patch's correlation."""
+    """Holds the highest point of each patch's correlation."""
 
     place: Float[np.ndarray, " c"]  # mm along the normal
     height: Float[np.ndarray, " c"]

@@ -26,7 +26,7 @@ def under_hair(
     seen: Bool[np.ndarray, "k s"],
     centres: Float[np.ndarray, "c 3"],
 ) -> Bool[np.ndarray, " c"]:
-    """The patches that show hair, or are about to.
+    """Returns the patches that show hair, or are about to.
 
     Args:
         patches: samples of the face and patches of them.
@@ -49,6 +49,6 @@ def under_hair(
 def patch_mean(
     patches: Patches, values: Float[np.ndarray, " s"], known: Bool[np.ndarray, " s"]
 ) -> Float[np.ndarray, " c"]:
-    """Mean over each patch's known samples; 0 where none is known."""
+    """Returns the mean over each patch's known samples; 0 where none is known."""
     total = patches.sums(patches.agreement, np.stack([values * known, known], axis=1).astype(float))
     return total[:, 0] / np.maximum(total[:, 1], 1e-9)

@@ -18,8 +18,8 @@ INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
-    """Of the solver's views: pictures in grey, the noise (grey levels) of each, and whether it shows anything at all. A
-    view without a photograph is black."""
+    """Holds of the solver's views pictures in grey, the noise (grey levels) of each, and whether it shows anything at
+    all. A view without a photograph is black."""
 
     grey: tuple[Float32[np.ndarray, "_ _"], ...]
     noise: Float[np.ndarray, " k"]
@@ -27,7 +27,7 @@ class Photographs:
 
 
 def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Views) -> Photographs:
-    """Those of the views; a view without a photograph, or with nothing to see in it, does not speak."""
+    """Loads those of the views; a view without a photograph, or with nothing to see in it, does not speak."""
 
     def load(k: int) -> tuple[Float32[np.ndarray, "h w"], float, bool]:
         width, height = views.size[k]
@@ -41,14 +41,14 @@ def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Vi
 
 
 def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:
-    """The signed distance of one view."""
+    """Returns the signed distance of one view."""
     width, height = views.size[k]
     return views.distance[views.offset[k] : views.offset[k] + width * height].reshape(height, width)
 
 
 def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], noise: float) -> bool:
-    """Is there more than noise inside the silhouette, and not half of it burnt out or black? A mask that stands in for
-    a photograph is one even value there."""
+    """Tells whether there is more than noise inside the silhouette, and not half of it burnt out or black. A mask that
+    stands in for a photograph is one even value there."""
     if not inside.any():
         return False
     smooth = cv2.GaussianBlur(grey, (0, 0), TEXTURE_BLUR_PX)[inside]
@@ -61,7 +61,7 @@ def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h 
 def blurred(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """All images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
+    """Returns all images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
     sigma = np.maximum(sigma_px, LEAST_BLUR_PX)
     with ThreadPoolExecutor(thread_count()) as pool:
         smooth = pool.map(lambda i, s: cv2.GaussianBlur(i, (0, 0), s).ravel(), photographs.grey, sigma.tolist())

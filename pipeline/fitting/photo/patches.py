@@ -18,7 +18,7 @@ from rig.mesh import vertex_normals
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """S samples of the full level's triangles, and C patches of them (start, member: compressed rows)."""
+    """Holds s samples of the full level's triangles, and C patches of them (start, member: compressed rows)."""
 
     corners: Int32[np.ndarray, "s 3"]
     shares: Float[np.ndarray, "s 3"]
@@ -32,7 +32,7 @@ class Patches:
         return _mixed(vertices, self.corners, self.shares)
 
     def mixed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " s"]:
-        """What the vertices have, at the samples."""
+        """Returns what the vertices have, at the samples."""
         return np.einsum("sk,sk->s", self.shares, values[self.corners])
 
     def normals(self, vertex_normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
@@ -40,17 +40,17 @@ class Patches:
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
     def sums(self, weights: Float[np.ndarray, " e"], values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "c n"]:
-        """Weighted sums over the samples of each patch."""
+        """Returns weighted sums over the samples of each patch."""
         shape = (len(self.centre), len(self.corners))
         return sparse.csr_array((weights, self.member, self.start), shape=shape) @ values
 
     def weights(self, size_mm: float) -> Float[np.ndarray, " e"]:
-        """A Gaussian window of that standard deviation."""
+        """Returns a Gaussian window of that standard deviation."""
         return np.exp(-0.5 * self.square_mm2 / size_mm**2) * self.agreement
 
 
 def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius_mm: float) -> Patches:
-    """Samples about ``sample_mm`` and patches about ``centre_mm`` apart, each patch a ball of ``radius_mm``."""
+    """Returns samples about ``sample_mm`` and patches about ``centre_mm`` apart, each patch a ball of ``radius_mm``."""
     level = model.levels["full"]
     vertices = model.vertices(np.zeros(0))
     normals = vertex_normals(vertices, level.faces)
@@ -67,14 +67,14 @@ def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius
 
 
 def arrays_of(patches: Patches) -> dict[str, np.ndarray]:
-    """By the names of the fields."""
+    """Returns them by the names of the fields."""
     return {field.name: getattr(patches, field.name) for field in fields(patches)}
 
 
 def spread_samples(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], spacing_mm: float
 ) -> tuple[Int32[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """About one sample in ``spacing_mm`` squared: large triangles are split, some of the small ones skipped."""
+    """Returns about one sample in ``spacing_mm`` squared: large triangles are split, some of the small ones skipped."""
     a, b, c = (vertices[faces[:, j]] for j in range(3))
     wanted = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / spacing_mm**2
     splits = np.maximum(np.round(np.sqrt(wanted)), 1).astype(int)
@@ -100,7 +100,7 @@ def _centroids(k: int) -> Float[np.ndarray, "n 3"]:
 def thinned(
     vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " n"], spacing_mm: float
 ) -> Int[np.ndarray, " c"]:
-    """One of ``rows`` in every cube of that edge: the one nearest to its middle."""
+    """Returns one of ``rows`` in every cube of that edge: the one nearest to its middle."""
     scaled = vertices[rows] / spacing_mm
     cell = np.floor(scaled).astype(np.int64)
     _, cube = np.unique(cell, axis=0, return_inverse=True)

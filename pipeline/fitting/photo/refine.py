@@ -80,7 +80,9 @@ def refine_with_photographs(
         visibility = sample_visibility(problem, state, patches, photographs.speaks, settings)
         seen = visibility.facing > 0
         hidden = under_hair(patches, hair or {}, problem.views.names, visibility.pixel, seen, centres)
-        surface, lost = observe(problem, state, photographs, patches, visibility, hidden, basis, each, settings)
+        surface, lost = observe(
+            problem, state, photographs, patches, visibility, hidden, basis=basis, each=each, settings=settings
+        )
         share = np.count_nonzero(~surface.bound) / max(len(patches.centre), 1)
         if share < settings.least_share:
             why = compose("level-alike-too-little", share=share, needed=settings.least_share)
@@ -97,7 +99,8 @@ def refine_with_photographs(
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
-    """The model with the fine kernel, its patches, and its modes at their centres: what the model alone decides."""
+    """Returns the model with the fine kernel, its patches, and its modes at their centres: what the model alone
+    decides."""
     length, amplitude = settings.fine_length_mm, settings.fine_amplitude_mm
     sizes = {
         "sample_mm": settings.sample_mm,
@@ -126,8 +129,8 @@ def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches
 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
-    """The vertices of the rim's level about vertices of the full level that lie under hair: their outline is hair's. A
-    fit to contours alone has bulged into it wherever its edge hung together with the face's."""
+    """Returns the vertices of the rim's level about vertices of the full level that lie under hair: their outline is
+    hair's. A fit to contours alone has bulged into it wherever its edge hung together with the face's."""
     mean = model.vertices(np.zeros(0))
     if not len(hair):
         return np.zeros(model.levels[LEVEL].count, bool)
@@ -137,7 +140,7 @@ def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray,
 def local_misfit_mm(
     model: HeadModel, seen: SurfaceObservations, state: State, lost: Int[np.ndarray, " u"]
 ) -> Float[np.ndarray, " v0"]:
-    """How far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).
+    """Tells how far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).
 
     Where several cameras see a place (vertex ``lost``) and find no match within reach, it is off by more than they can
     tell: eyes that the model has open and the subject closed. That counts where it is, and not for the whole head.

@@ -29,7 +29,7 @@ LIMIT = 3500  # evaluations a level: 60 modes have converged or will not
 
 @dataclass(frozen=True, slots=True)
 class HierarchyLevel:
-    """Which decimation of the mesh, and how large the images."""
+    """Holds which decimation of the mesh, and how large the images."""
 
     mesh: str
     image_scale: float
@@ -51,7 +51,7 @@ def fit_simplex(
     speaking: Literal["face", "all"] = "face",
     weighted: bool = True,
 ) -> Fit:
-    """Coefficients that minimise eq. (2) from the mean head. ``report("fit", fraction)`` may raise Cancelled.
+    """Returns coefficients that minimise eq. (2) from the mean head. ``report("fit", fraction)`` may raise Cancelled.
 
     ``speaking`` and ``weighted`` are the objective's: which pixels count, and whether by eq. (5) or eq. (4).
     ``rig`` and ``silhouettes`` may differ: cameras without a silhouette stay out.

@@ -20,7 +20,8 @@ SPREAD_TINY = 1e-30  # keeps the relative spread defined at a minimum of exactly
 
 @dataclass(frozen=True, slots=True)
 class Stats:
-    """What it took: calls of the function, the least value found, the relative spread of the values at the end."""
+    """Holds what it took: calls of the function, the least value found, the relative spread of the values at the
+    end."""
 
     evaluations: int
     cost: float
@@ -29,7 +30,7 @@ class Stats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """``value`` is the best point; ``result`` says why the search ended there."""
+    """Holds what the search found; ``value`` is the best point; ``result`` says why the search ended there."""
 
     value: Float[np.ndarray, " n"]
     result: Literal["converged", "evaluation limit"]
@@ -45,7 +46,7 @@ def minimise(
     limit: int = 3500,
     watch: Watcher = lambda evaluations, cost: None,
 ) -> Solution:
-    """A local minimum of ``function`` by the downhill simplex.
+    """Returns a local minimum of ``function`` by the downhill simplex.
 
     The initial simplex is ``p_0 = start`` and ``p_i = p_0 + steps[i] e_i`` (section 4.4). It ends when the relative
     spread falls below ``tolerance``, or after the first move that reaches ``limit`` evaluations (a shrink may overrun
@@ -72,7 +73,7 @@ def _move(function: Function, points: Float[np.ndarray, "n1 n"], values: Float[n
     centre = points[:-1].mean(axis=0)
 
     def try_at(factor: float) -> tuple[Float[np.ndarray, " n"], float]:
-        """The point at ``factor`` times the worst point's offset from the centre of the others."""
+        """Returns the point at ``factor`` times the worst point's offset from the centre of the others."""
         point = centre + factor * (points[-1] - centre)
         return point, function(point)
 

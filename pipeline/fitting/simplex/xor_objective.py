@@ -34,7 +34,7 @@ OUTLINE_PX = 2.0  # a vertex this near to the model's outline names the region o
 
 
 class SilhouetteObjective:
-    """Eq. (2) at one level of the hierarchy; owns the renderer's buffers for it. Close it, or use ``with``."""
+    """Holds eq. (2) at one level of the hierarchy; owns the renderer's buffers for it. Close it, or use ``with``."""
 
     def __init__(
         self,
@@ -87,14 +87,14 @@ class SilhouetteObjective:
         return float(self._drawn.xor_costs(self.vertices_world(coefficients)).sum())
 
     def vertices_world(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "v 3"]:
-        """T(H(alpha)): the level's vertices in the world, mm."""
+        """Returns t(H(alpha)): the level's vertices in the world, mm."""
         moved = (np.asarray(coefficients, np.float32) @ self._basis).reshape(-1, 3)
         return self._mean_world + moved @ self._turn.T
 
 
 def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
-    """The triangles with a fan over every hole, so that each edge has its counterpart; the same triangles where a hole
-    reaches the face region, whose outline may speak, or two holes meet."""
+    """Returns the triangles with a fan over every hole, so that each edge has its counterpart; the same triangles where
+    a hole reaches the face region, whose outline may speak, or two holes meet."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
     edges = {(a, b) for a, b in directed}
     rim = [(a, b) for a, b in edges if (b, a) not in edges]
@@ -113,7 +113,8 @@ def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -
 
 
 def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.ndarray, "_ _"]:
-    """The mask at another resolution: True where the contour leaves a pixel's centre inside, as the renderer draws.
+    """Returns the mask at another resolution: True where the contour leaves a pixel's centre inside, as the renderer
+    draws.
 
     From the signed distance (px, negative inside), averaged over the pixel. The contour of a binary mask often runs
     through a larger pixel's very centre; were all those ties to fall to one side, the contour would move by 0.15 px
@@ -128,7 +129,7 @@ def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.n
 def face_pixels(
     outline_mask: Bool[np.ndarray, "h w"], pixels: Float[np.ndarray, "v 2"], face_region: Bool[np.ndarray, " v"]
 ) -> Bool[np.ndarray, "h w"]:
-    """True where the nearest stretch of the model's outline belongs to the face region.
+    """Returns True where the nearest stretch of the model's outline belongs to the face region.
 
     ``pixels`` are the model's vertices in this view; those near to the edge of ``outline_mask`` name its stretches.
     """

@@ -29,14 +29,14 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Where in a reduced image the subject, and where the background, is sure enough to learn from."""
+    """Says where in a reduced image the subject, and where the background, is sure enough to learn from."""
 
     subject: Mask
     background: Mask
 
 
 def histogram(colours: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "b b b"]:
-    """How many pixels have each colour."""
+    """Tells how many pixels have each colour."""
     counts = np.zeros((BINS,) * 3, np.float32)
     np.add.at(counts, tuple(_bins(colours).T), 1.0)
     return counts
@@ -50,7 +50,7 @@ def colour_odds(
     *,
     nearby: bool,
 ) -> Float32[np.ndarray, "h w"]:
-    """Log odds of every pixel. ``common``: counts of the subject's colours in all views; ``noise``: levels;
+    """Returns the log odds of every pixel. ``common``: counts of the subject's colours in all views; ``noise``: levels;
     ``nearby``: whether local colours count, which they may where the samples are nearly complete."""
     subject = _log_density(image, (common, histogram(image[samples.subject])))
     background = _log_density(image, (histogram(image[samples.background]),))

@@ -33,7 +33,7 @@ ALPHA_BLUR_PX = 1.0  # of the image that was cut
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WithoutPlates:
-    """Views by what the outline is taken from: ``decisions`` for the matting, ``shares`` (of the subject in each
+    """Holds views by what the outline is taken from: ``decisions`` for the matting, ``shares`` (of the subject in each
     pixel, full size) of those that were cut."""
 
     decisions: Mapping[str, Decision]
@@ -86,7 +86,8 @@ def background_seen(
     volume: ViewingVolume,
     plane: Float[np.ndarray, " 4"] | None,
 ) -> Bool[np.ndarray, "h w"]:
-    """Reduced pixels (``size``: height, width) around points that are far from all subjects or on what it stands on."""
+    """Returns reduced pixels (``size``: height, width) around points that are far from all subjects or on what it
+    stands on."""
     seen_points = points.points[points.rows[name]]
     behind = np.linalg.norm(seen_points - volume.centre_world, axis=1) > volume.radius_mm
     if plane is not None:

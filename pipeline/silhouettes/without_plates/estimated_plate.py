@@ -30,8 +30,8 @@ def decision_without_plate(
     *,
     solid: bool = False,
 ) -> Decision:
-    """The decision that the present matting refines. ``solid``: a head, in which no backdrop is seen: what is enclosed
-    is skin or hair of the wall's colour."""
+    """Returns the decision that the present matting refines. ``solid``: a head, in which no backdrop is seen: what is
+    enclosed is skin or hair of the wall's colour."""
     mask, others = whole_subject(found.mask, found.odds < -1, settings)
     odds = found.odds
     if solid:
@@ -53,7 +53,7 @@ def decision_without_plate(
 def estimated_background(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], outside: Bool[np.ndarray, "h w"]
 ) -> Background:
-    """The plate as the pixels ``outside`` let it be guessed, and how badly they do."""
+    """Returns the plate as the pixels ``outside`` let it be guessed, and how badly they do."""
     guess = spread(coarse, outside.astype(np.float32), NEARBY_PX)
     size = (image.shape[1], image.shape[0])
     share = cv2.resize(cv2.GaussianBlur(outside.astype(np.float32), (0, 0), 1.0), size, interpolation=cv2.INTER_LINEAR)
@@ -77,6 +77,6 @@ def _pixel_noise(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 3"]
 
 
 def plate_noise(decision: Decision) -> float:
-    """By how much (levels) the guess is off along the subject's border."""
+    """Returns by how much (levels) the guess is off along the subject's border."""
     rim = dilated(decision.mask, MARGIN) & ~eroded(decision.mask, MARGIN)
     return float(np.median(decision.background.noise[rim])) if rim.any() else 0.0

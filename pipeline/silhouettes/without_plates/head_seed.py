@@ -23,7 +23,7 @@ UPRIGHT = 0.7  # sine of the angle between view and up
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadSeed:
-    """The head in the world (mm), and the face's landmarks in the views that show it."""
+    """Holds the head in the world (mm), and the face's landmarks in the views that show it."""
 
     centre_world: Float[np.ndarray, " 3"]
     up_world: Float[np.ndarray, " 3"]

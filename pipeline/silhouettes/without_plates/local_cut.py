@@ -28,7 +28,7 @@ PIECE_LEAST = 100  # px of outline
 
 @dataclass(frozen=True, slots=True)
 class Bands:
-    """How far inside and outside the given outline the edge is looked for, px of the images that are cut."""
+    """Says how far inside and outside the given outline the edge is looked for, px of the images that are cut."""
 
     inside: int
     outside: int
@@ -41,7 +41,7 @@ BANDS = (Bands(14, 8), Bands(8, 6))
 def cut_along(
     image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], bands: Bands
 ) -> Float32[np.ndarray, "h w"]:
-    """Share of the windows that hold a pixel for the subject, weighted towards their middles."""
+    """Returns the share of the windows that hold a pixel for the subject, weighted towards their middles."""
     height, width = mask.shape
     inner, outer = eroded(mask, bands.inside), ~dilated(mask, bands.outside)
     side = min(WINDOW, height, width)
@@ -88,7 +88,8 @@ def cut_views(
     *,
     report: Callable[[float], None],
 ) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Every view's share of the subject, at the size of ``images``; ``volume`` belongs to the size of ``masks``."""
+    """Returns every view's share of the subject, at the size of ``images``; ``volume`` belongs to the size of
+    ``masks``."""
     wide = {name: _resized(mask, images[name].shape[:2]) for name, mask in masks.items()}
     shares: dict[str, Float32[np.ndarray, "_ _"]] = {}
     for step, bands in enumerate(BANDS):

@@ -48,7 +48,8 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """What geometry knows of a view before any colour: surely subject, surely background, and where either may be."""
+    """Holds what geometry knows of a view before any colour: surely subject, surely background, and where either may
+    be."""
 
     core: Mask
     border: Mask
@@ -58,7 +59,7 @@ class Seeds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseMask:
-    """``odds`` of the subject when colours, neighbours and other views are heard; ``mask`` its one piece."""
+    """Holds ``odds`` of the subject when colours, neighbours and other views are heard; ``mask`` its one piece."""
 
     odds: Float32[np.ndarray, "h w"]
     mask: Mask
@@ -102,8 +103,8 @@ def search_masks(
     head: HeadSeed | None = None,
     report: Callable[[float], None],
 ) -> dict[str, CoarseMask]:
-    """The subject in every reduced image. ``background``: pixels that are known not to show it. ``bounded``: the
-    volume holds all of the subject, so that what is beyond it may be learnt as background nearby at once."""
+    """Returns the subject in every reduced image. ``background``: pixels that are known not to show it. ``bounded``:
+    the volume holds all of the subject, so that what is beyond it may be learnt as background nearby at once."""
     up = guessed_up(rig) if head is None else head.up_world
     sizes = {name: image.shape[:2] for name, image in images.items()}
     seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name], head) for camera in rig}

@@ -20,7 +20,8 @@ OFF_CENTRE_LEAST = 0.08  # of the radius: the place that all cameras look at is 
 def standing_plane(
     points_world: Float[np.ndarray, "n 3"], centre_world: Float[np.ndarray, " 3"], radius_mm: float
 ) -> Float[np.ndarray, " 4"] | None:
-    """``plane . (x, 1)`` is the distance (mm) on the subject's side; None where there is no such plane."""
+    """Returns a plane: ``plane . (x, 1)`` is the distance (mm) on the subject's side; None where there is no such
+    plane."""
     near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
     if len(near) < POINTS_LEAST:
         return None
@@ -47,7 +48,8 @@ def ball_above(
     centre_world: Float[np.ndarray, " 3"],
     radius_mm: float,
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Centre and radius (mm) of what stands on the plane: around the points above it, with room for what has none."""
+    """Returns the centre and radius (mm) of what stands on the plane: around the points above it, with room for what
+    has none."""
     height = points_world @ plane_world[:3] + plane_world[3]
     inside = np.linalg.norm(points_world - centre_world, axis=1) < radius_mm
     standing = points_world[inside & (height > 2 * NEAR * radius_mm)]

@@ -36,8 +36,8 @@ class ViewingVolume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherViews:
-    """What all other views say of each pixel of one: ``support``, the greatest sum of their log odds along its ray
-    (negative where they leave nothing of the subject on it), and ``solid``, where each of them has the subject."""
+    """Holds what all other views say of each pixel of one: ``support``, the greatest sum of their log odds along its
+    ray (negative where they leave nothing of the subject on it), and ``solid``, where each of them has the subject."""
 
     support: Float32[np.ndarray, "h w"]
     solid: Bool[np.ndarray, "h w"]
@@ -68,7 +68,8 @@ def viewing_volume(
     *,
     plane_world: Float[np.ndarray, " 4"] | None = None,
 ) -> ViewingVolume:
-    """The volume of a rig whose reduced images have ``sizes`` (height, width), in ``ball``, centre and radius (mm).
+    """Returns the volume of a rig whose reduced images have ``sizes`` (height, width), in ``ball``, centre and radius
+    (mm).
 
     ``plane_world``: what the subject stands on; only the side on which ``plane . (x, 1)`` is positive is kept."""
     centre, radius = ball
@@ -91,7 +92,7 @@ def viewing_volume(
 
 
 def reachable(volume: ViewingVolume, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """The pixels on whose rays there are voxels at all."""
+    """Returns the pixels on whose rays there are voxels at all."""
     mask = np.zeros(size[0] * size[1], np.uint8)
     places = volume.places[name]
     mask[places[places >= 0]] = 1
@@ -99,7 +100,7 @@ def reachable(volume: ViewingVolume, name: str, size: tuple[int, int]) -> Bool[n
 
 
 def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray, "_ _"]]) -> dict[str, OtherViews]:
-    """For each view, what the others say; ``odds``: of subject against background, of every view."""
+    """Tells for each view what the others say; ``odds``: of subject against background, of every view."""
     count = len(next(iter(volume.places.values())))
     total, seen, against = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
     grants = min(GRANTS_MOST, GRANTS_SUM / max(1, len(odds) - 1))

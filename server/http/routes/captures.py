@@ -77,6 +77,7 @@ def list_captures(
     service: ServiceOf,
     caller: Reader,
     q: Sought = "",
+    *,
     session: Key = None,
     verdict: Annotated[Literal["good", "usable", "poor", "none"] | None, Query(description="none: not judged")] = None,
     tag: WithTag = None,

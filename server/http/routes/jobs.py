@@ -56,6 +56,7 @@ def list_jobs(
     service: ServiceOf,
     caller: Reader,
     q: Sought = "",
+    *,
     state: State | None = None,
     capture: Key = None,
     session: Key = None,

@@ -39,6 +39,7 @@ def list_subjects(
     service: ServiceOf,
     caller: Reader,
     q: Sought = "",
+    *,
     tag: WithTag = None,
     sort: SubjectOrder = "-created",
     limit: Limit = 100,

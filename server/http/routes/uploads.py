@@ -88,6 +88,7 @@ async def tus_patch(
     caller: Taker,
     request: Request,
     upload_id: str,
+    *,
     tus_resumable: Resumable = None,
     upload_offset: Annotated[str | None, Header(alias="Upload-Offset")] = None,
     upload_checksum: Annotated[str | None, Header(alias="Upload-Checksum", max_length=200)] = None,

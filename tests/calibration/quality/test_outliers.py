@@ -64,7 +64,7 @@ def with_corners(view: View, corners: np.ndarray) -> View:
 
 def explained(source: Session, state: BundleState, views: list[View], bad: list[View]) -> list[Dropped]:
     names = list(source.rig.names)
-    return explain_shot(SHOT, views, bad, source.detections, state, names, source.poses, NOISE_PX)
+    return explain_shot(SHOT, views, bad, source.detections, state, names=names, boards=source.poses, noise_px=NOISE_PX)
 
 
 def test_a_view_is_blurred_by_squares_and_by_pixels(good: Session) -> None:

@@ -125,7 +125,7 @@ def shares(rig: Rig, made: Planted, fitted: Subject | None = None) -> dict[int, 
     subject = fitted or egg_head()
     assert subject.face_region is not None
     found = classify_parts(
-        made.images, made.silhouettes, rig, subject.mesh, subject.face_region, subject.landmarks, SETTINGS,
+        made.images, made.silhouettes, rig, subject.mesh, subject.face_region, subject.landmarks, settings=SETTINGS,
         report=lambda stage, share: None,
     )  # fmt: skip
     right: dict[int, list[np.ndarray]] = {1: [], 2: [], 3: []}
@@ -171,7 +171,7 @@ def test_nothing_is_said_outside_the_subject_and_of_views_that_do_not_count(rig)
     assert subject.face_region is not None
     found = classify_parts(
         made.images, {**made.silhouettes, "cam03": unusable}, rig, subject.mesh, subject.face_region,
-        subject.landmarks, SETTINGS, report=lambda stage, share: None,
+        subject.landmarks, settings=SETTINGS, report=lambda stage, share: None,
     )  # fmt: skip
     assert set(found) == {"cam00", "cam04", "cam07"}
     for name, each in found.items():
@@ -183,9 +183,10 @@ def test_nothing_is_said_outside_the_subject_and_of_views_that_do_not_count(rig)
 def test_the_same_photographs_give_the_same_bytes(rig):
     made, subject = planted(rig, "dark", "blue"), egg_head()
     assert subject.face_region is not None
-    head = rig, subject.mesh, subject.face_region, subject.landmarks, SETTINGS
+    head = rig, subject.mesh, subject.face_region, subject.landmarks
     one, two = (
-        classify_parts(made.images, made.silhouettes, *head, report=lambda stage, share: None) for _ in range(2)
+        classify_parts(made.images, made.silhouettes, *head, settings=SETTINGS, report=lambda stage, share: None)
+        for _ in range(2)
     )
     assert all(np.array_equal(one[name].probability, two[name].probability) for name in one)
 
@@ -194,7 +195,14 @@ def test_no_photograph_no_map(rig):
     subject = egg_head()
     assert subject.face_region is not None
     assert not classify_parts(
-        {}, {}, rig, subject.mesh, subject.face_region, subject.landmarks, SETTINGS, report=lambda stage, share: None
+        {},
+        {},
+        rig,
+        subject.mesh,
+        subject.face_region,
+        subject.landmarks,
+        settings=SETTINGS,
+        report=lambda stage, share: None,
     )
 
 

@@ -41,7 +41,9 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
     mesh, strip = with_strip(ellipsoid(5))
     settings, depths = TextureSettings(), depth_maps(shot.rig, mesh)
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
-    found = texture(mesh, mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings, around=around)
+    found = texture(
+        mesh, mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around
+    )
     assert found.decision is not None
     rim = np.unique(mesh.faces[strip])  # hidden by lids, as it were
     weights, slots, shares = (
@@ -72,7 +74,14 @@ def test_what_views_see_by_its_vertices_stays() -> None:
     settings, depths = TextureSettings(), depth_maps(shot.rig, shot.mesh)
     around = Neighbourhood.of(*neighbours(shot.mesh.faces, len(shot.mesh.vertices)))
     coloured = texture(
-        shot.mesh, shot.mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings, around=around
+        shot.mesh,
+        shot.mesh.normals(),
+        shot.capture,
+        shot.silhouettes,
+        shot.rig,
+        depths,
+        settings=settings,
+        around=around,
     )
     decision = coloured.decision
     assert decision is not None

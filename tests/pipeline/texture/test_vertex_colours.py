@@ -34,7 +34,7 @@ def colour(shot: Shot, **settings) -> Texture:
         shot.silhouettes,
         shot.rig,
         depth_maps(shot.rig, shot.mesh),
-        chosen,
+        settings=chosen,
     )
 
 
@@ -115,7 +115,9 @@ def test_hidden_surfaces_take_no_colour_from_what_hides_them() -> None:
     image = np.rint(255 * srgb_from_linear(np.where(np.isfinite(depth)[:, :, None], linear, 0.3))).astype(np.uint8)
     silhouette = silhouette_from_mask(np.isfinite(depth))
     capture = Capture({"cam00": image})
-    found = texture(mesh, mesh.normals(), capture, {"cam00": silhouette}, rig, {"cam00": depth}, TextureSettings())
+    found = texture(
+        mesh, mesh.normals(), capture, {"cam00": silhouette}, rig, {"cam00": depth}, settings=TextureSettings()
+    )
     lit = found.views[:count] > 0
     assert lit.sum() > 500
     assert (found.colours[:count][lit][:, 0] < 80).all()

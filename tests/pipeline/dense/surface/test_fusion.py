@@ -23,7 +23,14 @@ SPACING = BustSettings(spacing_mm=3.0)
 
 def fused(made: Scene, head: Mesh | None = None, settings: BustSettings = SPACING) -> BustSurface:
     return fuse(
-        made.maps, made.silhouettes, made.rig, head, None, WindowBias(), settings, report=lambda stage, share: None
+        made.maps,
+        made.silhouettes,
+        made.rig,
+        head,
+        votes=None,
+        bias=WindowBias(),
+        settings=settings,
+        report=lambda stage, share: None,
     )
 
 

@@ -27,7 +27,7 @@ def search(scene: Scene, hair: float = 0.0) -> PatchSearch:
     fit = Fit("contour", np.zeros(0), Similarity.identity(), 1, "planted")
     distances = {name: silhouette.distance for name, silhouette in scene.silhouettes.items()}
     shown = {name: np.full(image.shape[:2], hair, np.float32) for name, image in scene.images.items()}
-    return patch_search(scene.model, fit, scene.images, distances, shown, scene.rig, PhotoSettings())
+    return patch_search(scene.model, fit, scene.images, distances, shown, scene.rig, settings=PhotoSettings())
 
 
 @pytest.mark.parametrize("off_mm", [0.0, 0.4])

@@ -155,10 +155,10 @@ def test_correlation_of_planted_signals() -> None:
     grey[:, 1, 0], grey[:, 1, 2] = 10 * noise.T
     view, value = choose_views(patch, weights, facing, 0.85, 5)
     assert view.tolist() == [[0, 1]]
-    score = correlate(patch, weights, view, value, facing > 0, grey, np.zeros(2))
+    score = correlate(patch, weights, view, value, facing > 0, grey=grey, noise=np.zeros(2))
     assert score[0, 1] == pytest.approx(1.0, abs=1e-5)
     assert np.abs(score[0, [0, 2]]).max() < 4 / np.sqrt(400)
-    muted = correlate(patch, weights, view, value, facing > 0, grey, np.full(2, 1000.0))
+    muted = correlate(patch, weights, view, value, facing > 0, grey=grey, noise=np.full(2, 1000.0))
     assert muted.max() < 1e-3
 
 
@@ -186,7 +186,7 @@ def test_correlation_is_the_mean_of_all_pairs_of_views() -> None:
             pair = value[0, q] * value[0, r]
             alike += pair * (weights[:, None] * units[view[0, q]] * units[view[0, r]]).sum(axis=0)
             shared += pair
-    found = correlate(patch, weights, view, value, seen, grey, noise)
+    found = correlate(patch, weights, view, value, seen, grey=grey, noise=noise)
     np.testing.assert_allclose(found[0], alike / shared, atol=1e-5)
 
 
