@@ -15,7 +15,7 @@ from typing import TypeVar
 from rig.errors import WrongVariable
 from rig.messages.message import compose
 
-THREADS, THREADS_MOST = "EIGENHEAD_THREADS", 512
+THREADS, MAX_THREADS = "EIGENHEAD_THREADS", 512
 Result = TypeVar("Result")
 SLICES = 8  # of a loop: enough that threads end together
 
@@ -26,8 +26,8 @@ def thread_count() -> int:
     requested = os.environ.get(THREADS, "").strip()
     if not requested:
         return len(os.sched_getaffinity(0))
-    if not (requested.isascii() and requested.isdecimal() and 1 <= int(requested[:9]) <= THREADS_MOST):
-        raise WrongVariable(THREADS, [compose("threads-wrong", value=f"{requested!r}", most=THREADS_MOST)])
+    if not (requested.isascii() and requested.isdecimal() and 1 <= int(requested[:9]) <= MAX_THREADS):
+        raise WrongVariable(THREADS, [compose("threads-wrong", value=f"{requested!r}", most=MAX_THREADS)])
     return int(requested)
 
 

@@ -134,6 +134,13 @@ def test_the_list_of_exceptions_only_shrinks() -> None:
     assert not PUBLIC - {(file, name) for file, names in uses().items() for name, _ in names}
 
 
+def test_bounds_of_the_pipeline_begin_with_min_or_max() -> None:
+    bound = re.compile(r"^[A-Z0-9_, ]*(?:\b|_)(?:LEAST|MOST)(?:_[A-Z0-9_]+)?\b[A-Z0-9_, ]*(?=:| =)", re.MULTILINE)
+    modules = {path: path.read_text(encoding="utf-8") for path in sorted((ROOT / "pipeline").rglob("*.py"))}
+    wrong = [f"{path.relative_to(ROOT)}: {name}" for path, text in modules.items() for name in bound.findall(text)]
+    assert not wrong, "\n".join(wrong)
+
+
 @pytest.mark.parametrize(
     "source",
     [

@@ -19,8 +19,8 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import (
     BORDER_PX,
-    LEAST_SLOPE,
     LONGEST_SPAN,
+    MIN_SLOPE,
     Tangency,
     angle_slopes,
     epipolar_plane_axes,
@@ -114,5 +114,5 @@ def _extremes(contour: Contour, angle: Float[np.ndarray, " n"], u: np.ndarray, v
     behind = pixels - INSIDE_PX * (side / np.maximum(steep, 1e-12))[:, None] * slopes
     height, width = contour.mask.shape
     x, y = np.rint(np.clip(behind, 0, [width - 1, height - 1])).astype(int).T
-    good = (steep > LEAST_SLOPE) & (side * angle[at] - ends > PROMINENCE_PX * steep) & contour.mask[y, x]
+    good = (steep > MIN_SLOPE) & (side * angle[at] - ends > PROMINENCE_PX * steep) & contour.mask[y, x]
     return _Extremes(angle[at][good], side[good], pixels[good], slopes[good])

@@ -27,7 +27,7 @@ from calibration.silhouette_refinement.tangency_term import (
     per_camera,
     tangency_residuals,
 )
-from pipeline.estimation.levenberg_marquardt import DAMPING_LEAST, Limits, Solution, minimise
+from pipeline.estimation.levenberg_marquardt import MIN_DAMPING, Limits, Solution, minimise
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import NormalEquations, Problem, Quadratic, Term
 from pipeline.fitting.problem import camera_information
@@ -44,7 +44,7 @@ NOISE_LEAST_PX = 0.07  # a contour of a binary mask is not better
 OUTER_STEPS = 1  # with outer tangents alone, which cannot be confused
 STEPS, RIM_STEPS = 6, 2
 # One step to a set of tangencies, and hardly damped: the calibration is near, its covariance holds the rest.
-ONE_STEP = Limits(steps=1, first_damping=DAMPING_LEAST)
+ONE_STEP = Limits(steps=1, first_damping=MIN_DAMPING)
 SETTLED_PX = 1e-2
 FOLDS = 5
 GAIN_SIGMAS = 2.0  # by how many of its standard deviations the held-out residuals must shrink

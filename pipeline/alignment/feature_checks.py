@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.alignment.feature_points import locate_features
-from pipeline.alignment.landmarks import POINTS_LEAST, TRIANGLE_LEAST_MM, flatness
+from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
 from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS
 from rig.capture import Features
 from rig.messages.message import Message, compose
@@ -23,11 +23,11 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
     faults += [compose("feature-in-one-view", name=name) for name in single]
     located = locate_features(known, rig, noise_px=CLICK_PX)
     points = [point.position_world for point in located.points.values()]
-    if len(points) < POINTS_LEAST:
-        few = compose("features-too-few", count=len(points), needed=POINTS_LEAST)
+    if len(points) < MIN_POINTS:
+        few = compose("features-too-few", count=len(points), needed=MIN_POINTS)
         remarks = located.remarks
         faults.append(compose("features-too-few-because", few=few, reasons=remarks) if remarks else few)
-    elif flatness(np.stack(points)) < TRIANGLE_LEAST_MM:
+    elif flatness(np.stack(points)) < MIN_TRIANGLE_MM:
         faults.append(compose("features-on-line"))
     return faults
 

@@ -29,8 +29,8 @@ from rig.geometry import RigidTransform, Similarity
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-POINTS_LEAST = 3
-TRIANGLE_LEAST_MM = 5.0  # rms distance from the best line; less leaves the turn about that line to the noise
+MIN_POINTS = 3
+MIN_TRIANGLE_MM = 5.0  # rms distance from the best line; less leaves the turn about that line to the noise
 OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points is lost (chi-square, 3 degrees)
 
 
@@ -42,10 +42,10 @@ class TooFewFeatures(EigenheadError):
         usable_told = counts or compose("nothing-usable")
         if remarks:
             super().__init__(
-                compose("too-few-features-remarks", why=why, needed=POINTS_LEAST, usable=usable_told, remarks=remarks)
+                compose("too-few-features-remarks", why=why, needed=MIN_POINTS, usable=usable_told, remarks=remarks)
             )
         else:
-            super().__init__(compose("too-few-features", why=why, needed=POINTS_LEAST, usable=usable_told))
+            super().__init__(compose("too-few-features", why=why, needed=MIN_POINTS, usable=usable_told))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     ]
     points = {name: point for name, point in located.points.items() if name in model.landmarks}
     remarks = (*located.remarks, *unknown)
-    if len(points) < POINTS_LEAST:
+    if len(points) < MIN_POINTS:
         raise TooFewFeatures(points, compose("points-usable", count=len(points)), remarks)
     names = list(points)
     target = np.stack([point.position_world for point in points.values()])
@@ -126,9 +126,9 @@ def consensus(
     within OUTLIER_SIGMAS of the alignment of all that agree are kept. 26 points make 2,600 triples: 0.3 s.
     """
     best, agreed = np.inf, None
-    for triple in combinations(range(len(source)), POINTS_LEAST):
+    for triple in combinations(range(len(source)), MIN_POINTS):
         chosen = list(triple)
-        if min(flatness(source[chosen]), flatness(target[chosen])) < TRIANGLE_LEAST_MM:
+        if min(flatness(source[chosen]), flatness(target[chosen])) < MIN_TRIANGLE_MM:
             continue
         fitted = _rigid(source[chosen], target[chosen])
         squared = ((target - fitted.apply(source)) ** 2).sum(axis=1) / expected_mm**2
@@ -139,7 +139,7 @@ def consensus(
     for _ in range(3) if agreed is not None else ():
         fitted = _rigid(source[agreed], target[agreed])
         near = ((target - fitted.apply(source)) ** 2).sum(axis=1) < (OUTLIER_SIGMAS * expected_mm) ** 2
-        if near.sum() >= POINTS_LEAST and flatness(source[near]) >= TRIANGLE_LEAST_MM:
+        if near.sum() >= MIN_POINTS and flatness(source[near]) >= MIN_TRIANGLE_MM:
             agreed = near
     return agreed
 

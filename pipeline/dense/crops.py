@@ -21,7 +21,7 @@ from rig.rig import Rig
 LEVELS = 4  # full, half, quarter, eighth
 MARGIN_PX = 12  # about the subject: windows and the defocused edge
 UNSEEN_PX = -1e6  # signed distance beyond the photograph's edge: the subject may go on there
-UNSEEN_MOST_PX = -1e4  # what is left of that after any mixing with what is seen
+MAX_UNSEEN_PX = -1e4  # what is left of that after any mixing with what is seen
 HALVED_NOISE = 0.4  # what a blur by BLUR_PX and a mean of 2 x 2 pixels leave of white noise
 BLUR_PX = 0.5  # before every halving, and of the full size: what is left is fit for bilinear reading
 
@@ -89,8 +89,8 @@ def _crop(
     distance = cv2.remap(
         silhouette.distance, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=UNSEEN_PX
     )
-    distance = np.where(distance > UNSEEN_MOST_PX, distance * scale, UNSEEN_PX).astype(np.float32)
-    mask = np.where(distance > UNSEEN_MOST_PX, np.clip(0.5 - distance, 0.0, 1.0), 0.0).astype(np.float32)
+    distance = np.where(distance > MAX_UNSEEN_PX, distance * scale, UNSEEN_PX).astype(np.float32)
+    mask = np.where(distance > MAX_UNSEEN_PX, np.clip(0.5 - distance, 0.0, 1.0), 0.0).astype(np.float32)
     grey = colour.astype(np.float32) @ LUMINANCE
     noise = noise_level(image.astype(np.float32) @ LUMINANCE)
     blur = BLUR_PX * blur_growth(noise)

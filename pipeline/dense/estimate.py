@@ -32,7 +32,7 @@ from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.rig import Rig
 
-LEAST = 3  # level of the search's bounds: an eighth of the photographs' size
+COARSEST_LEVEL = 3  # level of the search's bounds: an eighth of the photographs' size
 # By how often the size was doubled since the search:
 STEPS_PX = ((1, 3), (1,), ())  # how far planes are taken over from
 # Surface of so few pixels is a chance match where other surface encloses it; the same area at both sizes. Of what is
@@ -71,7 +71,7 @@ def estimate_depth(
     pattern = square_pattern(2)
     first = find_search_level([crop.camera for crop in crops], extent[0])
     stack = stack_crops(crops, first)
-    depth_ranges = find_depth_ranges(crops, stack_crops(crops, LEAST), stack, head_world, extent, settings)
+    depth_ranges = find_depth_ranges(crops, stack_crops(crops, COARSEST_LEVEL), stack, head_world, extent, settings)
     report("dense", 0.1)
     fields = first_fields(stack, depth_ranges, neighbours, pattern, settings)
     report("dense", 0.3)

@@ -20,7 +20,7 @@ AGAINST = -1.0  # the view shows the place beside the subject
 BESIDE_PX = 2.0  # that far beside its outline
 WINDOW_PX = -1.0  # to the outline: nearer samples hold background, whose edge would be matched for the surface
 UNSEEN_PX = -1e4  # distances below are beyond the photograph
-LEAST_AREA = 0.05  # of a pixel in the other view: flatter, or from behind, it is not compared
+MIN_AREA = 0.05  # of a pixel in the other view: flatter, or from behind, it is not compared
 WIDTH, HEIGHT, START, NOISE = 12, 13, 14, 15  # entries of a way, behind rotation and translation
 LOW = np.uint32(0xFFFF)
 HIGH = np.uint32(16)
@@ -123,7 +123,7 @@ def place_window(way, z, z_x, z_y, column, row, reach, place):
     wide, tall = reach * (abs(x_x) + abs(x_y)), reach * (abs(y_x) + abs(y_y))
     if x - wide < 0.0 or y - tall < 0.0 or x + wide > way[WIDTH] - 1.01 or y + tall > way[HEIGHT] - 1.01:
         return False
-    if x_x * y_y - x_y * y_x < LEAST_AREA:
+    if x_x * y_y - x_y * y_x < MIN_AREA:
         return False
     place[0], place[1], place[2], place[3], place[4], place[5] = x, y, x_x, x_y, y_x, y_y
     place[6], place[7] = (ray0 - x * ray2) * per, (ray1 - y * ray2) * per

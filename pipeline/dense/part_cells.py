@@ -23,7 +23,7 @@ from rig.rig import Rig
 BALANCE_VERTICES = 3000  # of the face, enough to tell the cameras' gains
 CHEEK_INSIDE_MM, CHEEK_MARGIN_MM = 12.0, 3.0  # from the border of the face, and above the nose's lower end
 DOWNWARD = (-0.25, -0.5)  # cosine between normal and up: below jaw and chin, where light from above leaves skin dark
-LEAST_FACING = 0.5  # cosine: flatter skin shines
+MIN_FACING = 0.5  # cosine: flatter skin shines
 HIDDEN_MM = 4.0  # a nearer surface hides a vertex beyond this: a cell's own slope
 DARKEST = 0.01  # linear: added before ratios are taken, so that noise of dark cells makes no colours
 DETAIL_FLOOR = 0.01  # of a cell's mean: fine structure that noise and rounding make
@@ -201,7 +201,7 @@ def _gains(
         towards = camera.centre_world - points
         facing = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
         free = camera_depths(camera, points) < depth[row, column] + HIDDEN_MM
-        weights[k] = np.where(framed & free & (facing > LEAST_FACING), facing, 0.0)
+        weights[k] = np.where(framed & free & (facing > MIN_FACING), facing, 0.0)
         colours[k] = picture[row, column]
     return balance(weights, colours)[0].astype(np.float32)
 

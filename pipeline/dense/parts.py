@@ -39,7 +39,7 @@ OUTLIER = 0.02  # share of what belongs to no part
 BARE_PRIOR, BEARD_PRIOR = (0.8, 0.17), (0.3, 0.67)  # of skin and hair on a lower face without a beard, and with one
 BEARD_SHARE = (0.2, 0.45)  # of the lower face that looks otherwise than the cheeks: no beard, a beard for certain
 CONFIDENT = 0.8  # only cells so probable teach how their part looks: others would pull all parts together
-LEAST_THERE = 1e-3  # share of a part's sure places that do not look like skin: a bald head has no hair
+MIN_PRESENT = 1e-3  # share of a part's sure places that do not look like skin: a bald head has no hair
 SKIN_RATIO = 0.15  # looks that skin has so much less often than the whole subject are half not skin's
 OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a part of its own would fill evenly
 PLAIN = 0.1  # a cell that is less of a feature or underside than this is plain skin, or a beard
@@ -245,7 +245,7 @@ def _presence(
     """Is there hair, are there clothes? The share of their sure places that look otherwise than skin; a beard is hair,
     too."""
     shares = [float(unlikeness[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
-    return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], LEAST_THERE)
+    return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], MIN_PRESENT)
 
 
 def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:

@@ -14,7 +14,7 @@ from pipeline.dense.matching_kernels import (
 )
 from pipeline.dense.sweep_kernels import cost_of
 
-LEAST_LIKENESS = 0.3  # correlation of a view that may speak
+MIN_CORRELATION = 0.3  # correlation of a view that may speak
 BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken for hidden
 
 
@@ -113,7 +113,7 @@ def slide(sight, scratch, most_px, depth, slopes, place_mm, information, likenes
                 count += 1
             gradient, curvature, mean, spoke = 0.0, 0.0, 0.0, 0
             for k in range(count):
-                if found[k, 0] > LEAST_LIKENESS and found[k, 0] > best - BEHIND_BEST:
+                if found[k, 0] > MIN_CORRELATION and found[k, 0] > best - BEHIND_BEST:
                     gradient += found[k, 1]
                     curvature += found[k, 2]
                     mean += found[k, 0]

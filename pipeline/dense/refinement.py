@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int
 
-from pipeline.dense.crops import UNSEEN_MOST_PX
+from pipeline.dense.crops import MAX_UNSEEN_PX
 from pipeline.dense.field import Field
 from pipeline.dense.field_kernels import double, fit_planes
 from pipeline.dense.matching_kernels import make_scratch
@@ -22,10 +22,10 @@ from pipeline.settings import DenseSettings
 
 STEEPEST = 3.0  # slope against the image plane: 72 degrees
 RADIUS_PX = 2  # of the neighbourhood that a plane is laid through
-LEAST_INFORMATION = 1e-4  # 1 / mm^2: a standard deviation of 100 mm
+MIN_INFORMATION = 1e-4  # 1 / mm^2: a standard deviation of 100 mm
 SAME_PX = 0.1  # planes that differ by less are one: a slide takes either to its place
 PLANE_ROUNDS = 2  # what takes a speck's place is tried against its neighbours, too
-MOST_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
+MAX_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
 def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> list[Field]:
@@ -33,7 +33,7 @@ def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> l
 
     def work(view: int) -> Field:
         field, distance = fields[view], stack.image(stack.distance_px, view)
-        live = (distance < 0.5) & (distance > UNSEEN_MOST_PX)
+        live = (distance < 0.5) & (distance > MAX_UNSEEN_PX)
         depth, slopes = np.empty(live.shape, np.float32), np.empty((*live.shape, 2), np.float32)
         double(field.depth, field.slopes, live, depth, slopes)
         relief = (settings.relief_factor * field.relief_mm) ** 2
@@ -101,11 +101,11 @@ def _refined(
                 fresh[tried] = False
             specks = take_specks_off(depth, slopes, pixel_mm, speck_px)
             cost[specks], fresh[specks] = -1.0, True
-    before, known = depth, np.where(specks, np.float32(0.0), field.information) + LEAST_INFORMATION
+    before, known = depth, np.where(specks, np.float32(0.0), field.information) + MIN_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
     for _ in range(rounds):
         place, seen, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
-        slide(sight, scratch, MOST_SLIDE_PX, depth, slopes, place, seen, likeness)
+        slide(sight, scratch, MAX_SLIDE_PX, depth, slopes, place, seen, likeness)
         seen = seen / (settings.match_factor**2 + settings.match_floor_mm**2 * seen)
         information = seen + known
         joined = np.where(live, (seen * place + known * before) / information, 0.0).astype(np.float32)

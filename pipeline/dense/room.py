@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.dense.crops import UNSEEN_MOST_PX, Crop
+from pipeline.dense.crops import MAX_UNSEEN_PX, Crop
 from pipeline.dense.room_kernels import find_room
 from pipeline.dense.stack import Stack
 from pipeline.imaging.cpu_raster import depth_map
@@ -22,7 +22,7 @@ from rig.mesh import Mesh
 
 STEPS = 128  # along a ray through the subject
 SLACK_PX = 1.0  # of the least size: a mask may be that narrow
-LEAST_ROOM_MM = 4.0
+MIN_ROOM_MM = 4.0
 BOUND_BLUR_PX = 1.0  # of the least size: the hull has creases that the subject does not have
 LOOSE_HULL_MM = (
     30.0  # of a hull's front before the fitted head: 5 to 15 for cameras around a head, 100 for three in front
@@ -90,7 +90,7 @@ def _bounds(
     else:
         head, _ = depth_map(camera, head_world.vertices, head_world.faces)
         _bound_by_head(near, far, room, head, settings)
-    far[room] = np.maximum(far[room], near[room] + LEAST_ROOM_MM + step)
+    far[room] = np.maximum(far[room], near[room] + MIN_ROOM_MM + step)
     return near, far
 
 
@@ -124,7 +124,7 @@ def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"],
     room = near > 0.0
     width, height = (int(side) for side in stack.size[view])
     distance = stack.image(stack.distance_px, view)
-    live = (distance < 1.0) & (distance > UNSEEN_MOST_PX)
+    live = (distance < 1.0) & (distance > MAX_UNSEEN_PX)
     if not room.any():
         return DepthRange(np.zeros_like(distance), np.zeros_like(distance), np.zeros((height, width, 4), np.float32))
     bounds, slopes = [], []

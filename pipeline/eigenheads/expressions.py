@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32
 from rig.errors import InputError
 from rig.text import suggest
 
-LEAST_MM = 0.1  # a shape that moves the skin by less is none: pupils, the tongue
+MIN_MM = 0.1  # a shape that moves the skin by less is none: pupils, the tongue
 SPARSE_MM = 0.004  # what is left out of a file: what float16 loses of a centimetre
 
 BLINKS = {"eyeBlinkRight": "right", "eyeBlinkLeft": "left", "eye-right-closure": "right", "eye-left-closure": "left"}
@@ -60,7 +60,7 @@ def no_expressions(vertices: int) -> Expressions:
 
 def visible(expressions: Expressions) -> Expressions:
     """Returns those that move the skin."""
-    kept = np.linalg.norm(expressions.shapes, axis=2).max(axis=1) >= LEAST_MM if len(expressions) else np.zeros(0, bool)
+    kept = np.linalg.norm(expressions.shapes, axis=2).max(axis=1) >= MIN_MM if len(expressions) else np.zeros(0, bool)
     names = tuple(name for name, keep in zip(expressions.names, kept, strict=True) if keep)
     return Expressions(names, expressions.shapes[kept])
 

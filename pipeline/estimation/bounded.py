@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 PATIENCE = 10  # exchanges of whole blocks without fewer violations, before one unknown at a time is exchanged
 ROUNDING = 1e-12  # of the width between the bounds, or of the largest slope: nothing is violated by less
-EXCHANGES_MOST = 1000
+MAX_EXCHANGES = 1000
 
 
 def least_within(
@@ -50,7 +50,7 @@ def _least_in_box(
     side, fewest, patience = np.zeros(len(gradient), int), len(gradient) + 1, PATIENCE
     slack = ROUNDING * np.where(np.isfinite(upper - lower), upper - lower, 1.0)
     place = np.zeros(len(gradient))
-    for _ in range(EXCHANGES_MOST):
+    for _ in range(MAX_EXCHANGES):
         place = np.where(side < 0, lower, np.where(side > 0, upper, 0.0))
         free = np.flatnonzero(side == 0)
         if len(free):

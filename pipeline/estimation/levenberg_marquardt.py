@@ -22,9 +22,9 @@ from jaxtyping import Float
 from pipeline.estimation.bounded import least_within
 from pipeline.estimation.terms import Linearised, NormalEquations, Problem, Value
 
-DAMPING_LEAST = 1e-7  # after accepted steps; relative to the diagonal, Gauss-Newton to seven digits
+MIN_DAMPING = 1e-7  # after accepted steps; relative to the diagonal, Gauss-Newton to seven digits
 DAMPING_REFUSED = 1e-2  # at least, after a refused step
-DIAGONAL_LEAST = 1e-12  # of what nothing determines: damping then keeps it where it is
+MIN_DIAGONAL = 1e-12  # of what nothing determines: damping then keeps it where it is
 
 Reason = Literal["converged", "no step lowers the cost", "step limit"]
 Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.ndarray, " p"]]
@@ -111,7 +111,7 @@ def minimise(
             damping = max(damping * 100.0, DAMPING_REFUSED)
         if accepted is None:
             return ended("no step lowers the cost")
-        now, damping = accepted, max(damping * 0.1, DAMPING_LEAST)
+        now, damping = accepted, max(damping * 0.1, MIN_DAMPING)
         recent.append(now.cost)
         if now.cost < best.cost:
             best = now
@@ -145,7 +145,7 @@ def _damped_step(equations: NormalEquations, damping: float, solve: Solve) -> Fl
 def _damped(equations: NormalEquations, damping: float) -> Float[np.ndarray, "p p"]:
     damped = equations.matrix.copy()
     diagonal = np.einsum("ii->i", damped)
-    diagonal += damping * (diagonal + DIAGONAL_LEAST)
+    diagonal += damping * (diagonal + MIN_DIAGONAL)
     return damped
 
 

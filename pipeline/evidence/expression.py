@@ -13,7 +13,7 @@ from rig.geometry import Similarity
 from rig.mesh import Mesh
 
 TOLD = 0.05  # a smaller weight is nothing to speak of
-LEAST_SIGMA = 2.0  # nor one that its own deviation explains ...
+MIN_SIGMA = 2.0  # nor one that its own deviation explains ...
 READ_SIGMA = 1.0  # ... which takes less where the finished surface was asked: the prior has asked for more already
 CLOSED = 0.8  # lids that are so far closed show no eye
 
@@ -49,7 +49,7 @@ def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
     return dict(zip(model.expressions.names, (float(w) for w in fitted), strict=False))
 
 
-def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = LEAST_SIGMA) -> tuple[Found, ...]:
+def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = MIN_SIGMA) -> tuple[Found, ...]:
     """Returns what the head does, the strongest first: weights of more than ``least_sigma`` deviations."""
     weights = fitted_weights(model, fit)
     spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]

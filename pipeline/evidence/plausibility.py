@@ -21,11 +21,11 @@ from pipeline.fitting.fit import Fit
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 
-COEFFICIENT_MOST = 4.6  # standard deviations of the largest; the same rig scaled by 0.88 gives 4.6, by 1.12 gives 6.8
-CHANCE_LEAST = 1e-9  # of a sum of squares this large; a posterior mean is shrunk, so that good heads stay far below
-SIZE_MOST = 2.9  # standard deviations of the heads' own size, which good heads exceed once in 268
-SCALE_OFF_MOST = 0.07  # of size; 0.053 of a head from another population, more of a rig whose unit is wrong
-OUTSIDE_MOST_PX_PER_WIDTH = 0.003  # 3 px of 1024; at most 0.6 in 66 cameras of six good captures
+MAX_COEFFICIENT = 4.6  # standard deviations of the largest; the same rig scaled by 0.88 gives 4.6, by 1.12 gives 6.8
+MIN_CHANCE = 1e-9  # of a sum of squares this large; a posterior mean is shrunk, so that good heads stay far below
+MAX_SIZE = 2.9  # standard deviations of the heads' own size, which good heads exceed once in 268
+MAX_SCALE_OFF = 0.07  # of size; 0.053 of a head from another population, more of a rig whose unit is wrong
+MAX_OUTSIDE_PX_PER_WIDTH = 0.003  # 3 px of 1024; at most 0.6 in 66 cameras of six good captures
 OUTSIDE_TIMES_MEDIAN = 6.0  # and this many times what the other cameras have
 
 
@@ -96,14 +96,14 @@ def _shape(coefficients: Float[np.ndarray, " m"]) -> list[ReportWarning]:
         return []
     largest = float(np.abs(coefficients).max())
     total = float(coefficients @ coefficients)
-    if largest <= COEFFICIENT_MOST and float(chdtrc(len(coefficients), total)) >= CHANCE_LEAST:
+    if largest <= MAX_COEFFICIENT and float(chdtrc(len(coefficients), total)) >= MIN_CHANCE:
         return []
     warning = compose("shape-implausible", largest=largest, rms=np.sqrt(total / len(coefficients)))
     return [warning]
 
 
 def _scale(scale: float) -> list[ReportWarning]:
-    if abs(float(np.log(scale))) <= SCALE_OFF_MOST:
+    if abs(float(np.log(scale))) <= MAX_SCALE_OFF:
         return []
     warning = compose("scale-implausible", finding=compose("head-scale-off", scale=scale))
     return [warning]
@@ -130,7 +130,7 @@ def size_by_mode(model: HeadModel) -> Float[np.ndarray, " m"]:
 
 
 def _size(size: float, sigmas: float) -> list[ReportWarning]:
-    if abs(sigmas) <= SIZE_MOST:
+    if abs(sigmas) <= MAX_SIZE:
         return []
     warning = compose("size-unusual", size=size, sigmas=abs(sigmas))
     return [warning]
@@ -144,7 +144,7 @@ def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
     if not rms:
         return []
     median = float(np.median([rms[name] / widths_px[name] for name in rms]))
-    limit = max(OUTSIDE_MOST_PX_PER_WIDTH, OUTSIDE_TIMES_MEDIAN * median)
+    limit = max(MAX_OUTSIDE_PX_PER_WIDTH, OUTSIDE_TIMES_MEDIAN * median)
     return [
         compose("contour-implausible", camera=name, outside_px=of)
         for name, of in rms.items()

@@ -26,7 +26,7 @@ MIN_FACING = 0.5  # cosine: a camera that sees the head so far from the front mu
 MIN_VIEWS = 2
 ONE_SIDED = 0.95  # length of the cameras' mean direction: 0.98 for three within 12 degrees, 0.6 for the usual rig;
 # in three-brows a pose that nods by 30 degrees beat all others by 75 %
-NAMED_MOST = 4  # cameras of a warning
+MAX_NAMED = 4  # cameras of a warning
 RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best is not beaten
 
 
@@ -130,6 +130,6 @@ def _offset(pixels: Float[np.ndarray, "n 2"], found: Float[np.ndarray, "n 2"], s
 
 def _elsewhere(names: list[str], off: Mapping[str, float]) -> ReportWarning:
     worst = max(min(off[name], 10.0) for name in names)
-    more = len(names) - NAMED_MOST
-    where = compose("names-and-more", names=names[:NAMED_MOST], more=more) if more > 0 else names
+    more = len(names) - MAX_NAMED
+    where = compose("names-and-more", names=names[:MAX_NAMED], more=more) if more > 0 else names
     return compose("face-elsewhere", cameras=where, sizes=worst)

@@ -60,8 +60,8 @@ OUTSIDE_MM, OUTSIDE_DIRECTIONS, OUTSIDE_PX = (
     320,
 )  # from how far, how many and how finely a head is looked at
 REACHED_MM = 1.5  # a surface in front of a place by less is its own
-DIRECTIONS_LEAST = 8  # skin under hair is seen from 16 and more, a nostril and the inside of a mouth from 6 at most
-LEAST_PLACES = 50  # of a region, for figures of its own
+MIN_DIRECTIONS = 8  # skin under hair is seen from 16 and more, a nostril and the inside of a mouth from 6 at most
+MIN_PLACES = 50  # of a region, for figures of its own
 LEVELS: tuple[Level, ...] = ("span", "kernel", "photo", "fine")
 POOLED = ("studio", "draws")  # every subject of which counts alike in the figures of ``all``
 
@@ -199,7 +199,7 @@ def skin_figures(
     for kind, shown in {"seen": far < SEEN_MM, "hidden": hidden_skin}.items():
         for name, region in {"all": np.ones(len(deviation_mm), bool), **regions}.items():
             rows = np.flatnonzero(shown & region[nearest] & ~open_end)
-            if len(rows) < LEAST_PLACES:
+            if len(rows) < MIN_PLACES:
                 continue
             within = hit.distances[rows] < INTERVAL * stated[rows]
             found |= {
@@ -228,7 +228,7 @@ def reached_from_outside(mesh: Mesh) -> Bool[np.ndarray, " v"]:
         depth, _ = depth_map(camera, mesh.vertices, mesh.faces)
         column, row = np.rint(camera.project(mesh.vertices)).astype(int).T
         directions += camera_depths(camera, mesh.vertices) < depth[row, column] + REACHED_MM
-    return directions >= DIRECTIONS_LEAST
+    return directions >= MIN_DIRECTIONS
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:

@@ -55,7 +55,7 @@ Image = UInt8[np.ndarray, "s s 3"]
 SUBJECTS = 1
 GRID = 512  # texels that are compared: 0.7 mm a texel, beyond what two fits differ by
 PANEL = (540, 780)
-LEAST_FACING = 0.3  # cosine: flatter, the patches of a chart run together
+MIN_FACING = 0.3  # cosine: flatter, the patches of a chart run together
 LIGHTS: Mapping[str, tuple[Lamp, ...]] = {
     "studio": LAMPS,
     "left": (  # a warm window on the subject's left, hardly a fill
@@ -180,7 +180,7 @@ def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], r
     }
     plates = dict(capture.backgrounds)
     for name in scene.rig.names:
-        if facing[name] > LEAST_FACING:
+        if facing[name] > MIN_FACING:
             chart = chart_plate(scene, name, colour_chart.true_colours(), rng, turned_to=front, lamps=lamps)
             plates[name] = (*plates[name], chart)
     return replace(capture, backgrounds=plates)

@@ -47,7 +47,7 @@ STYLES = (
 SPLAT_MM = 1.8  # half the side of a point of the truth in pictures: points are 1.5 mm apart in the mean
 AZIMUTHS_DEG = (30.0, -75.0)
 SEEN_MM = 2.0  # from a visible point, 1.5 mm apart
-LEAST_PLACES = 50  # of a region, for figures of its own
+MIN_PLACES = 50  # of a region, for figures of its own
 REGIONS_SCORED = (
     "face",
     "eyes",
@@ -135,7 +135,7 @@ def region_errors(known: Known, head_world: Mesh, regions: Mapping[str, Bool[np.
     found: dict[str, float] = {}
     for name, region in regions.items():
         off, weight = hit.distances[region[nearest]], area[region[nearest]]
-        if name in REGIONS_SCORED and len(off) >= LEAST_PLACES:
+        if name in REGIONS_SCORED and len(off) >= MIN_PLACES:
             found |= {
                 f"head_{name}_seen_median_mm": weighted_quantile(off, weight, 0.5),
                 f"head_{name}_seen_mean_mm": float(off @ weight / weight.sum()),

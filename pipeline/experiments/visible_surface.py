@@ -21,8 +21,8 @@ NEIGHBOURS = 8  # samples among which one that faces the same way is looked for
 MISSING_MM = 50.0  # counted for a true point that has no such sample
 REACH_MM = 25.0  # surface farther from every true point is where nobody looked
 PLANE_MM = {"recall": 1.0, "precision": 2.0}  # sideways, within which a sample's tangent plane stands for the surface
-COUNTED_MOST = 200_000  # points of the surface for precision: shares are then good to 0.001
-LEAST_POINTS = 100  # of a part, for figures of its own
+MAX_COUNTED = 200_000  # points of the surface for precision: shares are then good to 0.001
+MIN_POINTS = 100  # of a part, for figures of its own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ def score_visible(truth: VisiblePoints, mesh: Mesh) -> VisibleScore:
     agree = np.einsum("nkx,nx->nk", normals[near], true_normals) > 0
     recall = np.where(agree, missed, np.inf).min(axis=1)
     recall[np.isinf(recall)] = MISSING_MM
-    counted = rng.choice(len(points), min(len(points), COUNTED_MOST), replace=False)
+    counted = rng.choice(len(points), min(len(points), MAX_COUNTED), replace=False)
     far, near = KDTree(true_points).query(points[counted])
     comparable = (far < REACH_MM) & (np.einsum("nx,nx->n", normals[counted], true_normals[near]) > 0)
     precision = _distances(points[counted], true_points[near], true_normals[near], far, PLANE_MM["precision"])
@@ -93,7 +93,7 @@ def _by_part(
     distances: Distances, part: Integer[np.ndarray, " n"], counted: Bool[np.ndarray, " n"]
 ) -> dict[str, dict[str, float]]:
     chosen = {name: counted & (part == code) for code, name in enumerate(PARTS)}
-    return {name: figures_of(distances[of]) for name, of in chosen.items() if of.sum() > LEAST_POINTS}
+    return {name: figures_of(distances[of]) for name, of in chosen.items() if of.sum() > MIN_POINTS}
 
 
 def document(score: VisibleScore) -> dict[str, object]:

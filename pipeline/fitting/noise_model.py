@@ -14,7 +14,7 @@ from pipeline.fitting.rim_term import observed_rim
 START_CLUTTER_MM = 12.0
 BLOCK_PX = 20.0
 BARE_SLACK_PX = 0.1  # noise of a contour's RMS
-FLOOR_SIGMAS, FLOOR_MOST_PX = 3.0, 6.0
+FLOOR_SIGMAS, MAX_FLOOR_PX = 3.0, 6.0
 UNIT_RANGE = (1.0, 40.0)  # px^3: noise of 0.5 px over 4 px; misfit of 2 px over 10 px
 
 
@@ -28,7 +28,7 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
     rim = observed_rim(problem, evidence, state, stage)
     near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
     deviation = 1.4826 * float(np.median(np.abs(near))) if len(near) > 10 else FIRST_NOISE_PX
-    floor = min(FLOOR_SIGMAS * deviation, FLOOR_MOST_PX)
+    floor = min(FLOOR_SIGMAS * deviation, MAX_FLOOR_PX)
     clutter, settled = evidence.noise.clutter, evidence.noise.is_settled
     if not settled and not stage.whole_head:  # a bare head has none
         clutter, settled = find_clutter(problem, rim, max(CLUTTER_PX, CLUTTER_SIGMAS * deviation)), True

@@ -25,7 +25,7 @@ from pipeline.fitting.fit import Fit
 from rig.mesh import vertex_normals
 
 # Measured on heads of the model's population and of another, with ears and forehead under hair (experiments hidden).
-LEAST_DETERMINED = 5.0  # coefficients; of fewer the prior's scale is not estimated
+MIN_DETERMINED = 5.0  # coefficients; of fewer the prior's scale is not estimated
 VARIANCE_RANGE = (0.1, 4.0)
 KERNEL_VARIANCE_UNSEEN = 4.0  # hidden skin strays more than seen skin: no landmark holds it in its place
 KERNEL_MM = math.hypot(*(scale.amplitude_mm for scale in SCALES))
@@ -66,7 +66,7 @@ def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
     """Estimated prior variance of a group of modes, by the unit prior's."""
     assert fit.covariance is not None
     determined = float(np.clip(1.0 - np.diag(fit.covariance)[modes], 0.0, 1.0).sum())
-    if determined < LEAST_DETERMINED:
+    if determined < MIN_DETERMINED:
         return 1.0
     return float(np.clip((fit.coefficients[modes] ** 2).sum() / determined, *VARIANCE_RANGE))
 

@@ -37,7 +37,7 @@ from pipeline.imaging.projection import packed_lens
 from pipeline.parallel_for import in_threads
 from rig.rig import Rig
 
-SAMPLES_MOST = 6000  # rim samples of one view; a full head has about 1,000
+MAX_SAMPLES = 6000  # rim samples of one view; a full head has about 1,000
 VIEWS_A_WORD = 64  # views that are swept together, a bit each
 STEPS_OUT_PX = (0.3, 2.5)  # both must leave the mask: the second drops samples at the edge of T-junctions and grooves
 
@@ -165,8 +165,8 @@ def _outlines(
     pictures = Pictures(views.packed()[some], centres, views.size[some], views.distance, views.offset[some])
     sweep = sweep_views(surface, planes, active, centres)
     counts = np.zeros(len(centres), np.int64)
-    corners = np.empty((len(centres), SAMPLES_MOST, 2), np.int32)
-    samples = np.empty((len(centres), SAMPLES_MOST, COLUMNS))
+    corners = np.empty((len(centres), MAX_SAMPLES, 2), np.int32)
+    samples = np.empty((len(centres), MAX_SAMPLES, COLUMNS))
     steps = np.array(STEPS_OUT_PX)
 
     def fill(first: int, last: int) -> None:

@@ -13,7 +13,7 @@ Plate = UInt8[np.ndarray, "h w 3"]
 
 CELLS = (64, 48)  # of a plate, compared
 DIFFERENT = 24.0  # levels, mean of a cell: black, white and coloured patches differ by more, light that drifts by less
-LEAST_CELLS = 4  # a chart of 50 px in a thousand has 6
+MIN_CELLS = 4  # a chart of 50 px in a thousand has 6
 
 
 def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:
@@ -34,4 +34,4 @@ def _differ(plates: tuple[Plate, ...]) -> bool:
     levels = small.mean(axis=(1, 2, 3), keepdims=True)
     small *= levels.mean() / np.maximum(levels, 1.0)  # another exposure is no chart
     spread = (small.max(axis=0) - small.min(axis=0)).max(axis=2)
-    return int(np.count_nonzero(spread > DIFFERENT)) >= LEAST_CELLS
+    return int(np.count_nonzero(spread > DIFFERENT)) >= MIN_CELLS

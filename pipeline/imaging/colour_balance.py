@@ -13,7 +13,7 @@ STEPS = 8  # of reweighting; gains move by less than 0.1 % after the fifth
 GAIN_SPREAD = 0.3  # prior: cameras of a rig are set alike, to a third of a stop or so
 OFFSET_SPREAD = 0.003  # of full scale: flare of a lens and the black level of a sensor
 RELATIVE, ABSOLUTE = 0.06, 0.004  # disagreement that is ordinary: shine and misfit by level, noise
-LEAST_SHARED = 50  # vertices; with fewer in common a camera keeps the gain that the prior gives
+MIN_SHARED = 50  # vertices; with fewer in common a camera keeps the gain that the prior gives
 SAMPLE = 4_000  # vertices are enough
 
 
@@ -25,7 +25,7 @@ def balance(
     shared = np.flatnonzero(np.count_nonzero(weights, axis=0) >= 2)
     shared = shared[:: max(1, len(shared) // SAMPLE)]
     gains, offsets = np.ones((cameras, 3)), np.zeros((cameras, 3))
-    if len(shared) < LEAST_SHARED:
+    if len(shared) < MIN_SHARED:
         return gains, offsets
     w = (weights[:, shared] > 0).astype(float)
     w *= np.sqrt(weights[:, shared] / weights[:, shared].max())

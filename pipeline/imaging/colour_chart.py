@@ -19,8 +19,8 @@ ROWS, COLUMNS = 4, 6
 WIDTHS_PX = (1024, 2048)  # of the picture, as it is searched: finds charts of 90 px and more there, then smaller ones
 INNER = 0.5  # of a patch's sides: its rim is blurred, and its frame black
 CLIPPED = 0.97  # linear: what a sensor no longer tells
-LEAST_PATCHES = 18  # that are not clipped, for nine numbers
-MOST_OFF = 0.06  # rms of what the correction leaves of the patches: its own colours in another order leave 0.2
+MIN_PATCHES = 18  # that are not clipped, for nine numbers
+MAX_OFF = 0.06  # rms of what the correction leaves of the patches: its own colours in another order leave 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,14 +98,14 @@ def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
     seen = np.concatenate([chart.colours for chart in charts])
     true = np.concatenate([true_colours()] * len(charts))
     kept = (seen < CLIPPED).all(axis=1)
-    if kept.sum() < LEAST_PATCHES:
+    if kept.sum() < MIN_PATCHES:
         return None
     # What is dark is to be as right as what is bright, as eyes have it.
     weight = 1.0 / (0.1 + true[kept].mean(axis=1, keepdims=True))
     matrix = np.linalg.lstsq(seen[kept] * weight, true[kept] * weight, rcond=None)[0].T
     off = float(np.sqrt(np.mean((seen[kept] @ matrix.T - true[kept]) ** 2)))
     bright = matrix.sum(axis=1)  # of grey
-    return ChartCorrection(matrix, off) if off < MOST_OFF and (bright > 0).all() else None
+    return ChartCorrection(matrix, off) if off < MAX_OFF and (bright > 0).all() else None
 
 
 def chart_normal(chart: Chart, camera: Camera) -> Float[np.ndarray, " 3"]:

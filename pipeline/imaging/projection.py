@@ -6,13 +6,13 @@ from jaxtyping import Float
 from pipeline.imaging.projection_kernels import project_all
 from rig.camera import Camera
 
-RADIUS_MOST = 1e6  # instead of an endless turning radius, which compiled loops with fast arithmetic may not meet
+MAX_RADIUS = 1e6  # instead of an endless turning radius, which compiled loops with fast arithmetic may not meet
 
 
 def packed_lens(camera: Camera) -> Float[np.ndarray, " 10"]:
     """Returns fx fy cx cy k1 k2 p1 p2 k3 and the turning radius."""
     k = camera.intrinsics
-    return np.append(k.values(), min(k.distortion.max_valid_radius(), RADIUS_MOST))
+    return np.append(k.values(), min(k.distortion.max_valid_radius(), MAX_RADIUS))
 
 
 def packed_camera(camera: Camera) -> Float[np.ndarray, " 22"]:

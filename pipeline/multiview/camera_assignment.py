@@ -19,8 +19,8 @@ from jaxtyping import Float, Float32, Int
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import (
     BORDER_PX,
-    LEAST_SLOPE,
     LONGEST_SPAN,
+    MIN_SLOPE,
     angle_slopes,
     epipolar_plane_axes,
     outer_hull,
@@ -30,7 +30,7 @@ from rig.camera import Camera
 from rig.messages.message import Message, compose, texts_of
 from rig.rig import Rig
 
-NOISE_LEAST_PX, NOISE_MOST_PX = 0.5, 1.5  # of one tangency: what masks leave, and what exchanges may not hide in
+MIN_NOISE_PX, MAX_NOISE_PX = 0.5, 1.5  # of one tangency: what masks leave, and what exchanges may not hide in
 ROBUST_SIGMAS = 3.0
 INSET_PX = (
     2.0  # hair that one camera resolves and the other does not: misses of 2.4 px become 0.9 (three quarters: half)
@@ -45,7 +45,7 @@ FITTING_MISFIT = (
 # 3 to 11 cameras; two knocked cameras whose pictures are tried on each other keep 0.34 and more
 NAMED_GAIN = 1.5  # tangents that an exchange explains before it is named: of three cameras that share three at most
 REPAIRED_GAIN = 4.0  # and before it is believed without asking: five planes, met by chance once in 10,000
-CAMERAS_LEAST = 3
+MIN_CAMERAS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +83,7 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
         An empty assignment where every camera holds its own picture, or where no exchange explains what is wrong.
     """
     seen = with_masks(silhouettes, rig)
-    if len(seen) < CAMERAS_LEAST:
+    if len(seen) < MIN_CAMERAS:
         return NOTHING
     hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
     if not _any_suspect(hulls, seen):
@@ -96,7 +96,7 @@ def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, flo
     """Tells how much each camera's picture contradicts the others where it is filed: 0.2 for its own, 0.5 and more for
     another's (mean robust misfit of its tangent planes)."""
     seen = with_masks(silhouettes, rig)
-    if len(seen) < CAMERAS_LEAST:
+    if len(seen) < MIN_CAMERAS:
         return dict.fromkeys(seen.names, CUT_OFF_MISFIT)
     errors_px = tangency_errors_px([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
     return dict(zip(seen.names, mean_misfit(errors_px, CUT_OFF_MISFIT).tolist(), strict=True))
@@ -154,7 +154,7 @@ def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> F
 
 def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Angles by angles a pixel; NaN where a plane has no direction, as in two cameras at one place."""
-    return np.divide(gap, step, out=np.full(gap.shape, np.nan), where=step > LEAST_SLOPE)
+    return np.divide(gap, step, out=np.full(gap.shape, np.nan), where=step > MIN_SLOPE)
 
 
 def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
@@ -184,7 +184,7 @@ def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"],
 def _noise_px(errors_px: Float[np.ndarray, " n"]) -> float:
     """Standard deviation (px) of a plane's miss by the best quarter: half of them may be of exchanged pictures."""
     quarter = float(np.quantile(np.abs(errors_px), 0.25)) if len(errors_px) else 0.0
-    return float(np.clip(quarter / 0.3186, NOISE_LEAST_PX, NOISE_MOST_PX))
+    return float(np.clip(quarter / 0.3186, MIN_NOISE_PX, MAX_NOISE_PX))
 
 
 def _robust(miss_px: np.ndarray, scale_px: float) -> np.ndarray:

@@ -35,13 +35,13 @@ INSET_MM = 2.2  # four pixels of the usual rig: a strand under a mask that is 2 
 NOISE_FLOOR_PX = 0.28  # of one contour, in its own pixels, never less however well they agree by chance
 ROBUST_SIGMAS = 3.0
 _LOSS = GemanMcClure(ROBUST_SIGMAS)
-EQUATIONS_LEAST = 5  # of a camera: two unknowns, and enough left over to judge them
-INDEPENDENT_LEAST = 0.3  # sine of the angle between two normals whose crossing is proposed
+MIN_EQUATIONS = 5  # of a camera: two unknowns, and enough left over to judge them
+MIN_INDEPENDENT = 0.3  # sine of the angle between two normals whose crossing is proposed
 NO_SHIFT_INFORMATION = 1e-6  # px^-2: keeps a shift that no normal sees at zero
-SIGMAS_LEAST, SHIFT_LEAST_PX = 8.0, 1.5  # good cameras reach 4, cameras turned by 0.2 degrees 14 and more
-GAIN_LEAST = 0.4  # share of the camera's own robust misfit that its shift must explain, and of all but one of them
+MIN_SIGMAS, MIN_SHIFT_PX = 8.0, 1.5  # good cameras reach 4, cameras turned by 0.2 degrees 14 and more
+MIN_GAIN = 0.4  # share of the camera's own robust misfit that its shift must explain, and of all but one of them
 LOOSE_PX = 1.5  # standard deviation of how loose a mask is: 1 to 2 px in real photographs
-MOVED_SIGMAS_LEAST = 4.0  # by which a shift explains the planes better than loose masks do, or both explain them
+MIN_MOVED_SIGMAS = 4.0  # by which a shift explains the planes better than loose masks do, or both explain them
 CHANCE = 0.01  # that a good camera disagrees so much with the rest (F test)
 
 
@@ -103,14 +103,14 @@ def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | Non
     rest = _normalised([t for t in tangencies if name not in t.cameras])
     scale = max(1.0, 1.4826 * float(np.median(np.abs(rest)))) if len(rest) else 1.0
     equations = ShiftEquations.of(name, tangencies, scale * NOISE_FLOOR_PX)
-    if len(equations.excess_px) < EQUATIONS_LEAST:
+    if len(equations.excess_px) < MIN_EQUATIONS:
         return None
     found = _robust_shift(equations)
     before, after = _misfits(equations.excess_px / equations.noise_px), _misfits(equations.missed(found.shift_px, 0.0))
     size = float(np.linalg.norm(found.shift_px))
-    if found.sigmas < SIGMAS_LEAST or size < SHIFT_LEAST_PX or not _explains(before, after):
+    if found.sigmas < MIN_SIGMAS or size < MIN_SHIFT_PX or not _explains(before, after):
         return None
-    moved = _beyond_loose_masks(equations, found) >= MOVED_SIGMAS_LEAST and _disagrees(before, _misfits(rest / scale))
+    moved = _beyond_loose_masks(equations, found) >= MIN_MOVED_SIGMAS and _disagrees(before, _misfits(rest / scale))
     turn = np.degrees(np.arctan(size / camera.intrinsics.fx))
     return Drift(name, found.shift_px, found.deviation_px, float(turn), found.sigmas, moved)
 
@@ -180,7 +180,7 @@ def _robust_shift(equations: ShiftEquations) -> _Shift:
     """The shift of least robust misfit, from the best of those that pairs of equations propose. Where the equations
     are all of one direction, the shift stays zero across it."""
     pairs = np.stack(np.triu_indices(len(equations.excess_px), 1), axis=1)
-    pairs = pairs[np.abs(np.linalg.det(equations.normals[pairs])) > INDEPENDENT_LEAST]
+    pairs = pairs[np.abs(np.linalg.det(equations.normals[pairs])) > MIN_INDEPENDENT]
     met = np.linalg.solve(equations.normals[pairs], equations.excess_px[pairs][:, :, None])[:, :, 0]
     proposals = np.concatenate([np.zeros((1, 2)), met])
     misses = (equations.excess_px - proposals @ equations.normals.T) / equations.noise_px
@@ -212,7 +212,7 @@ def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -
     """Whether the shift takes enough of the misfits away, and not of a single one alone: a bad stretch of one outline
     is met by one tangent plane, a moved camera by all of its own."""
     others = np.arange(len(before)) != np.argmax(before - after)
-    return all(after[k].sum() <= (1.0 - GAIN_LEAST) * before[k].sum() for k in (slice(None), others))
+    return all(after[k].sum() <= (1.0 - MIN_GAIN) * before[k].sum() for k in (slice(None), others))
 
 
 def _disagrees(misfits: Float[np.ndarray, " n"], rest: Float[np.ndarray, " m"]) -> bool:

@@ -25,7 +25,7 @@ HEAD_MM = 200.0  # median diameter of 32 heads with hair, 18 captures of the stu
 WARNED_MM = (145.0, 270.0)  # bald heads of adults have 161 and more, hair 40 mm thick 245 at most
 REFUSED_MM = (122.0, 350.0)  # a bald child of three has 130, hair 60 mm thick 310 at most; twice a bald head has 322
 STRAND_SHARE = 0.06  # of a mask's size (root of its area): a centimetre of a head, which loose strands do not fill
-VIEWS_LEAST = 3  # whose crown is in the picture
+MIN_VIEWS = 3  # whose crown is in the picture
 
 
 def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float | None:
@@ -43,14 +43,14 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float |
         crown = crown_disc(silhouette.mask)
         if crown is not None:
             seen.append((camera, *crown))
-    if len(seen) < VIEWS_LEAST:
+    if len(seen) < MIN_VIEWS:
         return None
     middle = _crossing([camera for camera, _, _ in seen], np.array([pixel for _, pixel, _ in seen]))
     depths = np.array([float(camera.camera_from_world.apply(middle)[2]) for camera, _, _ in seen])
     focal = np.array([camera.intrinsics.fx for camera, _, _ in seen])
     diameters = np.array([diameter for _, _, diameter in seen]) * depths / focal
     ahead = diameters[depths > 0]
-    return float(np.median(ahead)) if len(ahead) >= VIEWS_LEAST else None
+    return float(np.median(ahead)) if len(ahead) >= MIN_VIEWS else None
 
 
 class WrongScale(EigenheadError):

@@ -25,15 +25,15 @@ from rig.messages.message import Message, compose
 from rig.plausibility import alternative_conventions
 from rig.rig import Rig
 
-CAMERAS_LEAST = 4  # three have six planes at most: too few to refuse a capture by
-PLANES_LEAST = 4  # of a camera whose word counts
-WRONG_LEAST = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
-RIGHT_MOST = 0.25  # of a reading that is believed
+MIN_CAMERAS = 4  # three have six planes at most: too few to refuse a capture by
+MIN_PLANES = 4  # of a camera whose word counts
+MIN_WRONG = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
+MAX_RIGHT = 0.25  # of a reading that is believed
 LOOSE_QUARTER = 22e-4  # of the picture's width, that the better quarter of all planes misses at most in a right rig
 # whose masks are loose: 20e-4 with long hair in 8 to 24 views; 24e-4 and more in rigs of another arrangement
-LOOSE_BIMODAL, LOOSE_QUARTER_MOST = 0.28, 35e-4  # of the median miss: shadows spoil some planes and leave others whole,
+LOOSE_BIMODAL, MAX_LOOSE_QUARTER = 0.28, 35e-4  # of the median miss: shadows spoil some planes and leave others whole,
 # 0.03 to 0.25 with shadows in all of 11 views; a wrong rig's misses have one spread, 0.34 and more
-MISPLACED_LEAST = 0.6  # of one camera among good ones: 0.95 with its rotation transposed; good ones reach 0.25
+MIN_MISPLACED = 0.6  # of one camera among good ones: 0.95 with its rotation transposed; good ones reach 0.25
 MISPLACED_AMONG = 5  # cameras; of four, one that is wrong leaves three, who have six planes at most
 
 Pixels = Float[np.ndarray, "_ 2"]
@@ -48,10 +48,10 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
         rig: the cameras as calibrated.
     """
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
-    if len(seen) < CAMERAS_LEAST:
+    if len(seen) < MIN_CAMERAS:
         return None
     hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
-    if not _median_misfit(hulls, seen) >= WRONG_LEAST:
+    if not _median_misfit(hulls, seen) >= MIN_WRONG:
         return None
     square = all(camera.intrinsics.width == camera.intrinsics.height for camera in seen)
     conventions = (*_CONVENTIONS, *(_SQUARE_CONVENTIONS if square else ()))
@@ -59,7 +59,7 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
     for other, read, remedy in alternative_conventions(seen):
         message = compose("other-convention", convention=other, remedy=remedy)
         found.append((_median_misfit(hulls, read), message))
-    believed = [(misfit, message) for misfit, message in found if misfit <= RIGHT_MOST]
+    believed = [(misfit, message) for misfit, message in found if misfit <= MAX_RIGHT]
     if believed:
         return min(believed, key=lambda one: one[0])[1]
     return None if _are_loose(hulls, seen) else compose("other-rig")
@@ -69,9 +69,9 @@ def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
     """Tells whether most outlines contradict the others, though these cameras took the pictures (``wrong_rig`` is
     None)."""
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
-    if len(seen) < CAMERAS_LEAST:
+    if len(seen) < MIN_CAMERAS:
         return False
-    return _median_misfit([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen) >= WRONG_LEAST
+    return _median_misfit([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen) >= MIN_WRONG
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
@@ -83,7 +83,7 @@ def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | N
     errors_px = tangency_errors_px([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
     misfit, planes = mean_misfit(errors_px), np.isfinite(errors_px).sum(axis=(1, 2))
     worst = int(np.argmax(misfit))
-    if misfit[worst] < MISPLACED_LEAST or planes[worst] < PLANES_LEAST:
+    if misfit[worst] < MIN_MISPLACED or planes[worst] < MIN_PLANES:
         return None
     others = np.delete(np.arange(len(seen)), worst)
     agree = mean_misfit(errors_px[np.ix_(others, others)]).max() <= FITTING_MISFIT
@@ -93,8 +93,8 @@ def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | N
 def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
     """Median over the cameras of the mean robust misfit of their planes (0 to 1); NaN where too few planes speak."""
     errors_px = tangency_errors_px(hulls, rig)
-    speaking = np.isfinite(errors_px).sum(axis=(1, 2)) >= PLANES_LEAST
-    return float(np.median(mean_misfit(errors_px)[speaking])) if speaking.sum() >= CAMERAS_LEAST else np.nan
+    speaking = np.isfinite(errors_px).sum(axis=(1, 2)) >= MIN_PLANES
+    return float(np.median(mean_misfit(errors_px)[speaking])) if speaking.sum() >= MIN_CAMERAS else np.nan
 
 
 def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
@@ -103,7 +103,7 @@ def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
     widths = np.array([camera.intrinsics.width for camera in rig], float)
     shares = np.abs(errors_px) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
     quarter, half = np.nanquantile(shares, (0.25, 0.5))
-    return bool(quarter <= LOOSE_QUARTER or quarter <= min(LOOSE_BIMODAL * half, LOOSE_QUARTER_MOST))
+    return bool(quarter <= LOOSE_QUARTER or quarter <= min(LOOSE_BIMODAL * half, MAX_LOOSE_QUARTER))
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:

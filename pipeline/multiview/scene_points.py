@@ -15,11 +15,11 @@ from jaxtyping import Float, UInt8
 from rig.camera import Camera
 from rig.rig import Rig
 
-KEYPOINTS_MOST = 3000  # a view
-WIDTH_MOST = 1400  # px: larger pictures are reduced, a pixel is not asked for here
-NEIGHBOURS, ANGLE_MOST_DEG, ANGLE_LEAST_DEG = 4, 50.0, 1.5  # of the rays at the subject; SIFT bears 30 degrees or so
+MAX_KEYPOINTS = 3000  # a view
+MAX_WIDTH = 1400  # px: larger pictures are reduced, a pixel is not asked for here
+NEIGHBOURS, MAX_ANGLE_DEG, MIN_ANGLE_DEG = 4, 50.0, 1.5  # of the rays at the subject; SIFT bears 30 degrees or so
 RATIO = 0.75  # of the best match's distance to the second's (Lowe 2004 has 0.8)
-MISS_MOST_PX = 1.5  # of the reduced picture
+MAX_MISS_PX = 1.5  # of the reduced picture
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,16 +72,16 @@ def neighbouring_pairs(rig: Rig) -> list[tuple[str, str]]:
         (min(i, int(j)), max(i, int(j)))
         for i in range(len(rig))
         for j in np.argsort(angle[i])[:NEIGHBOURS]
-        if angle[i, j] < ANGLE_MOST_DEG
+        if angle[i, j] < MAX_ANGLE_DEG
     }
     return [(rig.names[i], rig.names[j]) for i, j in sorted(pairs)]
 
 
 def _keypoints(image: UInt8[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of the full image, and descriptors."""
-    scale = min(1.0, WIDTH_MOST / max(image.shape[:2]))
+    scale = min(1.0, MAX_WIDTH / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
-    found, descriptors = cv2.SIFT.create(nfeatures=KEYPOINTS_MOST).detectAndCompute(
+    found, descriptors = cv2.SIFT.create(nfeatures=MAX_KEYPOINTS).detectAndCompute(
         cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None
     )
     at = np.array([point.pt for point in found]).reshape(-1, 2)
@@ -119,8 +119,8 @@ def _where_rays_pass(
     along_u = (u @ base - cosine * (v @ base)) / sine2
     along_v = (cosine * (u @ base) - v @ base) / sine2
     points = 0.5 * (a.centre_world + along_u[:, None] * u + b.centre_world + along_v[:, None] * v)
-    limit = MISS_MOST_PX * max(1.0, max(a.intrinsics.width, a.intrinsics.height) / WIDTH_MOST)
-    good = (sine2 > np.sin(np.radians(ANGLE_LEAST_DEG)) ** 2) & (along_u > 0) & (along_v > 0)
+    limit = MAX_MISS_PX * max(1.0, max(a.intrinsics.width, a.intrinsics.height) / MAX_WIDTH)
+    good = (sine2 > np.sin(np.radians(MIN_ANGLE_DEG)) ** 2) & (along_u > 0) & (along_v > 0)
     for camera, at in ((a, first), (b, second)):
         with np.errstate(invalid="ignore"):
             good &= np.linalg.norm(camera.project(points) - at, axis=1) < limit

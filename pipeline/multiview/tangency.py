@@ -17,7 +17,7 @@ from rig.rig import Rig
 
 BORDER_PX = 4.0  # a tangent this near the image border may belong to what the border has cut off
 LONGEST_SPAN = 2.0  # rad of a silhouette about the line of two centres: beyond, the epipole lies in or near it
-LEAST_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
+MIN_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +107,7 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
         slopes = [
             angle_slopes(rays_about(camera, pixel), u, v) for camera, pixel in zip((one, two), pixels, strict=True)
         ]
-        if min(np.linalg.norm(slope) for slope in slopes) >= LEAST_SLOPE:
+        if min(np.linalg.norm(slope) for slope in slopes) >= MIN_SLOPE:
             difference = float(angles[0][i] - angles[1][j])
             found.append(tangency((one.name, two.name), pixels, (slopes[0], slopes[1]), difference, outward))
     return found

@@ -20,7 +20,7 @@ from rig.rig import Rig
 LIMITS = Limits(steps=50, tolerance=1e-12, tries=6)  # a step of 1e-6 standard deviations
 STEPS = 10  # of many points at once; three are usual
 SETTLED = 1e-9  # share of the misfit that a last step still takes away
-RAYS_APART_LEAST = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
+MIN_RAYS_APART = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 1500 px, depth is unknown
 
 
 class NoPoint(EigenheadError):
@@ -160,7 +160,7 @@ def _nearest_to_rays(
     weights = weights / weights.sum(axis=0)
     off_rays = np.eye(3) - rays_world[..., :, None] * rays_world[..., None, :]
     normal = np.einsum("vn,vnij->nij", weights, off_rays)
-    if np.linalg.eigvalsh(normal)[:, 0].min() < RAYS_APART_LEAST**2:
+    if np.linalg.eigvalsh(normal)[:, 0].min() < MIN_RAYS_APART**2:
         raise NoPoint(compose("point-rays-parallel"))
     right = np.einsum("vn,vnij,vj->ni", weights, off_rays, centres_world)
     return np.linalg.solve(normal, right[..., None])[..., 0]
@@ -190,6 +190,6 @@ def _start(rays_world: Mapping[str, Float[np.ndarray, " 3"]], rig: Rig) -> Float
     if not np.isfinite(normal).all():
         raise NoPoint(compose("point-outside-lens"))
     # The smallest eigenvalue is the sum of squared sines between the rays and their mean direction.
-    if np.linalg.eigvalsh(normal)[0] < RAYS_APART_LEAST**2:
+    if np.linalg.eigvalsh(normal)[0] < MIN_RAYS_APART**2:
         raise NoPoint(compose("point-rays-parallel"))
     return np.linalg.solve(normal, right)

@@ -23,7 +23,7 @@ from rig.messages.message import compose
 from rig.rig import Rig
 
 SPACING_MM = 3.0
-LEAST_SHARE = 0.5  # of the views must see a point of the hull; where fewer look, anything could be
+MIN_SHARE = 0.5  # of the views must see a point of the hull; where fewer look, anything could be
 
 
 class NoHull(EigenheadError):
@@ -108,7 +108,7 @@ def _field(
     everywhere = np.ones((blocks,) * 3, bool)
     for camera in cameras:
         carve_view(coarse, votes, everywhere, 1, corner, wide, packed_camera(camera), silhouettes[camera.name].distance)
-    _settle(coarse, votes, LEAST_SHARE * len(cameras))
+    _settle(coarse, votes, MIN_SHARE * len(cameras))
     # The field grows by at most a millimetre a millimetre (and a little: perspective), so that only blocks whose
     # corners are within their own diagonal of the surface can hold any of it.
     near = np.abs(coarse) < 1.2 * np.sqrt(3) * wide
@@ -121,7 +121,7 @@ def _field(
     step = wide / COARSE
     for camera in cameras:
         carve_view(exact, votes, active, COARSE, corner, step, packed_camera(camera), silhouettes[camera.name].distance)
-    _settle(exact, votes, LEAST_SHARE * len(cameras))
+    _settle(exact, votes, MIN_SHARE * len(cameras))
     known = np.zeros(fine.shape, bool)
     mark_occupied(known, active)
     fine = np.where(known, exact, fine)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int8
 
 from pipeline.imaging.projection import packed_camera
 from pipeline.multiview.visual_hull import mask_extent
-from pipeline.silhouettes.cross_view_kernels import LEAST_WITNESSES, least_dissent
+from pipeline.silhouettes.cross_view_kernels import MIN_WITNESSES, least_dissent
 from rig.rig import Rig
 
 
@@ -21,13 +21,13 @@ def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
     """Tells how many of the other cameras deny the subject at each doubtful pixel of camera ``name`` (at most
-    ``MOST``); -1 where nobody was asked or too few can see.
+    ``MAX_DISSENT``); -1 where nobody was asked or too few can see.
 
     Masks may be smaller than the images; all are evenly reduced.
     """
     out = np.full(doubt.shape, -1, np.int8)
     others = [camera for camera in rig if camera.name != name and masks[camera.name].any()]
-    if len(others) < LEAST_WITNESSES or not doubt.any():
+    if len(others) < MIN_WITNESSES or not doubt.any():
         return out
     centre, edge = mask_extent({camera.name: masks[camera.name] for camera in others}, rig)
     rows, columns = np.nonzero(doubt)

@@ -5,8 +5,8 @@ import numpy as np
 from pipeline.compiled import njit
 from pipeline.imaging.projection_kernels import LENS, NEAREST_MM, distorted, placed
 
-MOST = 3  # more dissent than this is not counted
-LEAST_WITNESSES = 4  # cameras that must see a point before it can be allowed
+MAX_DISSENT = 3  # more dissent than this is not counted
+MIN_WITNESSES = 4  # cameras that must see a point before it can be allowed
 STEPS = 96  # points on a ray: 4 mm on a subject of 400 mm
 SLACK = 1.0  # mask pixels by which a point may miss a mask
 
@@ -25,7 +25,7 @@ def least_dissent(
     out = np.full(len(rays), -1, np.int8)
     step = (span[1] - span[0]) / STEPS
     for n in range(len(rays)):
-        best = MOST + 1
+        best = MAX_DISSENT + 1
         for s in range(STEPS):
             reach = span[0] + (s + 0.5) * step
             x, y, z = (origin[0] + reach * rays[n, 0], origin[1] + reach * rays[n, 1], origin[2] + reach * rays[n, 2])
@@ -46,12 +46,12 @@ def least_dissent(
                 against += away > SLACK + 0.5 * step * p[LENS] / (cz * scales[k])
                 if against >= best:
                     break
-            if seen >= LEAST_WITNESSES and against < best:
+            if seen >= MIN_WITNESSES and against < best:
                 best = against
                 if best == 0:
                     break
-        if best <= MOST:
+        if best <= MAX_DISSENT:
             out[n] = best
-        elif best == MOST + 1:
-            out[n] = MOST
+        elif best == MAX_DISSENT + 1:
+            out[n] = MAX_DISSENT
     return out

@@ -20,7 +20,7 @@ from pipeline.imaging.masks import dilated, eroded, spread
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import CHANNEL_SUM, Background, coarse_size, estimate_background
 from pipeline.silhouettes.mean_field import smooth_odds
-from pipeline.silhouettes.mean_field_kernels import MOST_ODDS
+from pipeline.silhouettes.mean_field_kernels import MAX_ODDS
 from pipeline.silhouettes.shadows import find_shadows
 
 CLOSING = 2  # coarse pixels
@@ -33,14 +33,14 @@ ALLOWED, DENIED = 4.0, 3.0  # log odds for a pixel that no other camera denies, 
 PALETTE = 16  # bins a channel of the subject's colours
 ANY_LEVELS = 64  # a channel: the spread of any colour at all, as in settings.evidence
 REACH = 24  # coarse pixels from the mask in which a doubtful pixel may still be the subject
-PLATE_CHI2_MOST = 3.0  # chi-squared by its median over the background, up to which a pixel is the plate: 93 % of it are
+MAX_PLATE_CHI2 = 3.0  # chi-squared by its median over the background, up to which a pixel is the plate: 93 % of it are
 HAIR_DEPTH = 6  # coarse pixels (24 px)
 
 
 NOISE_HOLE_COARSE_PX = 3  # coarse pixels: a hole of this size is noise wherever it is
 MIXED = 0.1  # of the difference to the plate: standard deviation within a coarse pixel from which it is a mixture
 STRAND_SHADES = 0.75, 1.0, 1.33  # of the subject's colour nearby, in which strands before the plate may be
-FAINT_CHI2_MOST = 100.0  # chi-squared of a mean over nine pixels
+MAX_FAINT_CHI2 = 100.0  # chi-squared of a mean over nine pixels
 UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must leave, and that by the whole
 
 
@@ -74,9 +74,9 @@ def decide(
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     background = estimate_background(image, coarse, empty_plates(plates), settings)
     chi2, variance = _against_plate(coarse, background, image.shape[1] / size[0], settings)
-    odds = np.clip(0.5 * chi2 - settings.evidence, -MOST_ODDS, MOST_ODDS)
+    odds = np.clip(0.5 * chi2 - settings.evidence, -MAX_ODDS, MAX_ODDS)
     left, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)
-    chi2, odds = np.where(shadow, left, chi2), np.where(shadow, -MOST_ODDS / 2, odds).astype(np.float32)
+    chi2, odds = np.where(shadow, left, chi2), np.where(shadow, -MAX_ODDS / 2, odds).astype(np.float32)
     probability = smooth_odds(odds, coarse, background, settings)
     raw = probability > 0.5
     away, mixture = find_mixtures(image, coarse, background)
@@ -85,7 +85,7 @@ def decide(
     other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance, settings)
     clear &= ~dilated(other, 1)
     plain = (
-        clear & (chi2 < PLATE_CHI2_MOST * np.median(chi2[background.inliers]))
+        clear & (chi2 < MAX_PLATE_CHI2 * np.median(chi2[background.inliers]))
         if background.inliers.any()
         else clear & False
     )
@@ -108,7 +108,7 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: Se
     """Returns the decision after other cameras spoke: ``dissent`` is how many of them deny that a doubtful pixel shows
     the subject, negative where they were not asked."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
-    revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MOST_ODDS, MOST_ODDS)
+    revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MAX_ODDS, MAX_ODDS)
     odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
     probability = smooth_odds(odds, decision.coarse, decision.background, settings)
     mask, detached_component_areas = whole_subject(probability > 0.5, decision.plain, settings)
@@ -188,7 +188,7 @@ def _other_colour(
     shades: strands are not all alike) explains a faint difference, so that the subject has another colour there; and
     the chi-squared that they leave, of nine pixels' mean."""
     weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
-    faint = ((difference**2 * weight) @ CHANNEL_SUM < FAINT_CHI2_MOST).astype(np.float32)
+    faint = ((difference**2 * weight) @ CHANNEL_SUM < MAX_FAINT_CHI2).astype(np.float32)
     mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]
     square = (mean**2 * weight) @ CHANNEL_SUM
     left = square

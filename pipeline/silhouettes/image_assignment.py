@@ -36,7 +36,7 @@ PLATE_SEEN = (
 PLATE_GAIN = 1.3  # how many times as much of each picture the other plates must explain; another's explains 0 to 0.5
 PLATE_COLUMNS = 64
 PLATE_TOLERANCE = 0.06  # of log level: 2 % of light drift, vignetting, and noise averaged over 16 x 16 pixels
-CLICK_PX, CLICK_MISFIT_MOST = 1.5, 50.0
+CLICK_PX, MAX_CLICK_MISFIT = 1.5, 50.0
 
 
 Segmentation = Callable[[Capture], dict[str, Silhouette]]
@@ -205,8 +205,8 @@ def _contradiction(features: Features, rig: Rig) -> float:
             try:
                 misfit = triangulate(known, rig, noise_px=CLICK_PX).misfit(CLICK_PX)
             except NoPoint:
-                misfit = CLICK_MISFIT_MOST
-            total += min(misfit, CLICK_MISFIT_MOST)
+                misfit = MAX_CLICK_MISFIT
+            total += min(misfit, MAX_CLICK_MISFIT)
     return total
 
 

@@ -22,7 +22,7 @@ from pipeline.imaging.masks import box_around, dilated, eroded, spread
 from pipeline.settings import SegmentationSettings
 from pipeline.silhouettes.background import Background
 from pipeline.silhouettes.foreground import Decision
-from pipeline.silhouettes.matting_kernels import ALPHA_INFORMATION_MOST, solve_alpha
+from pipeline.silhouettes.matting_kernels import MAX_ALPHA_INFORMATION, solve_alpha
 from rig.colour_space import linear_from_srgb
 
 INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour: beyond the blur of an edge (3 sigma)
@@ -98,11 +98,11 @@ def _smooth(
 ) -> Float32[np.ndarray, "h w"]:
     """Alpha averaged by ``trust`` (1 / variance), in a window that is wider where it is low."""
     near = cv2.GaussianBlur(alpha, (0, 0), sigma)
-    if not (trust < ALPHA_INFORMATION_MOST).any():
+    if not (trust < MAX_ALPHA_INFORMATION).any():
         return near
     weight = cv2.GaussianBlur(trust, (0, 0), WIDE_PX)
     far = cv2.GaussianBlur(trust * alpha, (0, 0), WIDE_PX) / weight
-    share = np.clip(2 - 2 * weight / ALPHA_INFORMATION_MOST, 0, 1)
+    share = np.clip(2 - 2 * weight / MAX_ALPHA_INFORMATION, 0, 1)
     return near + share * (far - near)
 
 

@@ -6,7 +6,7 @@ from pipeline.compiled import njit
 from pipeline.imaging.sampling_kernels import bilinear
 
 OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
-ALPHA_INFORMATION_MOST = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
+MAX_ALPHA_INFORMATION = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -56,7 +56,7 @@ def solve_alpha(
     columns = np.minimum(np.arange(width) * cw // width, cw - 1)
     alpha = np.empty((height, width), np.float32)
     contrast = np.full((height, width), -1.0, np.float32)
-    trust = np.full((height, width), ALPHA_INFORMATION_MOST, np.float32)
+    trust = np.full((height, width), MAX_ALPHA_INFORMATION, np.float32)
     for y in range(height):
         zy = min(y * ch // height, ch - 1)
         ly, fly = corner_of(y, height, ch)
@@ -114,5 +114,5 @@ def solve_alpha(
             alpha[y, x] = value
             known = max(determinant / m11 - 1 / coarse_sigma**2, 1e-6)
             contrast[y, x] = np.sqrt(known)
-            trust[y, x] = min(ALPHA_INFORMATION_MOST, known)
+            trust[y, x] = min(MAX_ALPHA_INFORMATION, known)
     return alpha, contrast, trust

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.compiled import njit
 
-MOST_ODDS = 6.0  # log odds are clipped there, so that one pixel cannot outvote its eight neighbours for ever
+MAX_ODDS = 6.0  # log odds are clipped there, so that one pixel cannot outvote its eight neighbours for ever
 
 
 @njit(cache=True, nogil=True)
@@ -51,7 +51,7 @@ def undecided_pixels(odds: np.ndarray) -> np.ndarray:
     count = 0
     for y in range(height):
         for x in range(width):
-            sure = abs(odds[y, x]) >= MOST_ODDS
+            sure = abs(odds[y, x]) >= MAX_ODDS
             for v in range(max(0, y - 2), min(height, y + 3)):
                 for u in range(max(0, x - 2), min(width, x + 3)):
                     sure = sure and odds[v, u] == odds[y, x]

@@ -44,7 +44,7 @@ SEEDED_VIEWS = 8  # fewer do not tell the subject by each other, and begin with 
 ENOUGH_USABLE = 0.7  # of the views: 1 of 11 where skin and wall are alike, all of them in scan-a and draw-b, which a
 # face as the beginning makes no better
 BODY_FILLS = 0.75  # of the subject's width is on the border where shoulders leave; a cut above the brow leaves less
-LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
+MIN_GAIN, MAX_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
 
 def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress) -> dict[str, Silhouette]:
@@ -259,7 +259,7 @@ def _quality(
     if share < settings.least_area or share > 0.95:
         fatal.append(compose("subject-area-absurd", share=share))
     gains = figures.get("gain", [1.0])
-    if not all(LEAST_GAIN < g < MOST_GAIN for g in gains):
+    if not all(MIN_GAIN < g < MAX_GAIN for g in gains):
         fatal.append(compose("light-changed", factor=max(gains)))
     warnings += [compose("view-unused", remark=text) for text in fatal]
     components, holes = components_holes

@@ -20,7 +20,7 @@ from rig.errors import EigenheadError
 from rig.messages.message import compose
 from rig.rig import Rig
 
-VIEWS_LEAST = 3
+MIN_VIEWS = 3
 
 
 class TooFewViews(EigenheadError):
@@ -40,7 +40,7 @@ class TooFewViews(EigenheadError):
             remedy = compose("advice-supply-plates")
         usable, every = len(silhouettes) - len(poor), len(silhouettes)
         super().__init__(
-            compose("too-few-views", usable=usable, all=every, needed=VIEWS_LEAST, reasons=reasons, remedy=remedy)
+            compose("too-few-views", usable=usable, all=every, needed=MIN_VIEWS, reasons=reasons, remedy=remedy)
         )
 
 
@@ -73,10 +73,10 @@ def usable_views(
     Raises:
         ExchangedPictures, WrongRig: of ``assign_images``.
         WrongScale: of ``judge_head_size``.
-        TooFewViews: fewer than ``VIEWS_LEAST`` silhouettes are of use.
+        TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are of use.
     """
     assigned = assign_images(capture, rig, segmented, exchanged=exchanged)
-    if sum(silhouette.quality.usable for silhouette in assigned.silhouettes.values()) < VIEWS_LEAST:
+    if sum(silhouette.quality.usable for silhouette in assigned.silhouettes.values()) < MIN_VIEWS:
         raise TooFewViews(assigned.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(assigned.silhouettes, rig)
     size = judge_head_size(silhouettes, rig)

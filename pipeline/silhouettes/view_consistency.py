@@ -29,10 +29,10 @@ from rig.rig import Rig
 
 GRID = 32  # voxels a side: 12 mm on a subject of 400 mm
 REDUCTION = 16  # of the image in which areas are counted
-LEAST_CAMERAS = 4  # with fewer, one camera's word stands against another's
-CONTRADICTED_LEAST = 1e-3  # of the others' masks, mean: 0 in 150 true views of 4 to 24 cameras; 0.0013 and more where a
+MIN_CAMERAS = 4  # with fewer, one camera's word stands against another's
+MIN_CONTRADICTED = 1e-3  # of the others' masks, mean: 0 in 150 true views of 4 to 24 cameras; 0.0013 and more where a
 # crown is missing, and up to 0.0016 then in a good view beside it ...
-CONTRADICTED_MOST = 0.5  # ... which contradicts less than this share of what the worst view does
+MAX_CONTRADICTED = 0.5  # ... which contradicts less than this share of what the worst view does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,7 @@ def judge_agreement(
         ready: cameras whose mask is an operator's: they are warned of, and stay usable.
     """
     trusted = [name for name in rig.names if silhouettes[name].quality.usable]
-    if len(trusted) < LEAST_CAMERAS:
+    if len(trusted) < MIN_CAMERAS:
         return dict(silhouettes)
     believed = rig.subset(trusted)
     votes = cast_votes(silhouettes, believed)
@@ -96,7 +96,7 @@ def judge_agreement(
         shares = [*pool.map(lambda k: _shares(votes, k, masks[k]), range(len(trusted)))]
         suspects = [k for k, (_, missing) in enumerate(shares) if missing > settings.missing_share_warned]
         contradicted = dict(zip(suspects, pool.map(lambda k: _contradicted(votes, k, masks), suspects), strict=True))
-    limit = max(CONTRADICTED_LEAST, CONTRADICTED_MOST * max(contradicted.values(), default=0.0))
+    limit = max(MIN_CONTRADICTED, MAX_CONTRADICTED * max(contradicted.values(), default=0.0))
     culprits = [k for k, share in contradicted.items() if share >= limit]
     for k, (name, (strange, missing)) in enumerate(zip(trusted, shares, strict=True)):
         if strange > settings.strange_share_warned and culprits:

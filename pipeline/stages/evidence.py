@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from pipeline.diagnostics import ReportWarning
 from pipeline.evidence.camera_metrics import CameraFigures, camera_figures, start_masks
 from pipeline.evidence.expression import (
-    LEAST_SIGMA,
+    MIN_SIGMA,
     READ_SIGMA,
     BlendshapeRig,
     Found,
@@ -74,7 +74,7 @@ def judge_head(
     fitted = {name: np.isfinite(depth) for name, depth in texturing.depths.items()}
     cameras = camera_figures(model, fit, views.silhouettes, rig, fitted, before)
     widths_px = {camera.name: camera.intrinsics.width for camera in rig}
-    made, min_sigma, closed_eyes = fit, LEAST_SIGMA, frozenset[str]()
+    made, min_sigma, closed_eyes = fit, MIN_SIGMA, frozenset[str]()
     if refined.displaced is not None:
         made, min_sigma = fit_with_read_face(context, head, refined.displaced)
         closed_eyes = refined.displaced.closed_eyes
@@ -108,7 +108,7 @@ def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced:
     rows = blinks_of(model)
     lids = {side: share for side, share in displaced.lids.items() if share != float(fit.coefficients[rows[side]])}
     if not makes_face(fit.coefficients, model.posed):
-        return with_lids(fit, model, lids), LEAST_SIGMA
+        return with_lids(fit, model, lids), MIN_SIGMA
     read = with_read_expression(
         fit,
         model,
@@ -118,7 +118,7 @@ def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced:
         eigenheads=min(settings.modes, len(context.model.modes)),
         median=settings.expression_median,
     )
-    return with_lids(read, model, lids), LEAST_SIGMA if read is fit else READ_SIGMA
+    return with_lids(read, model, lids), MIN_SIGMA if read is fit else READ_SIGMA
 
 
 def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> frozenset[str]:

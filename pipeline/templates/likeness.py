@@ -42,7 +42,7 @@ STAGES = (
     Stage(10, None, 5.0, 0.0, 0.05),
 )
 FACING = 0.6  # cosine between normals of what meets
-ROBUST, LEAST_MM = 5.0, 0.05  # scale of Geman and McClure's weight, by the median residual; and its least
+ROBUST, MIN_MM = 5.0, 0.05  # scale of Geman and McClure's weight, by the median residual; and its least
 MET_MM = 10.0  # what is nearer in the end was met
 MARK_MM = 0.5  # to which a landmark is marked, an axis
 BULGE = 0.75  # of the way to the tangent planes at a triangle's corners, as its authors have it
@@ -115,7 +115,7 @@ class _Mesh:
             along = np.einsum("nx,nx->n", apart, planes)
             met &= np.sqrt(np.maximum(off**2 - along**2, 0.0)) < np.maximum(1.0, 0.5 * off)
         usual = float(np.median(off[met])) if met.any() else stage.reach_mm
-        robust = np.clip(ROBUST * usual, LEAST_MM, 0.5 * stage.reach_mm)
+        robust = np.clip(ROBUST * usual, MIN_MM, 0.5 * stage.reach_mm)
         return places, planes, off, met / (1.0 + (off / robust) ** 2) ** 2
 
     def _nearest(

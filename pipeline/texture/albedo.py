@@ -27,9 +27,9 @@ from rig.mesh import Mesh
 from rig.messages.message import compose
 
 DIM_SHARE = 0.3  # of a vertex' weight in dimmer views: of four views the second dimmest, which noise hardly makes
-MOST_SHINE = 0.5  # of a texture's light that may be taken for a highlight
+MAX_SHINE = 0.5  # of a texture's light that may be taken for a highlight
 CALM = 6  # rounds of means with the neighbours: a highlight is wide, a dim view's noise is not
-LEAST_SHADING = 0.35  # by the face's: what is darker (nostrils, below the jaw) would be noise, and errors, made bright
+MIN_SHADING = 0.35  # by the face's: what is darker (nostrils, below the jaw) would be noise, and errors, made bright
 FACTORS_PX = 1024  # side of the image of factors, smooth as the normals are
 BAND_ROWS = 64
 CODES = 65535
@@ -67,7 +67,7 @@ def estimate_albedo(
     if chart is not None:
         light = levelled_by_chart(light, chart.normal_world)
     shading = white @ light.coefficients
-    least = LEAST_SHADING * np.median(shading[seen & face_region], axis=0)
+    least = MIN_SHADING * np.median(shading[seen & face_region], axis=0)
     shading = 0.5 * (shading + least + np.hypot(shading - least, 0.5 * least))  # a maximum without a crease
     albedo = fill_unknown(matt / shading, seen, mesh_world.faces)
     factors = albedo / np.maximum(shown, 1e-4)
@@ -80,14 +80,14 @@ def shine_left(
     seen: Bool[np.ndarray, " v"],
     around: Neighbourhood,
 ) -> Float[np.ndarray, " v"]:
-    """Returns the share of each vertex' light that is no highlight, ``MOST_SHINE`` to 1. By brightness: highlights of
+    """Returns the share of each vertex' light that is no highlight, ``MAX_SHINE`` to 1. By brightness: highlights of
     skin have their lamp's colour, but a dim view's own colour is noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
     ratio = around.calmed(ratio[:, None], CALM)[:, 0]
     # Between its views every vertex differs by noise: what most of the head has is no highlight.
     ordinary = float(np.median(ratio[seen])) if seen.any() else 1.0
-    return np.clip(ratio / max(ordinary, 1e-4), 1.0 - MOST_SHINE, 1.0)
+    return np.clip(ratio / max(ordinary, 1e-4), 1.0 - MAX_SHINE, 1.0)
 
 
 def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:

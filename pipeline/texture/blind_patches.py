@@ -20,10 +20,10 @@ from pipeline.texture.visibility import see_weights
 from rig.mesh import Mesh, face_normals
 
 INNER = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6.0  # places in a triangle that are looked at
-LEAST_MM2 = 20.0  # of a patch: an open eye has 200, a fold of the skin less
-LEAST_SHOWN = 0.5  # of a triangle, in some view
-LEAST_SEEN = 0.4  # of the patch's area, in the view that it takes; lids hide its upper third from most
-MOST_KNOWN = 0.5  # of the corners of its triangles, by area, that some view sees: beyond, it is no opening, but skin
+MIN_MM2 = 20.0  # of a patch: an open eye has 200, a fold of the skin less
+MIN_SHOWN = 0.5  # of a triangle, in some view
+MIN_SEEN = 0.4  # of the patch's area, in the view that it takes; lids hide its upper third from most
+MAX_KNOWN = 0.5  # of the corners of its triangles, by area, that some view sees: beyond, it is no opening, but skin
 BARELY = np.float32(1e-9)  # weight of a view at a corner that it does not see
 
 
@@ -48,7 +48,7 @@ def fill_unobserved_patches(
         for view in decision.views
     ]
     seen = np.stack(found).reshape(len(found), len(rows), len(INNER))
-    shown = (seen > 0).mean(axis=2).max(axis=0) >= LEAST_SHOWN  # the hidden side of a lid is blind as the eye is
+    shown = (seen > 0).mean(axis=2).max(axis=0) >= MIN_SHOWN  # the hidden side of a lid is blind as the eye is
     faces, area, seen = faces[shown], area[shown], seen[:, shown]
     wide = _wide(faces, area)
     return _taken(decision, faces[wide], area[wide], _patches(faces[wide]), seen[:, wide])
@@ -67,7 +67,7 @@ def _parts(
 def _wide(faces: Int[np.ndarray, "f 3"], area: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
     """Triangles of patches that are large enough."""
     patch = _patches(faces)
-    return np.bincount(patch, area)[patch] >= LEAST_MM2 if len(faces) else np.zeros(0, bool)
+    return np.bincount(patch, area)[patch] >= MIN_MM2 if len(faces) else np.zeros(0, bool)
 
 
 def _taken(
@@ -82,9 +82,9 @@ def _taken(
     for number in np.unique(patch):
         rows = np.flatnonzero(patch == number)
         share = ((seen[:, rows] > 0).mean(axis=2) * area[rows]).sum(axis=1) / area[rows].sum()
-        if (known[rows] * area[rows]).sum() > MOST_KNOWN * area[rows].sum():
+        if (known[rows] * area[rows]).sum() > MAX_KNOWN * area[rows].sum():
             continue
-        worth = np.where(share >= LEAST_SEEN, (seen[:, rows].mean(axis=2) * area[rows]).sum(axis=1), 0.0)
+        worth = np.where(share >= MIN_SEEN, (seen[:, rows].mean(axis=2) * area[rows]).sum(axis=1), 0.0)
         best = int(worth.argmax())
         if worth[best] <= 0:
             continue

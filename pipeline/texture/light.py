@@ -29,15 +29,15 @@ DIRECTIONS = 96  # that shadows are looked for in: the face differs from 384 by 
 MAP_PX = 192  # 2 mm a pixel
 FAR_RADII = 20.0  # a distant light, at 3 degrees
 BIAS_MM = 3.0  # a surface does not hide itself for its facets
-SLOPE_PX, LEAST_COSINE = 1.5, 0.1  # nor for its slope between the map's pixels; flatter light hardly counts
+SLOPE_PX, MIN_COSINE = 1.5, 0.1  # nor for its slope between the map's pixels; flatter light hardly counts
 RETURNED = 0.3  # of the light that comes from where the head itself is: skin, lit about as the rest
 CALM = 8  # rounds of means: an edge of the depth maps is no edge of a shadow
 SCALE = 0.12  # of the shading: skin varies by less, brows and lips by more, and count less
 SAMPLES = 150.0  # spots of skin that vary by themselves; freckles and folds are as large as that
 PRIOR = 1.0  # standard deviation of a coefficient where the even light has 3.5; a studio's lamps make 2 to 3
-LEAST_UNHIDDEN = 0.3  # of the face's brightness: walls and ceiling send that much back to what no lamp reaches
+MIN_UNHIDDEN = 0.3  # of the face's brightness: walls and ceiling send that much back to what no lamp reaches
 ITERATIONS = 25
-LEAST_VERTICES = 100
+MIN_VERTICES = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +126,7 @@ def _hidden(
     left, top = x.astype(int), y.astype(int)
     across, down = x - left, y - top
     depths = camera_depths(camera, points)
-    slope = np.sqrt(1.0 - np.minimum(cosine, 1.0) ** 2) / np.maximum(cosine, LEAST_COSINE)
+    slope = np.sqrt(1.0 - np.minimum(cosine, 1.0) ** 2) / np.maximum(cosine, MIN_COSINE)
     limit = depths - BIAS_MM - SLOPE_PX * slope * depths / camera.intrinsics.fx
     share = np.zeros(len(points))
     for dy, wy in ((0, 1 - down), (1, down)):
@@ -148,7 +148,7 @@ def fit_light(
     """
     rows, seen = white[skin], colours[skin]
     level = np.median(seen, axis=0) if len(seen) else np.zeros(3)
-    if len(seen) < LEAST_VERTICES or level.min() <= 0:
+    if len(seen) < MIN_VERTICES or level.min() <= 0:
         return None
     # In units of an evenly lit vertex; what the even light is worth is left free, the rest is drawn to zero.
     relative = seen / level
@@ -159,7 +159,7 @@ def fit_light(
         weighted = rows * (weights / weights.sum())[:, None]
         bounded = _bounds(found)
         left = rows.T @ weighted + prior + bounded.T @ bounded * stiffness
-        right = weighted.T @ relative + LEAST_UNHIDDEN * stiffness * bounded.sum(axis=0)[:, None]
+        right = weighted.T @ relative + MIN_UNHIDDEN * stiffness * bounded.sum(axis=0)[:, None]
         found = np.linalg.solve(left, right)
         off = (relative - rows @ found) / np.maximum(rows @ found, 0.1)
         weights = 1.0 / (1.0 + (off**2).mean(axis=1) / SCALE**2)
@@ -171,5 +171,5 @@ def fit_light(
 
 def _bounds(coefficients: Float[np.ndarray, "9 3"]) -> Float[np.ndarray, "n 9"]:
     """The normals that would be darker than any studio leaves them: what no part of the face is turned to."""
-    dark = (SURROUND @ coefficients).mean(axis=1) < LEAST_UNHIDDEN
+    dark = (SURROUND @ coefficients).mean(axis=1) < MIN_UNHIDDEN
     return SURROUND[dark] if coefficients.any() else SURROUND[:0]

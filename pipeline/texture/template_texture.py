@@ -14,8 +14,8 @@ from pipeline.templates.carrying import SurfaceBinding
 from pipeline.texture.uv_unwrap import Atlas, Layout
 from rig.formats.polygon_obj import PolygonMesh, fan
 
-MOST_TILES = 10  # a row of UDIM
-MOST_TEXELS = 4096  # a side
+MAX_TILES = 10  # a row of UDIM
+MAX_TEXELS = 4096  # a side
 COARSE = 512  # side of the small image that fills what no triangle covers
 NEAR = 0.02  # of the side: so far from known texels the nearest one is repeated, twice as far it has faded
 CUT = 0.05  # of the model's layout: a triangle longer than that lies over its cut
@@ -48,7 +48,7 @@ def template_textures(
     coordinates."""
     tiles, on_skin = corner_tiles(mesh), skin_polygons(mesh, surface_binding)
     found = np.unique(tiles[on_skin & (tiles[:, 0] >= 0)], axis=0)
-    if not 0 < len(found) <= MOST_TILES:
+    if not 0 < len(found) <= MAX_TILES:
         return {}
     places = _places(atlas.layout, surface_binding)
     of_polygon = np.repeat(np.arange(len(mesh.sizes)), mesh.sizes - 2)
@@ -79,7 +79,7 @@ def _tile(
     tile: Int[np.ndarray, " 2"],
 ) -> UInt8[np.ndarray, "s s 3"]:
     side = len(atlas.image)
-    size = min(side, MOST_TEXELS)
+    size = min(side, MAX_TEXELS)
     uv = mesh.uv[mesh.corner_uv[corners.ravel()]] - tile
     texels = size * np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1) - 0.5
     faces, ones = np.arange(len(uv), dtype=np.int32).reshape(-1, 3), np.ones(len(uv))

@@ -5,8 +5,8 @@ import numpy as np
 from pipeline.compiled import njit
 
 DARKER = 0.5  # of a difference, where a view is darker: most are shading that turns with the surface, few are shadows
-MOST_VOTE = 0.7  # of a view about the median, by the mean weight: a close-up that a shadow lies in is one of many
-LEAST_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it
+MAX_VOTE = 0.7  # of a view about the median, by the mean weight: a close-up that a shadow lies in is one of many
+MIN_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it
 
 
 @njit(cache=True, nogil=True)
@@ -30,7 +30,7 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
                 n += 1
         if n == 0:
             continue
-        cap, votes = MOST_VOTE * total / n, 0.0
+        cap, votes = MAX_VOTE * total / n, 0.0
         for i in range(n):
             votes += min(weights[order[i], v], cap)
         for c in range(3):
@@ -60,5 +60,5 @@ def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tup
         for c in range(3):
             out[v, c] /= norm
         for i in range(n):
-            views[v] += weights[order[i], v] > LEAST_SHARE * total
+            views[v] += weights[order[i], v] > MIN_SHARE * total
     return out, views

@@ -29,8 +29,8 @@ SURFACE_POINTS = 6000  # of the reference, for the search: 6 mm apart on a head
 PARTS = 4  # of the scan: shoulders or a stand move its middle away from the head's
 TURN_MM = 30.0  # distance that a difference of one between unit normals counts as, in the search
 FEW = 300  # of these points, for telling starts apart
-LEAST_MARKS = 3
-LEAST_TOLD = 0.3  # share of the face that must not lie at the scan's rim
+MIN_MARKS = 3
+MIN_COVERED = 0.3  # share of the face that must not lie at the scan's rim
 STEPS = 30
 STILL_MM = 3e-4  # a step whose points move by less is the last
 NOT_THIS_MM = 5.0  # RMS over the face after the best fit: beyond any fault of a rig, and near any two heads' difference
@@ -70,7 +70,7 @@ def best_fit(measured: Measured, reference: Reference) -> BestFit:
     picked = rng.choice(np.flatnonzero(face), count, replace=False)
     points, weights = measured.mesh_world.vertices[picked], measured.areas[picked]
     marks = [name for name in reference.landmarks if name in measured.landmarks]
-    if len(marks) >= LEAST_MARKS:
+    if len(marks) >= MIN_MARKS:
         start = "landmarks"
         motion = rigid_fit(stacked(measured.landmarks, marks), stacked(reference.landmarks, marks))
         starts = [Similarity.from_rigid(motion)]
@@ -123,7 +123,7 @@ def _refined(
         reach = max(0.5 * reach, 0.5)
     hits = reference.index.closest(place.apply(points))
     covered = ~reference.beside(hits)
-    if covered.mean() < LEAST_TOLD:
+    if covered.mean() < MIN_COVERED:
         return place, np.inf, 0
     off = np.minimum(hits.distances, FAR_MM)[covered]
     return place, float(np.sqrt(np.average(off**2, weights=weights[covered]))), int(counted(hits, reference).sum())

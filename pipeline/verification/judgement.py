@@ -29,8 +29,8 @@ from rig.errors import InputError
 
 FORM_SHARE = 0.997  # of the area; the rest are outliers, as three of a thousand points
 FEATURES = ("eyes", "nose", "mouth")
-LEAST_COVERED = 0.2  # share of a region, below which it has no figures
-LEAST_FACING = 0.5  # share of the judged face where both surfaces face the same way
+MIN_COVERED = 0.2  # share of a region, below which it has no figures
+MIN_FACING = 0.5  # share of the judged face where both surfaces face the same way
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def judge_one(measured: Measured, reference: Reference) -> Judged:
     face = measured.regions["face"] & np.isfinite(deviation)
     turned = measured.mesh_world.normals() @ fit.reference_from_world.rotation.T
     facing = np.average(np.einsum("nc,nc->n", turned, hits.normals)[face] > 0, weights=measured.areas[face])
-    if facing < LEAST_FACING:
+    if facing < MIN_FACING:
         raise InputError(reference.name, ["faces inwards: turn its triangles over, or mirror it back"])
     regions = region_errors(deviation, measured)
     form = weighted_range(deviation[face], measured.areas[face], FORM_SHARE)
@@ -128,7 +128,7 @@ def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> 
         region = measured.regions[name]
         whole, kept = float(measured.areas[region].sum()), region & known
         covered = float(measured.areas[kept].sum()) / whole if whole else 0.0
-        if covered >= LEAST_COVERED:
+        if covered >= MIN_COVERED:
             found[name] = _region_error(deviation_mm[kept], measured.areas[kept], covered)
     return found
 

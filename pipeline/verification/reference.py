@@ -19,7 +19,7 @@ from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh, boundary_edges
 
-LEAST_TRIANGLES = 1000  # of a head; scan_checks asks the same of scans
+MIN_TRIANGLES = 1000  # of a head; scan_checks asks the same of scans
 SIZE_MM = (150.0, 1500.0)  # diagonal: from a bare face to a life-size figure down to the waist
 OFF_SURFACE_MM = 5.0  # a landmark marked on this mesh lies on it; the rest is the marking program's rounding
 TURNED_EDGES = 0.002  # share of edges whose triangles face opposite ways: more is no scan's noise
@@ -76,7 +76,7 @@ def _edge_numbers(edges: Int[np.ndarray, "e 2"], count: int) -> Int[np.ndarray, 
 
 
 def _surface_faults(mesh: Mesh) -> list[str]:
-    if len(mesh.faces) < LEAST_TRIANGLES:
+    if len(mesh.faces) < MIN_TRIANGLES:
         return [f"has {len(mesh.faces)} triangles; the scan of a head has thousands: is the file whole?"]
     used = mesh.vertices[np.unique(mesh.faces)]
     size = float(np.linalg.norm(np.ptp(used, axis=0)))

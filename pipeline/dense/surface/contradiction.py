@@ -15,7 +15,7 @@ from pipeline.dense.surface.view_stack import ViewStack
 from pipeline.dense.surface.vote_kernels import OUTLINE
 from pipeline.parallel_for import map_in_threads
 
-VIEWS_LEAST = 2  # that see something solid
+MIN_VIEWS = 2  # that see something solid
 WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
 SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
@@ -27,7 +27,7 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
         height, width = views.sizes[v]
         blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
         mark_contradicted(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
-        solid = np.bitwise_count(blocks) >= VIEWS_LEAST
+        solid = np.bitwise_count(blocks) >= MIN_VIEWS
         outline_px = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
         return _beyond_windows(solid, outline_px.reshape(height, width)) if solid.any() else None
 

@@ -9,7 +9,7 @@ from pipeline.dense.surface.grid_kernels import grown
 from pipeline.parallel_for import in_threads
 from rig.mesh import Mesh
 
-ROUNDS_MOST = 40
+MAX_ROUNDS = 40
 APART_SHARE = 0.05  # of the way to the middle of a vertex's neighbours: some 0.03 mm
 SIZES = 4  # classes of triangles, each half as wide as the last
 HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of it, and take their neighbours along
@@ -76,7 +76,7 @@ def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh,
     vertices, faces = mesh.vertices.copy(), mesh.faces
     moved = np.zeros(len(vertices), bool)
     active: Bool[np.ndarray, " f"] | None = None
-    for done in range(ROUNDS_MOST):
+    for done in range(MAX_ROUNDS):
         crossing = crossing_faces(vertices, faces, active)
         if not crossing.any():
             break

@@ -35,7 +35,7 @@ from rig.progress import Progress
 from rig.rig import Rig
 
 TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
-VIEWS_LEAST = 3
+MIN_VIEWS = 3
 HEAD_STRIDE = 7  # every seventh vertex of the fitted head says which piece is the subject
 CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and others see solid
 
@@ -85,8 +85,8 @@ def fuse(
         NoSurface: fewer than three views know any depth, or they contradict each other.
     """
     maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
-    if len(maps) < VIEWS_LEAST:
-        raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=VIEWS_LEAST))
+    if len(maps) < MIN_VIEWS:
+        raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
     level = solve(maps, views, head_world, settings.spacing_mm)

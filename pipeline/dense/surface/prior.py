@@ -9,7 +9,7 @@ from rig.mesh import Mesh, boundary_edges
 THICKEST_MM = 60.0  # of hair: farther out a point belongs to something else
 RIM_MM = 12.0  # about the open rim of a model the head goes on in a way that it does not know
 EVERY = 4  # vertices of the head stand for the others: 3 mm apart is enough for a guess
-LEAST_POINTS = 3  # of the surface near a vertex, for a thickness
+MIN_POINTS = 3  # of the surface near a vertex, for a thickness
 NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance within which they count alike
 
 
@@ -41,10 +41,10 @@ def _thickness(
     height = np.maximum(((points - vertices[near]) * normals[near]).sum(axis=1), 0.0)
     count = np.bincount(near, minlength=len(vertices))
     thickness = np.bincount(near, height, len(vertices)) / np.maximum(count, 1)
-    known = np.flatnonzero(count >= LEAST_POINTS)
+    known = np.flatnonzero(count >= MIN_POINTS)
     if len(known) < NEAREST:
         return np.zeros(len(vertices))
-    blank = np.flatnonzero(count < LEAST_POINTS)
+    blank = np.flatnonzero(count < MIN_POINTS)
     far, near = KDTree(vertices[known]).query(vertices[blank], k=NEAREST)
     share = 1.0 / (far * far + EVEN_MM**2)
     thickness[blank] = (share * thickness[known[near]]).sum(axis=1) / share.sum(axis=1)

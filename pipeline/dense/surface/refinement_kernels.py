@@ -6,10 +6,10 @@ from pipeline.compiled import njit
 from pipeline.dense.surface.vote_kernels import (
     DEPTH,
     FLATTEST,
+    MAX_VIEWS,
     NORMAL,
     SIGMA,
     UNKNOWN_MM,
-    VIEWS_MOST,
     Pixels,
     agreed,
     cosine,
@@ -43,7 +43,7 @@ def measure(
     """
     cameras, sizes, starts, pixels = seen
     gate, agreement, floor = limits
-    votes, weights = np.empty(VIEWS_MOST), np.empty(VIEWS_MOST)
+    votes, weights = np.empty(MAX_VIEWS), np.empty(MAX_VIEWS)
     for n in range(first, last):
         place, count = vertices[n], 0
         for v in range(len(cameras)):

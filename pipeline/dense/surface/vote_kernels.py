@@ -9,7 +9,7 @@ from pipeline.imaging.projection_kernels import LENS, NEAREST_MM, pinhole, place
 
 DEPTH, NORMAL, SIGMA, OUTLINE, FRAME = 0, 1, 4, 5, 6  # columns of a pixel; the normal has three
 CENTRE = 16  # of a camera's row: its centre
-VIEWS_MOST = 64
+MAX_VIEWS = 64
 PLANE_SHARE = 0.3  # of the way along the ray that a place before a surface is off at least, however flat that is seen
 THICKEST_MM = 60.0  # of a body behind its surface, where no silhouette bounds it
 UNDECIDED = -1.0  # weight of a place inside of the outlines that only their guess beyond the photographs leaves out
@@ -51,7 +51,7 @@ def vote(
     """
     cameras, sizes, starts, pixels = views
     reach, behind, agreement, unit, floor = limits
-    votes, weights, place = np.empty(VIEWS_MOST), np.empty(VIEWS_MOST), np.empty(3)
+    votes, weights, place = np.empty(MAX_VIEWS), np.empty(MAX_VIEWS), np.empty(3)
     for n in range(first, last):
         for axis in range(3):
             place[axis] = corner[axis] + step_mm * index[n, axis]

@@ -23,7 +23,7 @@ from rig.mesh import vertex_normals
 HALF, OTHERS = 0.5, (0.25, 0.75, 1.0)
 NEAR = 0.6  # of the fissure's length: points about the eye
 REACH_MM, AGREEMENT, ROBUST_MM = 6.0, 0.3, 0.3
-LEAST_POINTS = 200
+MIN_POINTS = 200
 GAIN = 0.97  # of the misfit of open lids that half closed ones must stay under: 0.89 and 0.94 of closed ones, 1.03 and
 # more of open ones
 SHUT = 0.5  # lids that far down over an eye that shows nothing are closed ...
@@ -118,7 +118,7 @@ def _nearest_closure(
     middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
     off = np.linalg.norm(surface.points - middle, axis=1)
     about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != Part.UNSEEN))
-    if len(about.points) < LEAST_POINTS:
+    if len(about.points) < MIN_POINTS:
         return fitted, 1.0
     near, faces = _patch(open_lids, model, middle, NEAR * slit.length_mm + REACH_MM)
     still = _misfit(open_lids[near], faces, about)

@@ -17,9 +17,9 @@ from pipeline.fitting.fine.association import associate, interpolated
 from pipeline.fitting.fine.surface_points import SurfacePoints
 from rig.mesh import Mesh
 
-REACH_MM, AGREEMENT, LEAST_POINTS = 2.0, 0.8, 300
+REACH_MM, AGREEMENT, MIN_POINTS = 2.0, 0.8, 300
 ROBUST_MM, ROUNDS = 0.15, 10
-MOST_MM, SHARE_MOST = 0.3, 2.0  # of the common offset, and of the share: beyond, something else is wrong
+MAX_MM, MAX_SHARE = 0.3, 2.0  # of the common offset, and of the share: beyond, something else is wrong
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,14 +51,14 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
 def measure_bias(seen: OnFace) -> WindowBias:
     """Returns the robust line of what points and fit differ by, over the windowed height; none where too few points
     tell."""
-    if len(seen.row) < LEAST_POINTS:
+    if len(seen.row) < MIN_POINTS:
         return WindowBias()
     columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)
     line, loss = np.array([np.median(seen.off_mm), 0.0]), Cauchy(ROBUST_MM)
     for _ in range(ROUNDS):
         weight = np.sqrt(loss.weight((seen.off_mm - columns @ line) ** 2))
         line = np.linalg.lstsq(columns * weight[:, None], seen.off_mm * weight, rcond=None)[0]
-    return WindowBias(float(np.clip(line[0], -MOST_MM, MOST_MM)), float(np.clip(line[1], 0.0, SHARE_MOST)))
+    return WindowBias(float(np.clip(line[0], -MAX_MM, MAX_MM)), float(np.clip(line[1], 0.0, MAX_SHARE)))
 
 
 def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:

@@ -24,7 +24,7 @@ BLEND_MM = 10.0  # over which the head follows
 STARTS_MM = (0.0, -9.0, 9.0)  # up and down the head, and to and fro
 REACHES_MM = (14.0, 10.0, 7.0, 5.0, 4.0, 3.0, 3.0, 3.0)
 ROBUST_SHARE = 0.4  # of the reach
-LEAST_POINTS, LEAST_SHOWN = 80, 80  # about the ear, and on it
+MIN_POINTS, MIN_SHOWN = 80, 80  # about the ear, and on it
 TURN_SD, SCALE_SD, SHIFT_SD_MM = 0.2, 0.08, 8.0  # of the motion, against points worth ...
 POINT_SD_MM = 3.0  # ... that each: they are many, and the shape is another's
 AGREEMENT = 0.4
@@ -62,7 +62,7 @@ def with_ears_in_place(
             continue
         distance, _ = KDTree(vertices[rows]).query(skin.points, distance_upper_bound=ABOUT_MM)
         near = skin.chosen(np.isfinite(distance))
-        if len(near.points) < LEAST_POINTS:
+        if len(near.points) < MIN_POINTS:
             continue
         turned = _registered(vertices, faces, side, near, model)
         off, _ = KDTree(vertices[rows]).query(vertices, distance_upper_bound=4.0 * BLEND_MM)
@@ -96,7 +96,7 @@ def _registered(
             if abs(rise) + abs(forth) <= max(STARTS_MM):  # up, down, to or fro
                 found.append(_descend(target, ear[local], points, centre, shift))
     best = min(found, key=lambda each: each.cost)
-    if best.shown < LEAST_SHOWN:
+    if best.shown < MIN_SHOWN:
         return vertices
     return best.scale * (vertices - centre) @ best.turn.T + centre + best.shift
 

@@ -29,10 +29,10 @@ BRIDGE_HEIGHT, BRIDGE_RAISED = (
 )  # half height and middle of the bridge, by the fissure's length: up to the fold
 SHOWN_LENGTH, SHOWN_HEIGHT = 0.5, 0.3  # where an open eye is looked for, by its length: a fit may be 4 mm off; no brow
 SKIN_BELOW, SKIN_SIZE = 0.75, 0.25  # where skin is looked at, by the fissure's length
-VIEWS, LEAST_FACING = 5, 0.6  # the most frontal cameras
+VIEWS, MIN_FACING = 5, 0.6  # the most frontal cameras
 WHITE_CHROMA, WHITE_LIGHT, DARK_LIGHT = 0.5, 0.6, 0.35  # by the skin's
 WHITE_SHARE, DARK_SHARE = 0.05, 0.1  # of what is looked at; lashes of a closed eye are a line
-LEAST_VERTICES = 12
+MIN_VERTICES = 12
 MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.07, 0.1  # of lids that are half closed, and of lids that meet
 
 
@@ -139,7 +139,7 @@ def _facing(
     towards = np.array([rig[name].centre_world - middle for name in names])
     cosine = towards @ outward / np.linalg.norm(towards, axis=1)
     order = np.argsort(-cosine, kind="stable")[:VIEWS]
-    return [names[k] for k in order if cosine[k] > LEAST_FACING]
+    return [names[k] for k in order if cosine[k] > MIN_FACING]
 
 
 def _shares(
@@ -147,7 +147,7 @@ def _shares(
 ) -> tuple[float, float] | None:
     """Shares of the opening that are white, and dark; None where the photograph does not show it."""
     eye, about = _colours(image, opening), _colours(image, skin)
-    if len(eye) < LEAST_VERTICES or len(about) < LEAST_VERTICES:
+    if len(eye) < MIN_VERTICES or len(about) < MIN_VERTICES:
         return None
     light, chroma = _light_and_chroma(eye)
     skin_light, skin_chroma = (float(np.median(values)) for values in _light_and_chroma(about))

@@ -6,8 +6,8 @@ from jaxtyping import Bool, Float, Int
 
 from rig.mesh import face_normals
 
-MOST_TURN = 0.0  # cosine between a triangle before and after; a right angle is a fold
-LEAST_AREA = 0.02  # of the triangle's own, before
+MAX_TURN = 0.0  # cosine between a triangle before and after; a right angle is a fold
+MIN_AREA = 0.02  # of the triangle's own, before
 SWEEPS, RINGS = 60, 6  # of smoothing, and how far about a fold it may reach
 GIVING_WAY = 0.8  # what a sweep leaves of a displacement, in the second half of them
 
@@ -18,7 +18,7 @@ def folded(
     """Returns triangles that a displacement turns over or squeezes to nothing."""
     old, new = face_normals(before, faces), face_normals(after, faces)
     size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
-    return ((old * new).sum(axis=1) <= MOST_TURN * size * length) | (length < LEAST_AREA * size)
+    return ((old * new).sum(axis=1) <= MAX_TURN * size * length) | (length < MIN_AREA * size)
 
 
 def unfolded(

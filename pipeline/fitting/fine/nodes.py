@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from pipeline.eigenheads.model import HeadModel
 from pipeline.eigenheads.subdivision import row_count, subdivision
 
-COARSE_MOST = 5000  # nodes in three dimensions: 0.2 s to solve exactly
+MAX_COARSE = 5000  # nodes in three dimensions: 0.2 s to solve exactly
 NEIGHBOURS = 4
 
 
@@ -43,7 +43,7 @@ def solving_nodes(model: HeadModel) -> Nodes:
     full, cage = model.levels["full"], model.levels["cage"]
     if full.count == cage.count:
         full_nodes = node_mesh(full.faces, sparse.csr_array(sparse.identity(full.count, format="csr")))
-        return Nodes(_decimated(model) if full.count > COARSE_MOST else full_nodes, full_nodes)
+        return Nodes(_decimated(model) if full.count > MAX_COARSE else full_nodes, full_nodes)
     faces, to_nodes = cage.faces, sparse.csr_array(sparse.identity(cage.count, format="csr"))
     while 4 * len(faces) < len(full.faces):
         step, faces = subdivision(faces, row_count(to_nodes))

@@ -17,8 +17,8 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
-LEAST_AREA = 1e-3  # of the mean triangle: a sliver must not tear its corners from the rest
-MOST_COTANGENT = 20.0
+MIN_AREA = 1e-3  # of the mean triangle: a sliver must not tear its corners from the rest
+MAX_COTANGENT = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,17 +52,17 @@ def smooth_field(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     stiffness, mass = sparse.csr_array((count, count)), np.zeros(count)
     corners = vertices[faces]
     double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    double_area = np.maximum(double_area, LEAST_AREA * double_area.mean())
+    double_area = np.maximum(double_area, MIN_AREA * double_area.mean())
     rows, columns, values = [], [], []
     for k in range(3):
         i, j = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
         a, b = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
-        half = np.clip(0.5 * (a * b).sum(axis=1) / double_area, 0.0, MOST_COTANGENT)
+        half = np.clip(0.5 * (a * b).sum(axis=1) / double_area, 0.0, MAX_COTANGENT)
         rows += [i, j]
         columns += [j, i]
         values += [half, half]
         mass += np.bincount(faces[:, k], double_area / 6.0, count)
-    mass = np.maximum(mass, LEAST_AREA * mass.mean())
+    mass = np.maximum(mass, MIN_AREA * mass.mean())
     shape = (count, count)
     beside = sparse.csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape)
     stiffness = sparse.diags_array(beside.sum(axis=1)) - beside

@@ -7,7 +7,7 @@ from pipeline.fitting.photo.correlation_kernels import Members, Pictures, Sample
 from pipeline.fitting.photo.patches import Patches
 from pipeline.parallel_for import in_threads
 
-LEAST_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
+MIN_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
 
 
 def choose_views(
@@ -21,7 +21,7 @@ def choose_views(
     value = np.where(seen > least_seen * total, cosine**2, 0.0)
     view = np.argsort(-value, axis=1, kind="stable")[:, :most]
     value = np.take_along_axis(value, view, axis=1)
-    speaks = value > LEAST_VIEW
+    speaks = value > MIN_VIEW
     return np.where(speaks, view, -1), np.where(speaks, value, 0.0)
 
 

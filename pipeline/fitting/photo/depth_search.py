@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from pipeline.fitting.photo.camera_term import camera_sensitivity, gram_matrices
 from pipeline.fitting.photo.correlation import choose_views, correlate, sweep
 from pipeline.fitting.photo.correlation_kernels import Pictures, Samples
-from pipeline.fitting.photo.images import LEAST_BLUR_PX, Photographs, blurred, distance_of
+from pipeline.fitting.photo.images import MIN_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.fitting.photo.patches import Patches
 from pipeline.fitting.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.fitting.rim import Views
@@ -32,7 +32,7 @@ from rig.mesh import Mesh
 from rig.parabola import second_difference, vertex_offset
 
 DEPTH_LEVEL = "p95"  # of the z-buffer: it differs from the full mesh by far less than what may hide a sample
-LEAST_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
+MIN_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
 EDGE_PX = 4  # nothing is read nearer to the image's edge
 WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
 FLATTEST = 1e-6  # curvature of correlation by a step squared: below it a peak has no place of its own
@@ -142,7 +142,7 @@ def facing_of(
     towards = camera.centre_world - points
     cosine = np.einsum("sc,sc->s", towards, normals) / np.linalg.norm(towards, axis=1)
     height, width = depth.shape
-    front = np.flatnonzero(cosine >= LEAST_FACING)
+    front = np.flatnonzero(cosine >= MIN_FACING)
     pixel = project_points(camera, points[front])
     with np.errstate(invalid="ignore"):  # NaN is outside
         inside = ((pixel >= EDGE_PX) & (pixel < (width - EDGE_PX - 1, height - EDGE_PX - 1))).all(axis=1)
@@ -243,7 +243,7 @@ def find_places(
     grey = sweep(samples, pictures, steps)
     view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
     peaks = find_peaks(correlate(patches, weights, view, value, seen, grey=grey, noise=noise), steps)
-    blur_mm = np.maximum(each.blur_mm, LEAST_BLUR_PX / scale).mean()
+    blur_mm = np.maximum(each.blur_mm, MIN_BLUR_PX / scale).mean()
     variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
     clear = peaks.inside & (peaks.height > settings.least_correlation)
     return Places(peaks.place, peaks.height, variance, view[:, 1] >= 0, clear, view, value, weights, samples, pictures)

@@ -12,7 +12,7 @@ from pipeline.fitting.rim import Views
 from pipeline.imaging.grey import LUMINANCE, noise_level
 from pipeline.parallel_for import map_in_threads, thread_count
 
-LEAST_BLUR_PX = 0.7  # below that a bilinear sample is mostly interpolation error
+MIN_BLUR_PX = 0.7  # below that a bilinear sample is mostly interpolation error
 INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
 
 
@@ -62,7 +62,7 @@ def blurred(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
     """Returns all images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
-    sigma = np.maximum(sigma_px, LEAST_BLUR_PX)
+    sigma = np.maximum(sigma_px, MIN_BLUR_PX)
     with ThreadPoolExecutor(thread_count()) as pool:
         smooth = pool.map(lambda i, s: cv2.GaussianBlur(i, (0, 0), s).ravel(), photographs.grey, sigma.tolist())
         return np.concatenate(list(smooth)), photographs.noise / (2.0 * np.sqrt(np.pi) * sigma)

@@ -35,7 +35,7 @@ from rig.messages.message import compose
 ROUNDS = (Round(3.0, 0.8, 4.0, 17), Round(2.5, 0.55, 2.0, 13), Round(2.0, 0.45, 1.0, 9))
 RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
 LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is the full level's anyway
-VIEWS_LEAST = 3
+MIN_VIEWS = 3
 NEIGHBOURS, NEAR_MM = 24, 4.0  # patches about a vertex: two windows
 HAIR_REACH_MM = 4.0  # patches are 3 mm apart
 LOST_MM = 2.5  # off by at least that where nothing matches: what two photographs still recognise
@@ -64,10 +64,8 @@ def refine_with_photographs(
     problem = solved.problem
     photographs = load_photographs(images, problem.views)
     speaking = int(np.count_nonzero(photographs.speaks))
-    if speaking < VIEWS_LEAST:
-        why = compose(
-            "level-views-without-texture", speaking=speaking, all=len(problem.views.names), needed=VIEWS_LEAST
-        )
+    if speaking < MIN_VIEWS:
+        why = compose("level-views-without-texture", speaking=speaking, all=len(problem.views.names), needed=MIN_VIEWS)
         return solved, Detail("kernel", why)
     model, patches, basis = finer(problem.model, settings)
     problem = widened(problem, model, (LEVEL,))

@@ -18,10 +18,10 @@ BINS = 24  # a channel: 11 levels
 HISTOGRAM_BLUR = 0.8  # bins, standard deviation
 UNSEEN = 1e-5  # share of a colour that was never seen: unknown, not impossible
 NEARBY_PX = 6.0  # of the reduced image: sigma of the window of local colours
-SCATTER_LEAST = 2.0  # levels: folds and weave of a cloth are no less
+MIN_SCATTER = 2.0  # levels: folds and weave of a cloth are no less
 SUBJECT_SCATTER = 1.5  # by which the subject's shading is rougher than that
 LOG_CELL = 3 * np.log(BINS / 256)  # log of one over a bin's volume, levels^-3
-ODDS_MOST = 5.0
+MAX_ODDS = 5.0
 
 Image = Float32[np.ndarray, "h w 3"]
 Mask = Bool[np.ndarray, "h w"]
@@ -55,10 +55,10 @@ def colour_odds(
     subject = _log_density(image, (common, histogram(image[samples.subject])))
     background = _log_density(image, (histogram(image[samples.background]),))
     if nearby:
-        scatter = np.maximum(noise, SCATTER_LEAST).astype(np.float32)
+        scatter = np.maximum(noise, MIN_SCATTER).astype(np.float32)
         subject = np.logaddexp(subject, _log_nearby(image, samples.subject, SUBJECT_SCATTER * scatter)) - np.log(2)
         background = np.logaddexp(background, _log_nearby(image, samples.background, scatter)) - np.log(2)
-    return np.clip(subject - background, -ODDS_MOST, ODDS_MOST).astype(np.float32)
+    return np.clip(subject - background, -MAX_ODDS, MAX_ODDS).astype(np.float32)
 
 
 def _bins(colours: np.ndarray) -> np.ndarray:

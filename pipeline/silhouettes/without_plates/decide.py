@@ -27,7 +27,7 @@ from rig.rig import Rig
 
 POINTS_SHARE, MASKS_SHARE = 0.3, 0.6  # of the time, when they are there
 POINT_PX = 2  # of the reduced image: what is around a point is the same thing
-PLATE_NOISE_MOST = 8.0  # levels by which the guess of a plate may be off; 2 to 4 before the studio's backdrops
+MAX_PLATE_NOISE = 8.0  # levels by which the guess of a plate may be off; 2 to 4 before the studio's backdrops
 ALPHA_BLUR_PX = 1.0  # of the image that was cut
 
 
@@ -68,7 +68,7 @@ def decide_without_plates(
         name: decision_without_plate(images[name], small[name], found[name], settings, solid=head is not None)
         for name in rig.names
     }
-    cluttered = {n for n, one in decisions.items() if plane is not None or plate_noise(one) > PLATE_NOISE_MOST}
+    cluttered = {n for n, one in decisions.items() if plane is not None or plate_noise(one) > MAX_PLATE_NOISE}
     if not cluttered:
         return WithoutPlates(decisions, {})
     report_cuts = partial(_between, report, MASKS_SHARE, 1.0)

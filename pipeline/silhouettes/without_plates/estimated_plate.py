@@ -19,7 +19,7 @@ MARGIN = 2  # coarse pixels beyond the mask in which the subject may still be
 NEARBY_PX = 2.5  # coarse pixels: sigma of the window that the plate is taken from
 NOISE_WINDOW_PX = 6.0  # of the window in which the guess is judged
 SOLID_ODDS = np.float32(4.0)  # of what a head encloses
-NOISE_LEAST = 0.7  # levels: what a sensor and 8 bits leave
+MIN_NOISE = 0.7  # levels: what a sensor and 8 bits leave
 
 
 def decision_without_plate(
@@ -65,7 +65,7 @@ def estimated_background(
     ring = (outside & ~far).astype(np.float32)
     error = np.sqrt(spread((coarse - test) ** 2, ring, NOISE_WINDOW_PX))
     pixel = _pixel_noise(image)
-    noise = np.sqrt(error**2 + np.maximum(pixel, NOISE_LEAST) ** 2).astype(np.float32)
+    noise = np.sqrt(error**2 + np.maximum(pixel, MIN_NOISE) ** 2).astype(np.float32)
     small = cv2.resize(plate, (coarse.shape[1], coarse.shape[0]), interpolation=cv2.INTER_AREA).astype(np.float32)
     return Background(plate[None], np.ones_like(coarse), small, noise, outside, np.ones(3, np.float32))
 

@@ -15,15 +15,15 @@ from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.imaging.masks import dilated, eroded
 from pipeline.parallel_for import thread_count
-from pipeline.silhouettes.mean_field_kernels import MOST_ODDS
+from pipeline.silhouettes.mean_field_kernels import MAX_ODDS
 from pipeline.silhouettes.without_plates.viewing_volume import ViewingVolume, ask_other_views
 
 COLUMNS = 640  # of the images that are cut: 2 px of a picture of 1300
 WINDOW, STEP = 80, 28  # px of them: side of a window, and from one to the next along the outline
 ITERATIONS = 2
 DENIED = -6.0  # sum of log odds below which the other views leave nothing of the subject: two of them deny it
-SAMPLES_LEAST = 30  # pixels of each kind that a window must be sure of
-PIECE_LEAST = 100  # px of outline
+MIN_SAMPLES = 30  # pixels of each kind that a window must be sure of
+MIN_PIECE = 100  # px of outline
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ def cut_along(
     votes, total = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.float32)
     outlines, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
-        if len(outline) < PIECE_LEAST:
+        if len(outline) < MIN_PIECE:
             continue
         for x, y in outline[::STEP, 0]:
             left, top = int(np.clip(x - side // 2, 0, width - side)), int(np.clip(y - side // 2, 0, height - side))
@@ -71,7 +71,7 @@ def _cut(
     outer: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"] | None:
     """One window; None where it is not sure of enough on both sides."""
-    if min(np.count_nonzero(inner), np.count_nonzero(outer)) < SAMPLES_LEAST:
+    if min(np.count_nonzero(inner), np.count_nonzero(outer)) < MIN_SAMPLES:
         return None
     kinds = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     kinds[inner], kinds[outer] = cv2.GC_FGD, cv2.GC_BGD
@@ -110,7 +110,7 @@ def _carved(
 ) -> dict[str, Bool[np.ndarray, "_ _"]]:
     """What was cut, without what the other views' cuts deny."""
     odds = {
-        name: (MOST_ODDS * (2 * cv2.resize(share, masks[name].shape[::-1], interpolation=cv2.INTER_AREA) - 1))
+        name: (MAX_ODDS * (2 * cv2.resize(share, masks[name].shape[::-1], interpolation=cv2.INTER_AREA) - 1))
         for name, share in shares.items()
     }
     others = ask_other_views(volume, odds)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32
 
 from pipeline.imaging.masks import dilated, eroded
 from pipeline.multiview.upright import guessed_up
-from pipeline.silhouettes.mean_field_kernels import MOST_ODDS, mean_field_sweeps
+from pipeline.silhouettes.mean_field_kernels import MAX_ODDS, mean_field_sweeps
 from pipeline.silhouettes.without_plates.colour_odds import Samples, colour_odds, histogram
 from pipeline.silhouettes.without_plates.head_seed import HeadSeed, beside_head, head_core
 from pipeline.silhouettes.without_plates.viewing_volume import (
@@ -34,14 +34,14 @@ CORE = 0.11  # of the image's smaller side: radius of the disc that is surely su
 BORDER = 0.05  # of the same: width of the strip that is surely background ...
 BODY_SIDE = 0.3  # ... above this share of the way from the middle to the lower border, where a body may leave
 LEVEL = 0.5  # sine of the angle between view and up below which no side of the image is the lower one
-SUPPORT_WEIGHT, SUPPORT_MOST, DENIAL_MOST = 0.5, 1.0, 5.0  # of what the other views say, in log odds
+SUPPORT_WEIGHT, MAX_SUPPORT, MAX_DENIAL = 0.5, 1.0, 5.0  # of what the other views say, in log odds
 SOLID_ODDS = 3.0  # that a pixel gains where every other view has the subject
 CORE_ODDS, BORDER_ODDS = 2.0, -1.0
 FACE_ODDS = 10.0  # of a core that a found face is: highlights have the colour of a bright wall
 LINK, LINK_NOISE, SWEEPS = 0.7, 2.0, 12  # of neighbours: log odds, noise levels that hardly count as an edge
-GREY_MOST = 2.0  # levels by which the channels of a grey photograph differ
+MAX_GREY = 2.0  # levels by which the channels of a grey photograph differ
 TEXTURE_PX, TEXTURE_GAIN = 2.0, 4.0  # sigma of the window; scatter by it counts like a colour
-SAMPLES_LEAST = 50  # pixels that a background is learnt from
+MIN_SAMPLES = 50  # pixels that a background is learnt from
 
 Mask = Bool[np.ndarray, "h w"]
 
@@ -121,7 +121,7 @@ def search_masks(
         for name, image in images.items():
             evidence = colour_odds(image, samples[name], common, noise[name], nearby=local)
             evidence = np.where(known[name], evidence + BORDER_ODDS, evidence)
-            odds[name] = np.where(seeds[name].reachable, evidence, -MOST_ODDS).astype(np.float32)
+            odds[name] = np.where(seeds[name].reachable, evidence, -MAX_ODDS).astype(np.float32)
         start = {name: mask.odds for name, mask in found.items()} if local else odds
         for _ in range(2):
             other_views = ask_other_views(volume, start)
@@ -142,12 +142,10 @@ def _with_neighbours(
     noise: Float[np.ndarray, " 3"],
 ) -> CoarseMask:
     combined = (
-        odds
-        + np.clip(SUPPORT_WEIGHT * other_views.support, -DENIAL_MOST, SUPPORT_MOST)
-        + SOLID_ODDS * other_views.solid
+        odds + np.clip(SUPPORT_WEIGHT * other_views.support, -MAX_DENIAL, MAX_SUPPORT) + SOLID_ODDS * other_views.solid
     )
-    combined = np.where(seeds.reachable, combined + seeds.core_odds * seeds.core, -MOST_ODDS)
-    combined = np.clip(combined, -MOST_ODDS, MOST_ODDS).astype(np.float32)
+    combined = np.where(seeds.reachable, combined + seeds.core_odds * seeds.core, -MAX_ODDS)
+    combined = np.clip(combined, -MAX_ODDS, MAX_ODDS).astype(np.float32)
     smooth = mean_field_sweeps(combined, (image / (LINK_NOISE * noise)).astype(np.float32), LINK, SWEEPS)
     smooth = np.asarray(2 * smooth, np.float32)
     return CoarseMask(smooth, _one_piece(smooth > 0, seeds.core), other_views)
@@ -159,7 +157,7 @@ def _learn(found: CoarseMask, known: Mask, *, border: bool) -> Samples:
     if border:
         return Samples(subject, known)
     background = (~dilated(found.mask, 2) & (found.other_views.support < 0)) | (known & ~found.mask)
-    return Samples(subject, background if background.sum() >= SAMPLES_LEAST else known)
+    return Samples(subject, background if background.sum() >= MIN_SAMPLES else known)
 
 
 def _one_piece(mask: Mask, core: Mask) -> Mask:
@@ -174,7 +172,7 @@ def _one_piece(mask: Mask, core: Mask) -> Mask:
 
 def _with_texture(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
     """A grey photograph with its surroundings' mean and scatter in place of two channels that say nothing."""
-    if np.ptp(image, axis=2).max() > GREY_MOST:
+    if np.ptp(image, axis=2).max() > MAX_GREY:
         return image
     grey = image[:, :, 0]
     mean = cv2.GaussianBlur(grey, (0, 0), TEXTURE_PX)

@@ -10,11 +10,11 @@ from jaxtyping import Float
 TRIPLES, SAMPLES = 20000, 2000  # drawn; of those far enough apart, tried
 OUTER, APART = 0.35, 0.4  # of the radius: how far from the middle, and from each other, the points of a sample are
 NEAR = 0.012  # of the volume's radius: how far a point of the plane may be from it; 3 mm of a head's picture
-POINTS_LEAST, SHARE_LEAST = 40, 0.08  # that lie on it; 0.11 of the Buddha's
-BEYOND_MOST = 0.01  # share of the points within the volume that may lie on its other side
-WIDTH_LEAST = 0.45  # of the radius: root mean square distance of its points from their middle; of a face 0.25
+MIN_POINTS, MIN_SHARE = 40, 0.08  # that lie on it; 0.11 of the Buddha's
+MAX_BEYOND = 0.01  # share of the points within the volume that may lie on its other side
+MIN_WIDTH = 0.45  # of the radius: root mean square distance of its points from their middle; of a face 0.25
 OUTLYING, ROOM = 0.01, 1.2  # share of points that are wrong; of their distance, room for what shows none
-OFF_CENTRE_LEAST = 0.08  # of the radius: the place that all cameras look at is not on it
+MIN_OFF_CENTRE = 0.08  # of the radius: the place that all cameras look at is not on it
 
 
 def standing_plane(
@@ -23,7 +23,7 @@ def standing_plane(
     """Returns a plane: ``plane . (x, 1)`` is the distance (mm) on the subject's side; None where there is no such
     plane."""
     near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
-    if len(near) < POINTS_LEAST:
+    if len(near) < MIN_POINTS:
         return None
     rng = np.random.default_rng(0)
     best, most = None, 0
@@ -34,7 +34,7 @@ def standing_plane(
     sides = np.linalg.norm(triples - np.roll(triples, 1, axis=1), axis=2).min(axis=1)
     for three in triples[sides > APART * radius_mm][:SAMPLES]:
         plane = _through(three, centre_world)
-        if plane is None or plane[:3] @ centre_world + plane[3] < OFF_CENTRE_LEAST * radius_mm:
+        if plane is None or plane[:3] @ centre_world + plane[3] < MIN_OFF_CENTRE * radius_mm:
             continue
         count = int((np.abs(near @ plane[:3] + plane[3]) < NEAR * radius_mm).sum())
         if count > most and _holds(plane, near, centre_world, radius_mm):
@@ -53,7 +53,7 @@ def ball_above(
     height = points_world @ plane_world[:3] + plane_world[3]
     inside = np.linalg.norm(points_world - centre_world, axis=1) < radius_mm
     standing = points_world[inside & (height > 2 * NEAR * radius_mm)]
-    if len(standing) < POINTS_LEAST:
+    if len(standing) < MIN_POINTS:
         return centre_world, radius_mm
     low, high = np.quantile(standing, (OUTLYING, 1 - OUTLYING), axis=0)
     middle = 0.5 * (low + high)
@@ -70,11 +70,11 @@ def _holds(
     height = points @ plane[:3] + plane[3]
     on = points[np.abs(height) < NEAR * radius]
     inside = np.linalg.norm(points - centre, axis=1) < radius
-    if len(on) < max(POINTS_LEAST, SHARE_LEAST * len(points)):
+    if len(on) < max(MIN_POINTS, MIN_SHARE * len(points)):
         return False
     spread = np.sqrt(((on - on.mean(axis=0)) ** 2).sum(axis=1).mean())
     beyond = (height[inside] < -2 * NEAR * radius).mean() if inside.any() else 1.0
-    return bool(spread > WIDTH_LEAST * radius and beyond < BEYOND_MOST)
+    return bool(spread > MIN_WIDTH * radius and beyond < MAX_BEYOND)
 
 
 def _through(three: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 4"] | None:

@@ -17,9 +17,9 @@ from pipeline.multiview.visual_hull import depth_of
 from rig.rig import Rig
 
 CELLS = 96  # voxels a side: 7 mm where images show 0.66 m, 2.6 pixels of the reduced images
-DENIES_MOST = 4.0  # log odds that one view's word against a voxel is worth: empty space in one view is empty ...
-GRANTS_MOST, GRANTS_SUM = 1.0, 10.0  # ... and those for it, of one view and of all, however many they are
-WITNESSES_LEAST = 3  # other views that must see a voxel before their word counts
+MAX_DENIES = 4.0  # log odds that one view's word against a voxel is worth: empty space in one view is empty ...
+MAX_GRANTS, GRANTS_SUM = 1.0, 10.0  # ... and those for it, of one view and of all, however many they are
+MIN_WITNESSES = 3  # other views that must see a voxel before their word counts
 WITNESSES_SHARE = 0.5  # of the other views that must hold a voxel for the subject before it must be in a mask
 SOLID_ODDS = 0.5  # log odds that all pixels around a voxel must have in a view that holds it for the subject
 
@@ -103,28 +103,28 @@ def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray
     """Tells for each view what the others say; ``odds``: of subject against background, of every view."""
     count = len(next(iter(volume.places.values())))
     total, seen, against = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
-    grants = min(GRANTS_MOST, GRANTS_SUM / max(1, len(odds) - 1))
+    grants = min(MAX_GRANTS, GRANTS_SUM / max(1, len(odds) - 1))
     words: dict[str, Float32[np.ndarray, " n"]] = {}
     doubts: dict[str, Bool[np.ndarray, " n"]] = {}
     for name, field in odds.items():
         places = volume.places[name]
         shown = places >= 0
         at = np.where(shown, places, 0)
-        words[name] = np.where(shown, np.clip(field.ravel()[at], -DENIES_MOST, grants), 0).astype(np.float32)
+        words[name] = np.where(shown, np.clip(field.ravel()[at], -MAX_DENIES, grants), 0).astype(np.float32)
         width = 2 * volume.reach_px[name] + 1
         around = cv2.erode(field, np.ones((width, width), np.uint8), borderValue=2 * SOLID_ODDS)
         doubts[name] = shown & (around.ravel()[at] < SOLID_ODDS)
         total, seen, against = total + words[name], seen + shown, against + doubts[name]
     other_views = {}
-    witnesses = min(WITNESSES_LEAST, len(odds) - 1)  # of three cameras no voxel has three others
+    witnesses = min(MIN_WITNESSES, len(odds) - 1)  # of three cameras no voxel has three others
     for name, field in odds.items():
         places = volume.places[name]
         witnessed = (places >= 0) & (seen > witnesses)
-        support = np.full(field.size, -DENIES_MOST * len(odds), np.float32)
+        support = np.full(field.size, -MAX_DENIES * len(odds), np.float32)
         np.maximum.at(support, places[witnessed], (total - words[name])[witnessed])
-        if witnesses < WITNESSES_LEAST:  # two views from nearly one side take the same wall for the subject
+        if witnesses < MIN_WITNESSES:  # two views from nearly one side take the same wall for the subject
             support = np.minimum(support, np.float32(0.0))
-        wanted = max(WITNESSES_LEAST, WITNESSES_SHARE * (len(odds) - 1))
+        wanted = max(MIN_WITNESSES, WITNESSES_SHARE * (len(odds) - 1))
         held = witnessed & (against == doubts[name]) & (seen - 1 >= wanted)
         solid = np.zeros(field.size, np.uint8)
         solid[places[held]] = 1

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.dense.surface.fusion import BustSurface
 from pipeline.experiments.detail import Known
-from pipeline.experiments.visible import LEAST_PLACES, STYLES, head_to_bust, region_errors, seen_of, splats
+from pipeline.experiments.visible import MIN_PLACES, STYLES, head_to_bust, region_errors, seen_of, splats
 from rig.capture import Capture
 from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
@@ -53,7 +53,7 @@ def test_errors_of_a_region_are_of_its_seen_skin_alone() -> None:
     assert set(found) == {f"head_{r}_seen_{q}_mm" for r in ("eyes", "ears") for q in ("median", "mean", "p95")}
     assert found["head_eyes_seen_median_mm"] == pytest.approx(0.4, abs=0.03)
     assert found["head_ears_seen_p95_mm"] < 0.6
-    assert count > LEAST_PLACES
+    assert count > MIN_PLACES
 
 
 def test_a_splat_faces_the_way_of_its_point() -> None:

@@ -65,7 +65,7 @@ def test_a_chart_of_other_colours_is_none(monkeypatch: pytest.MonkeyPatch) -> No
     mixed = [np.random.default_rng(seed).permutation(true_colours()) for seed in range(20)]
     charts = [Chart(np.zeros((24, 2)), colours) for colours in mixed]
     assert all(chart_correction([chart]) is None for chart in charts)
-    monkeypatch.setattr(colour_chart, "MOST_OFF", 1.0)
+    monkeypatch.setattr(colour_chart, "MAX_OFF", 1.0)
     assert min(found.off for found in map(chart_correction, [[chart] for chart in charts]) if found) > 0.2
 
 

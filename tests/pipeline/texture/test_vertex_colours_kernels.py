@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.texture.vertex_colours_kernels import LEAST_SHARE, MOST_VOTE, blend_views
+from pipeline.texture.vertex_colours_kernels import MAX_VOTE, MIN_SHARE, blend_views
 
 OUTLIER = 0.15
 
@@ -20,12 +20,12 @@ def expected_blend(weights: np.ndarray, colours: np.ndarray, outlier: float) -> 
         middle = np.zeros(3)
         for c in range(3):
             order = np.argsort(colour[:, c], kind="stable")
-            votes = np.minimum(weight, MOST_VOTE * weight.mean())
+            votes = np.minimum(weight, MAX_VOTE * weight.mean())
             middle[c] = colour[order, c][np.argmax(np.cumsum(votes[order]) >= 0.5 * votes.sum())]
         off = (colour - middle) / (outlier * middle + 0.005)
         off = np.where(off > 0, off, 0.5 * off)
         share = weight / (1 + (off**2).mean(axis=1))
-        out[v], views[v] = share @ colour / share.sum(), np.sum(weight > LEAST_SHARE * weight.sum())
+        out[v], views[v] = share @ colour / share.sum(), np.sum(weight > MIN_SHARE * weight.sum())
     return out, views
 
 

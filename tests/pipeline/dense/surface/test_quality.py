@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.dense.surface.quality import MOST_MM, deviation_mm, without_islands
+from pipeline.dense.surface.quality import MAX_MM, deviation_mm, without_islands
 from pipeline.dense.surface.refinement import Measured
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
@@ -34,4 +34,4 @@ def test_what_is_taken_off_has_the_deviation_of_a_guess() -> None:
     alone[HEAD.faces[0]] = True
     measured = seen_where(HEAD, alone)
     assert deviation_mm(HEAD, measured)[HEAD.faces[0]].max() < 1.0
-    assert (deviation_mm(HEAD, without_islands(HEAD, measured)) == MOST_MM).all()
+    assert (deviation_mm(HEAD, without_islands(HEAD, measured)) == MAX_MM).all()
