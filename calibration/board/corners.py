@@ -100,9 +100,9 @@ def _checkerboard(grey: np.ndarray, board: Board) -> Corners | None:
         if corners is None:
             continue
         grid = in_board_order(grey, corners.astype(float), board)
-        found = (np.arange(board.corner_count), grid.reshape(-1, 2))
-        if is_flat_grid(board, *found):
-            return None if _mirrored(grey, grid, board) or pattern_continues(grey, grid) else found
+        numbers, pixels = np.arange(board.corner_count), grid.reshape(-1, 2)
+        if is_flat_grid(board, numbers, pixels):
+            return None if _mirrored(grey, grid, board) or pattern_continues(grey, grid) else (numbers, pixels)
     return None
 
 

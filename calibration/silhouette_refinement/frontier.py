@@ -88,8 +88,13 @@ def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
     first, second = (_extremes(c, angle, u, v) for c, angle in zip((one, two), angles, strict=True))
     if not len(first.angle) or not len(second.angle):
         return []
-    steep = np.linalg.norm(first.slopes, axis=1)[:, None], np.linalg.norm(second.slopes, axis=1)[None, :]
-    apart = np.abs(first.angle[:, None] - second.angle[None, :]) / np.hypot(*steep) * np.sqrt(2.0)
+    steepness = np.linalg.norm(first.slopes, axis=1)
+    other_steepness = np.linalg.norm(second.slopes, axis=1)
+    apart = (
+        np.abs(first.angle[:, None] - second.angle[None, :])
+        / np.hypot(steepness[:, None], other_steepness[None, :])
+        * np.sqrt(2.0)
+    )
     apart[first.side[:, None] != second.side[None, :]] = np.inf
     found = []
     for i, j in zip(*np.nonzero(apart < gate_px), strict=True):

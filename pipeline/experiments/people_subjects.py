@@ -284,8 +284,16 @@ def photograph(
     )
     scene = shot.scene
     places = {name: place for name, place in scene.landmarks_world.items() if name in SEVEN_POINTS}
-    known = (scene.head, face, scene.visible, places)
-    return CaptureWithTruth(shot.capture, shot.rig, shot.masks, *known, vertices_correspond=corresponds)
+    return CaptureWithTruth(
+        capture=shot.capture,
+        rig=shot.rig,
+        masks=shot.masks,
+        mesh_world=scene.head,
+        face=face,
+        visible=scene.visible,
+        landmarks_world=places,
+        vertices_correspond=corresponds,
+    )
 
 
 def _finer(vertices: Float[np.ndarray, "v 3"], level: Level) -> tuple[Mesh, Bool[np.ndarray, " w"]]:

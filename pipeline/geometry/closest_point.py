@@ -24,12 +24,12 @@ def closest_candidates(
         facing_mm: that distance.
     """
     triangle, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
-    arrays = np.ascontiguousarray(points, float), np.ascontiguousarray(candidates, np.int64)
+    places, rows = np.ascontiguousarray(points, float), np.ascontiguousarray(candidates, np.int64)
     shape = np.ascontiguousarray(corners, float)
     normals = np.zeros((0, 3)) if facing is None else np.ascontiguousarray(facing, float)
 
     def work(first: int, last: int) -> None:
-        closest_of_candidates(first, last, *arrays, shape, normals, float(facing_mm), triangle, weights)
+        closest_of_candidates(first, last, places, rows, shape, normals, float(facing_mm), triangle, weights)
 
     in_threads(len(points), work)
     return triangle, weights

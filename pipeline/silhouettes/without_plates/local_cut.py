@@ -76,8 +76,9 @@ def _cut(
     kinds = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     kinds[inner], kinds[outer] = cv2.GC_FGD, cv2.GC_BGD
     cv2.setRNGSeed(0)  # of this thread: the colours' first clusters are drawn
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(image), kinds, (0, 0, 1, 1), *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    background, subject = np.zeros((1, 65)), np.zeros((1, 65))
+    box, how = (0, 0, 1, 1), cv2.GC_INIT_WITH_MASK
+    cv2.grabCut(np.ascontiguousarray(image), kinds, box, background, subject, ITERATIONS, how)
     return (kinds == cv2.GC_FGD) | (kinds == cv2.GC_PR_FGD)
 
 
