@@ -26,11 +26,12 @@ from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
 from rig.formats.capture_masks import mask_subjects
+from rig.formats.fault_groups import say_once
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import decode_image_file, picture_size, write_image
 from rig.formats.picture_names import is_junk
 from rig.formats.picture_samples import WHOLE_BITS, measure_samples
-from rig.formats.reading import CamerasRead, say_once
+from rig.formats.reading import CamerasRead
 from rig.formats.shot_files import (
     BESIDE_PICTURES,
     ShotFiles,

@@ -99,6 +99,13 @@ def test_other_units_are_recognised_by_what_the_pictures_show(unit, name):
     assert f"multiply them by {unit}" in fault.text
 
 
+@pytest.mark.parametrize("unit", [10, 25.4])
+def test_centimetres_and_inches_are_both_named_for_either_may_be_meant(unit):
+    (fault,) = rig_faults(posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation / unit)))
+    other = 25.4 if unit == 10 else 10
+    assert f"multiply them by {unit}, or by {other} if they are" in fault.text
+
+
 @pytest.mark.parametrize(
     ("factor", "remedy"),
     [
