@@ -20,6 +20,8 @@ WARNING_CODES = (
     "mask-inverted",
     "mask-loose",
     "mask-undecided",
+    "masks-exchanged",
+    "masks-off-edges",
     "no-albedo",
     "no-bust",
     "no-chart",

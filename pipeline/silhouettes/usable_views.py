@@ -14,6 +14,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_drift import find_drift
 from pipeline.multiview.head_size import judge_head_size
 from pipeline.multiview.rig_agreement import misplaced_camera
+from pipeline.silhouettes.mask_edges import masks_off_edges
 from pipeline.silhouettes.own_pictures import own_pictures
 from rig.capture import Capture
 from rig.errors import EigenheadError
@@ -80,7 +81,8 @@ def usable_views(
         raise TooFewViews(own.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(own.silhouettes, rig)
     size = judge_head_size(silhouettes, rig)
-    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *size, *capture.remarks)
+    beside = masks_off_edges(own.capture.images, silhouettes, [name for name in rig.names if name in own.capture.masks])
+    warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *size, *beside, *capture.remarks)
     return UsableViews(own.capture, silhouettes, own.pictures, warnings)
 
 

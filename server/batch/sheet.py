@@ -21,6 +21,7 @@ from rig.messages.message import MessageDocument
 SEVERE = frozenset(
     {
         "camera-moved", "cameras-exchanged", "contour-implausible", "face-elsewhere", "mask-contradicted",
+        "masks-exchanged", "masks-off-edges",
         "outlines-unexplained", "plates-exchanged", "pose-doubtful", "scale-implausible", "shape-implausible",
         "size-unusual",
     }
