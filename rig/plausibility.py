@@ -25,6 +25,11 @@ FRAME_MOST_MM = 10_000.0  # and of the spread, since axes that hardly converge m
 UNIT_MOST = 1_000_000  # nanometres; beyond, it is no unit
 UNITS = {10: compose("centimetres"), 25.4: compose("inches"), 100: compose("decimetres"), 1000: compose("metres")}
 UNIT_FRAME_MOST_MM = 2500.0  # in a unit that is guessed: a head has a twelfth of the picture then
+CORNER_PX = 1.0  # a principal point that nobody gave is 0, or half a pixel off it
+OTHER_SIZE, SIZE_SPREAD = (
+    0.4,
+    0.2,
+)  # logarithm of a size's share, and how far cameras' principal points scatter about it
 GRID = (9, 7)
 CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
 
@@ -32,6 +37,9 @@ CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the co
 def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[Message]:
     """Returns faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base
     line. ``any_unit``: a known length beside them will tell the unit."""
+    of_all = _principal_point_faults(rig)
+    if of_all:  # what else such intrinsics look like is said of none
+        return of_all
     faults = [fault for camera in rig if (fault := _lens_fault(camera))]
     convention = _convention_fault(rig)
     return faults + ([convention] if convention else [] if any_unit else _spread_faults(rig))
@@ -52,6 +60,20 @@ def _lens_fault(camera: Camera) -> Message | None:
     held = [f"{name} = {value:g}" for name, value in _coefficients(camera).items()]
     what = compose("lens-unmet", share=lost) if lost > LENS_LOST_MOST else compose("lens-shapeless")
     return compose("lens-absurd", camera=camera.name, coefficients=held, what=what)
+
+
+def _principal_point_faults(rig: Rig) -> list[Message]:
+    """Principal points that lie off the middle by one factor in all cameras, across and down: those of pictures of
+    another size, or none at all. A crop moves them by pixels, and a shifted lens one way."""
+    sizes = np.array([(camera.intrinsics.width, camera.intrinsics.height) for camera in rig], float)
+    points = np.array([(camera.intrinsics.cx, camera.intrinsics.cy) for camera in rig])
+    if (np.abs(points) <= CORNER_PX).all():
+        return [compose("principal-points-missing")]
+    shares = (2.0 * points + 1.0) / sizes
+    share = float(np.median(shares))
+    if share <= 0.0 or abs(np.log(share)) < OTHER_SIZE or np.abs(shares / share - 1.0).max() > SIZE_SPREAD:
+        return []
+    return [compose("intrinsics-of-other-size", share=share, factor=1.0 / share)]
 
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
