@@ -25,6 +25,8 @@ TEMPLATES = {
     "cameras-exchanged": "{exchange}: they were put right for this result. Put the cables or the files right",
     "plates-exchanged": "{exchange}: they were put right for this result",
     "masks-exchanged": "{exchange}, and the photographs are where they belong: the masks were put right for this result. Put the files right",
+    "mask-specks": "{masks}: small pieces apart from the subject, or small holes in it, were taken away: look whether anything of the subject went with them",
+    "masks-of-alpha": "the pictures are cut-outs, and their alpha is taken for masks",
     "masks-off-edges": "{count} of {all} masks lie about {offset_px:.0f} px {where} what the photographs show, and the head becomes as wrong: give masks that are tight, or clean plates in their place",
     "outlines-outside": "outside",
     "outlines-inside": "inside",

@@ -349,6 +349,8 @@ export default {
   "cameras-exchanged": "{exchange}: Für dieses Ergebnis wurden sie richtig zugeordnet. Kabel oder Dateien richtigstellen",
   "plates-exchanged": "{exchange}: Für dieses Ergebnis wurden sie richtig zugeordnet",
   "masks-exchanged": "{exchange}, und die Fotos sind, wo sie hingehören: Für dieses Ergebnis wurden die Masken richtig zugeordnet. Die Dateien richtigstellen",
+  "mask-specks": "{masks}: Kleine Teile neben der Person oder kleine Löcher in ihr wurden entfernt: ansehen, ob etwas von ihr mit verschwand",
+  "masks-of-alpha": "die Bilder sind freigestellt, und ihr Alpha wird als Maske genommen",
   "masks-off-edges": "{count} von {all} Masken liegen etwa {offset_px:.0f} px {where} dessen, was die Fotos zeigen, und der Kopf wird ebenso falsch: enge Masken geben, oder stattdessen Leerbilder",
   "outlines-outside": "außerhalb",
   "outlines-inside": "innerhalb",
