@@ -20,7 +20,7 @@ from rig.rig import Rig
 
 SPECK_SHARE = 0.02  # of the largest piece: less is no part of a subject; a head above a collar is 0.3 of a torso
 HOLE_SHARE = 3e-4  # of the subject: whites of eyes; gaps in hair are larger, as in ``pipeline.silhouettes.segment``
-SPECKS_TOLD = 2e-4  # of the subject's area
+SPECKS_TOLD = 3e-3  # of the subject's area; loose strands of hair have 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,16 +77,15 @@ def _without_specks(share: Share) -> tuple[Share, float]:
     changed, area, lost = share, max(int(np.count_nonzero(white)), 1), 0
     for of, fill in ((white, 0), (~white, 255)):
         _, labels, stats, _ = cv2.connectedComponentsWithStats(of.astype(np.uint8), connectivity=8 if fill == 0 else 4)
-        labels, areas = np.asarray(labels), np.asarray(stats)[:, cv2.CC_STAT_AREA]
+        labels, areas = np.asarray(labels, np.int32), np.asarray(stats, np.int64)[:, cv2.CC_STAT_AREA]
         largest = int(areas[1:].max(initial=0))
         limit = SPECK_SHARE * largest if fill == 0 else HOLE_SHARE * area
         small: np.ndarray = np.asarray(areas < limit)
         small[0] = False
         if fill == 255:  # background that the picture's border cuts off is no hole
-            at_border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-            small[at_border] = False
+            small[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = False
         if small.any():
-            inside = small[labels]
+            inside = np.take(small, labels)
             lost += int(areas[small].sum())
             changed = np.where(inside, np.uint8(fill), changed)
     if lost == 0:
