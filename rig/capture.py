@@ -39,11 +39,12 @@ def reassign_images(
     pictures: Mapping[str, str] = MappingProxyType({}),
     plates: Mapping[str, str] = MappingProxyType({}),
     points: Mapping[str, str] = MappingProxyType({}),
+    masks: Mapping[str, str] | None = None,
 ) -> Capture:
-    """Returns the capture with some of its images, clean plates and points assigned to other cameras.
+    """Returns the capture with some of its images, masks, clean plates and points assigned to other cameras.
 
     Args:
-        pictures: for a camera, the name under which its image and mask are filed now.
+        pictures: for a camera, the name under which its image is filed now, and its mask unless ``masks`` says so.
         plates: the same of its clean plates.
         points: the same of the feature points that were picked in its image.
     """
@@ -52,14 +53,15 @@ def reassign_images(
         wanted = {name: source.get(name, name) for name in filed.keys() | source.keys()}
         return {name: filed[wanted[name]] for name in sorted(wanted) if wanted[name] in filed}
 
+    masks = pictures if masks is None else masks
     return Capture(
         reassign(capture.images, pictures),
         reassign(capture.backgrounds, plates),
-        reassign(capture.masks, pictures),
+        reassign(capture.masks, masks),
         {landmark: reassign(views, points) for landmark, views in capture.features.items()},
-        _renamed(capture.digests, {"images": pictures, "masks": pictures, "background": plates}),
+        _renamed(capture.digests, {"images": pictures, "masks": masks, "background": plates}),
         capture.remarks,
-        reassign(capture.soft_masks, pictures),
+        reassign(capture.soft_masks, masks),
     )
 
 

@@ -23,7 +23,13 @@ FRAME_LEAST_MM = 100.0  # longer side of what the pictures show where the camera
 FRAME_USUAL_MM = 600.0  # of the studio's arrangements: 556 to 559
 FRAME_MOST_MM = 10_000.0  # and of the spread, since axes that hardly converge meet anywhere: a head is 2% of the side
 UNIT_MOST = 1_000_000  # nanometres; beyond, it is no unit
-UNITS = {10: compose("centimetres"), 100: compose("decimetres"), 1000: compose("metres")}
+UNITS = {10: compose("centimetres"), 25.4: compose("inches"), 100: compose("decimetres"), 1000: compose("metres")}
+UNIT_FRAME_MOST_MM = 2500.0  # in a unit that is guessed: a head has a twelfth of the picture then
+CORNER_PX = 1.0  # a principal point that nobody gave is 0, or half a pixel off it
+OTHER_SIZE, SIZE_SPREAD = (
+    0.4,
+    0.2,
+)  # logarithm of a size's share, and how far cameras' principal points scatter about it
 GRID = (9, 7)
 CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
 
@@ -31,6 +37,9 @@ CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the co
 def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[Message]:
     """Returns faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base
     line. ``any_unit``: a known length beside them will tell the unit."""
+    of_all = _principal_point_faults(rig)
+    if of_all:  # what else such intrinsics look like is said of none
+        return of_all
     faults = [fault for camera in rig if (fault := _lens_fault(camera))]
     convention = _convention_fault(rig)
     return faults + ([convention] if convention else [] if any_unit else _spread_faults(rig))
@@ -51,6 +60,20 @@ def _lens_fault(camera: Camera) -> Message | None:
     held = [f"{name} = {value:g}" for name, value in _coefficients(camera).items()]
     what = compose("lens-unmet", share=lost) if lost > LENS_LOST_MOST else compose("lens-shapeless")
     return compose("lens-absurd", camera=camera.name, coefficients=held, what=what)
+
+
+def _principal_point_faults(rig: Rig) -> list[Message]:
+    """Principal points that lie off the middle by one factor in all cameras, across and down: those of pictures of
+    another size, or none at all. A crop moves them by pixels, and a shifted lens one way."""
+    sizes = np.array([(camera.intrinsics.width, camera.intrinsics.height) for camera in rig], float)
+    points = np.array([(camera.intrinsics.cx, camera.intrinsics.cy) for camera in rig])
+    if (np.abs(points) <= CORNER_PX).all():
+        return [compose("principal-points-missing")]
+    shares = (2.0 * points + 1.0) / sizes
+    share = float(np.median(shares))
+    if share <= 0.0 or abs(np.log(share)) < OTHER_SIZE or np.abs(shares / share - 1.0).max() > SIZE_SPREAD:
+        return []
+    return [compose("intrinsics-of-other-size", share=share, factor=1.0 / share)]
 
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
@@ -84,15 +107,32 @@ def _spread_faults(rig: Rig) -> list[Message]:
     if spread < LEAST_SPREAD_MM:
         return [compose("cameras-near", spread_mm=f"{spread:.3g}")]
     frame = frame_mm(rig)
-    unit = next((unit for unit in UNITS if frame * unit >= FRAME_LEAST_MM), None)
-    if frame < FRAME_LEAST_MM and unit is not None:
-        return [compose("cameras-show-little", frame_mm=f"{frame:.3g}", unit=UNITS[unit], factor=unit)]
+    if frame < FRAME_LEAST_MM and frame * max(UNITS) >= FRAME_LEAST_MM:
+        return [_unit_fault(frame)]
     if min(frame, spread) > FRAME_MOST_MM:
         factor = 10 ** round(np.log10(frame / FRAME_USUAL_MM))
         wrong = factor > UNIT_MOST
         remedy = compose("look-for-wrong-one") if wrong else compose("divide-translations", factor=factor)
         return [compose("cameras-show-much", frame_m=f"{frame / 1000:.3g}", remedy=remedy)]
     return []
+
+
+def _unit_fault(frame: float) -> Message:
+    """The unit that makes a head fit into the pictures; two that do are both named, for only the file's owner knows."""
+    fitting = [unit for unit in UNITS if FRAME_LEAST_MM <= frame * unit <= UNIT_FRAME_MOST_MM]
+    usual = sorted(fitting, key=lambda unit: abs(np.log(frame * unit / FRAME_USUAL_MM)))
+    if len(usual) < 2:
+        unit = usual[0] if usual else next(unit for unit in UNITS if frame * unit >= FRAME_LEAST_MM)
+        return compose("cameras-show-little", frame_mm=f"{frame:.3g}", unit=UNITS[unit], factor=unit)
+    factor, second = usual[:2]
+    return compose(
+        "cameras-show-little-of-two",
+        frame_mm=f"{frame:.3g}",
+        unit=UNITS[factor],
+        factor=factor,
+        other=UNITS[second],
+        other_factor=second,
+    )
 
 
 def frame_mm(rig: Rig) -> float:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.alignment.feature_points import locate_features
+from pipeline.alignment.feature_points import features_as_wholes, locate_features
 from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
 from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS
 from rig.capture import Features
@@ -21,6 +21,9 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
     known = {name: views for name, views in features.items() if name in NAMES}
     single = [name for name, views in known.items() if len(views) < 2]
     faults += [compose("feature-in-one-view", name=name) for name in single]
+    whole = features_as_wholes(known, rig, noise_px=CLICK_PX)
+    if whole is not None:
+        return [*faults, compose("of-features", fault=whole)]
     located = locate_features(known, rig, noise_px=CLICK_PX)
     points = [point.position_world for point in located.points.values()]
     if len(points) < MIN_POINTS:

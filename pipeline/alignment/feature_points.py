@@ -16,6 +16,9 @@ from rig.capture import Features
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
+GROSS_NOISE = 3.0  # times the noise of a click: who clicks carelessly is not told that points are another shot's
+VIEWS_ASKED, POINTS_ASKED = 3, 3  # of a point, whose contradiction is its own; and points
+WRONG_SHARE, RIGHT_SHARE = 0.6, 0.8  # of the points
 CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point in 10,000 is lost without need
 
 
@@ -47,6 +50,21 @@ def locate_features(features: Features, rig: Rig, *, noise_px: float) -> Located
             remarks.append(compose("feature-view-contradicts", name=name, camera=dropped))
         points[name] = point
     return LocatedFeatures(points, tuple(remarks))
+
+
+def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Message | None:
+    """What is wrong with most points together: rows and columns exchanged, or another shot's. None where most points
+    agree in their views, or where too few are told to ask."""
+    grossly = GROSS_NOISE * noise_px
+    asked = {name: views for name, views in features.items() if len(views) >= VIEWS_ASKED}
+    wrong = len(asked) - len(locate_features(asked, rig, noise_px=grossly).points)
+    if len(asked) < POINTS_ASKED or wrong < WRONG_SHARE * len(asked):
+        return None
+    exchanged = {name: {camera: at[::-1] for camera, at in views.items()} for name, views in asked.items()}
+    right = len(locate_features(exchanged, rig, noise_px=grossly).points)
+    if right >= RIGHT_SHARE * len(asked):
+        return compose("features-transposed")
+    return compose("features-of-other-pictures", count=wrong, all=len(asked))
 
 
 def _consistent(

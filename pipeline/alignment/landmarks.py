@@ -18,8 +18,9 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.alignment.feature_points import locate_features
+from pipeline.alignment.feature_points import features_as_wholes, locate_features
 from pipeline.alignment.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.eigenheads.landmarks import mirrored
 from pipeline.eigenheads.model import HeadModel
 from pipeline.multiview.triangulation import TriangulatedPoint
 from pipeline.settings import AlignmentSettings
@@ -30,8 +31,16 @@ from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 MIN_POINTS = 3
+MIN_AGREED_SIDES = 0.85  # of all points, that agree where right and left are as they should be
 MIN_TRIANGLE_MM = 5.0  # rms distance from the best line; less leaves the turn about that line to the noise
 OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points is lost (chi-square, 3 degrees)
+
+
+class WrongFeatures(EigenheadError):
+    """Feature points that are wrong as wholes; the sentence says how."""
+
+    def __init__(self, fault: Message) -> None:
+        super().__init__(compose("of-features", fault=fault))
 
 
 class TooFewFeatures(EigenheadError):
@@ -70,6 +79,9 @@ def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: 
 
 def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> FeatureAlignment:
     """Returns alignment to picked points: outliers found, eq. (3) minimised, then weighed. Raises TooFewFeatures."""
+    whole = features_as_wholes(features, rig, noise_px=settings.feature_noise_px)
+    if whole is not None:
+        raise WrongFeatures(whole)
     located = locate_features(features, rig, noise_px=settings.feature_noise_px)
     unknown = [
         compose("feature-not-of-model", name=name, model=model.name)
@@ -88,6 +100,8 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     kept = consensus(source, target, expected)
     if kept is None:
         raise TooFewFeatures(points, compose("points-on-line"), remarks)
+    if _sides_exchanged(model, names, target, noise, kept, settings):
+        raise WrongFeatures(compose("features-sides-exchanged"))
     procrustes_only = procrustes(source[kept], target[kept])
     rows = np.flatnonzero(np.repeat(kept, 3))
     aligned = generalised_procrustes(
@@ -102,6 +116,24 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     residuals = dict(zip(names, distances.tolist(), strict=True))
     used = dict(zip(names, kept.tolist(), strict=True))
     return FeatureAlignment(aligned, procrustes_only, points, residuals, used, remarks)
+
+
+def _sides_exchanged(
+    model: HeadModel,
+    names: list[str],
+    target: Float[np.ndarray, "n 3"],
+    noise: Float[np.ndarray, "n 3 3"],
+    kept: Bool[np.ndarray, " n"],
+    settings: AlignmentSettings,
+) -> bool:
+    """Whether most points belong together only once right and left are exchanged in all of them."""
+    others = [mirrored(name) for name in names]
+    if float(kept.mean()) >= MIN_AGREED_SIDES or others == names or not all(name in model.landmarks for name in others):
+        return False
+    source, spread = landmark_statistics(model, others, settings.landmark_noise_mm)
+    expected = np.sqrt((_own_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
+    found = consensus(source, target, expected)
+    return found is not None and float(found.mean()) >= MIN_AGREED_SIDES and bool(found.sum() > kept.sum() + 1)
 
 
 def landmark_statistics(

@@ -2,11 +2,11 @@
 
 Where most cameras contradict the others, other readings are tried: all pictures reflected about their principal points,
 as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 where they are
-square; and poses that were written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
-sphere about the world's origin does not show by itself. The reading under which tangent planes touch both outlines of
-each pair is named. Where there is none, the calibration is another rig's, or of this one before it was rearranged;
-unless a good part of all planes meet closely nevertheless: then the masks are loose, with a shadow on the wall or hair
-that some of them miss.
+square; poses that were written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
+sphere about the world's origin does not show by itself; and intrinsics of other pictures (``lens_reading``). The
+reading under which tangent planes touch both outlines of each pair is named. Where there is none, the calibration is
+another rig's, or of this one before it was rearranged; unless a good part of all planes meet closely nevertheless: then
+the masks are loose, with a shadow on the wall or hair that some of them miss.
 Where one camera alone contradicts the others, it is named.
 
 Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
+from pipeline.multiview.lens_reading import find_lens_reading
 from pipeline.multiview.tangency import outer_hull
 from rig.camera import Intrinsics
 from rig.messages.message import Message, compose
@@ -29,6 +30,7 @@ MIN_CAMERAS = 4  # three have six planes at most: too few to refuse a capture by
 MIN_PLANES = 4  # of a camera whose word counts
 MIN_WRONG = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
 MAX_RIGHT = 0.25  # of a reading that is believed
+MAX_LENSES = 0.2  # of one in which focal lengths and principal points were sought: 0.01 to 0.15 where they are wrong
 LOOSE_QUARTER = 22e-4  # of the picture's width, that the better quarter of all planes misses at most in a right rig
 # whose masks are loose: 20e-4 with long hair in 8 to 24 views; 24e-4 and more in rigs of another arrangement
 LOOSE_BIMODAL, MAX_LOOSE_QUARTER = 0.28, 35e-4  # of the median miss: shadows spoil some planes and leave others whole,
@@ -62,7 +64,15 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
     believed = [(misfit, message) for misfit, message in found if misfit <= MAX_RIGHT]
     if believed:
         return min(believed, key=lambda one: one[0])[1]
+    lenses = find_lens_reading(hulls, seen, lambda read: _judged_misfit(hulls, read))
+    if lenses.is_other and _judged_misfit(hulls, lenses.rig) <= MAX_LENSES:
+        return lenses.message()
     return None if _are_loose(hulls, seen) else compose("other-rig")
+
+
+def _judged_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
+    misfit = _median_misfit(hulls, rig)
+    return misfit if np.isfinite(misfit) else 1.0
 
 
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:

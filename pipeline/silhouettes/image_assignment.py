@@ -25,6 +25,7 @@ from pipeline.multiview.camera_assignment import (
 )
 from pipeline.multiview.rig_agreement import loose_outlines, wrong_rig
 from pipeline.multiview.triangulation import NoPoint, triangulate
+from pipeline.silhouettes.mask_edges import masks_alone_exchanged
 from rig.capture import Capture, Features, reassign_images
 from rig.errors import EigenheadError
 from rig.messages.message import Message, compose
@@ -89,19 +90,36 @@ def assign_images(
     duplicates = duplicate_views(capture, silhouettes, rig)
     distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
     assignment = find_assignment(distinct, rig)
+    masks = assignment.pictures if _masks_alone(capture, silhouettes, assignment) else {}
+    what = compose("what-masks") if masks else compose("what-pictures")
     if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
-        raise ExchangedPictures(assignment.messages(), doubtful=not assignment.overwhelming)
+        found = ring_messages(assignment.pictures, what)
+        raise ExchangedPictures(found, doubtful=not assignment.overwhelming)
     wrong = None if assignment.pictures else wrong_rig(distinct, rig)
     if wrong:
         raise WrongRig(wrong)
-    if assignment.pictures:
-        capture = _filed_back(capture, assignment.pictures, rig)
+    pictures = {} if masks else assignment.pictures
+    if masks:
+        capture = reassign_images(capture, masks=masks)
         silhouettes = segmented(capture)
-        plates = _composed(plates, assignment.pictures)
-    warnings = _warnings(assignment, plates, duplicates)
+    elif pictures:
+        capture = _filed_back(capture, pictures, rig)
+        silhouettes = segmented(capture)
+        plates = _composed(plates, pictures)
+    warnings = _warnings(pictures, masks, plates, duplicates)
     if not assignment.pictures and loose_outlines(distinct, rig):
         warnings = (*warnings, compose("outlines-loose"))
-    return ImageAssignment(capture, _left_out(silhouettes, duplicates), assignment.pictures, plates, warnings)
+    return ImageAssignment(capture, _left_out(silhouettes, duplicates), pictures, plates, warnings)
+
+
+def _masks_alone(capture: Capture, silhouettes: Mapping[str, Silhouette], assignment: Assignment) -> bool:
+    """Whether ready masks alone are exchanged, for the photographs agree with them once they are filed back."""
+    names = assignment.pictures.keys()
+    return (
+        bool(names)
+        and names <= capture.masks.keys()
+        and masks_alone_exchanged(capture.images, silhouettes, assignment.pictures)
+    )
 
 
 def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
@@ -211,12 +229,14 @@ def _contradiction(features: Features, rig: Rig) -> float:
 
 
 def _warnings(
-    assignment: Assignment, plates: Mapping[str, str], duplicates: Mapping[str, str]
+    pictures: Mapping[str, str], masks: Mapping[str, str], plates: Mapping[str, str], duplicates: Mapping[str, str]
 ) -> tuple[ReportWarning, ...]:
     found = []
-    if assignment.pictures:
-        found.append(compose("cameras-exchanged", exchange=assignment.messages()))
-    if plates and not assignment.pictures:
+    if pictures:
+        found.append(compose("cameras-exchanged", exchange=ring_messages(pictures, compose("what-pictures"))))
+    if masks:
+        found.append(compose("masks-exchanged", exchange=ring_messages(masks, compose("what-masks"))))
+    if plates and not pictures:
         found.append(compose("plates-exchanged", exchange=ring_messages(plates, compose("what-plates"))))
     for name, owner in duplicates.items():
         found.append(compose("picture-duplicated", camera=name, owner=owner))

@@ -15,6 +15,7 @@ from pipeline.multiview.camera_drift import find_drift
 from pipeline.multiview.head_size import judge_head_size
 from pipeline.multiview.rig_agreement import misplaced_camera
 from pipeline.silhouettes.image_assignment import assign_images
+from pipeline.silhouettes.mask_edges import masks_off_edges
 from rig.capture import Capture
 from rig.errors import EigenheadError
 from rig.messages.message import compose
@@ -80,7 +81,9 @@ def usable_views(
         raise TooFewViews(assigned.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(assigned.silhouettes, rig)
     size = judge_head_size(silhouettes, rig)
-    warnings = (*assigned.warnings, *view_warnings(silhouettes), *moved, *size, *capture.remarks)
+    given_masks = [name for name in rig.names if name in assigned.capture.masks]
+    beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
+    warnings = (*assigned.warnings, *view_warnings(silhouettes), *moved, *size, *beside, *capture.remarks)
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 

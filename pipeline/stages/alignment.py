@@ -16,6 +16,7 @@ from pipeline.stages.faces import Faces
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
 from rig.errors import EigenheadError
+from rig.formats.fault_groups import say_once
 from rig.geometry import Similarity
 from rig.messages.message import compose
 from rig.progress import Progress
@@ -75,5 +76,6 @@ def align_to_views(
             front = frontmost_camera(pose.rotation[:, 2], pose.translation, rig)
         return Staged(Alignment(pose, front, "silhouettes", rival=found.rival))
     found = feature_alignment(model, views.capture.features, rig, settings.alignment)
-    warnings = [compose("features", remark=remark) for remark in found.remarks]
+    names = [*views.capture.features, *rig.names]
+    warnings = [compose("features", remark=remark) for remark in say_once(found.remarks, names)]
     return Staged(Alignment(found.world_from_head, front, "features"), warnings)

@@ -9,6 +9,7 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
+from rig.formats.fault_groups import say_once
 from rig.geometry import RigidTransform, nearest_rotation
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS, LensModel, RecordedLens
@@ -17,6 +18,7 @@ from rig.rig import Rig
 FORMAT = "eigenhead-cameras/1"
 CAMERAS_LEAST, CAMERAS_MOST = 3, 64
 SERIAL_MOST = 64
+UNITS_MM = {"m": 1000, "meter": 1000, "metre": 1000, "meters": 1000, "metres": 1000, "cm": 10, "in": 25.4, "inch": 25.4}
 PIXELS_MOST = 20_000  # a side; larger is a damaged or hostile file, not a camera
 
 
@@ -71,17 +73,28 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     if document.get("format") != FORMAT:
         faults.append(compose("format-is", format=f"{document.get('format')!r:.80}", wanted=f"{FORMAT!r}"))
     if document.get("unit", "mm") != "mm":
-        faults.append(compose("unit-is", unit=f"{document['unit']!r:.80}"))
+        faults.append(_unit_fault(document["unit"]))
     entries = document["cameras"]
     if not CAMERAS_LEAST <= len(entries) <= CAMERAS_MOST:
         faults.append(compose("cameras-few-or-many", count=len(entries), least=CAMERAS_LEAST, most=CAMERAS_MOST))
-    cameras = [_read_camera(entry, f"cameras[{i}]", faults) for i, entry in enumerate(entries[:CAMERAS_MOST])]
+    places = [f"cameras[{i}]" for i in range(len(entries[:CAMERAS_MOST]))]
+    cameras = [_read_camera(entry, place, faults) for entry, place in zip(entries, places, strict=False)]
     found = [camera for camera in cameras if camera is not None]
     names = [camera.name for camera in found]
     faults += _repeated(names) + _shared_serials(found)
     if faults:
-        raise InputError(subject, faults)
+        written = [entry["name"] for entry in entries if isinstance(entry, dict) and isinstance(entry.get("name"), str)]
+        raise InputError(subject, say_once(faults, [*filter(None, written), *places]))
     return Rig(tuple(found))
+
+
+def _unit_fault(unit: Any) -> Message:
+    """A unit that is no millimetre, with the factor where it is known."""
+    written = f"{unit!r:.80}"
+    factor = UNITS_MM.get(unit.lower()) if isinstance(unit, str) else None
+    if factor is None:
+        return compose("unit-is", unit=written)
+    return compose("unit-of-length", unit=written, factor=factor)
 
 
 def _repeated(names: list[str]) -> list[Message]:

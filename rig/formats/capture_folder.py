@@ -26,11 +26,12 @@ from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
 from rig.formats.capture_masks import mask_subjects
+from rig.formats.fault_groups import say_once
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import decode_image_file, picture_size, write_image
+from rig.formats.images import cut_out_alpha, decode_image_file, picture_size, write_image
 from rig.formats.picture_names import is_junk
 from rig.formats.picture_samples import WHOLE_BITS, measure_samples
-from rig.formats.reading import CamerasRead, say_once
+from rig.formats.reading import CamerasRead
 from rig.formats.shot_files import (
     BESIDE_PICTURES,
     ShotFiles,
@@ -198,16 +199,28 @@ def read_shot(
         digests["features.json"] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
         features = work_features(features, rig, work_rig(rig, pixels_most))
-    subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)
+    cut_out = {} if masks or backgrounds else _cut_outs(folder, jobs, rig)
+    subjects = mask_subjects(masks or cut_out, rig, faults, pixels_most=pixels_most)
     return Capture(
         images,
         {name: tuple(plates) for name, plates in backgrounds.items()},
         subjects.masks,
         features,
         digests,
-        (*levels, *subjects.remarks),
+        (*levels, *subjects.remarks, *([compose("masks-of-alpha")] if cut_out else [])),
         subjects.soft,
     )
+
+
+def _cut_outs(folder: Path, jobs: Sequence[tuple[str, str, Path]], rig: Rig) -> dict[str, tuple[str, np.ndarray]]:
+    """The alpha of each picture, where all were cut out: what is left of them has no other outline."""
+    found = {}
+    for _, name, path in jobs:
+        alpha, k = cut_out_alpha(path), rig[name].intrinsics
+        if alpha is None or alpha.shape != (k.height, k.width):
+            return {}
+        found[name] = path.relative_to(folder).as_posix(), alpha
+    return found
 
 
 def _sample_bits(

@@ -8,6 +8,7 @@ edges are soft, and what was noticed. Faults are appended, one sentence for file
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
@@ -16,6 +17,10 @@ from rig.formats.work_size import at_share, work_rig, work_share
 from rig.mask_polarity import inverted_masks
 from rig.messages.message import Message, compose
 from rig.rig import Rig
+
+SPECK_SHARE = 0.02  # of the largest piece: less is no part of a subject; a head above a collar is 0.3 of a torso
+HOLE_SHARE = 3e-4  # of the subject: whites of eyes; gaps in hair are larger, as in ``pipeline.silhouettes.segment``
+SPECKS_TOLD = 3e-3  # of the subject's area; loose strands of hair have 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,9 +48,11 @@ def mask_subjects(
     faults += _by_cause({files[name]: reading.fault for name, reading in readings.items()})
     usable = {name: reading for name, reading in readings.items() if not reading.fault}
     inverted = inverted_masks({name: reading.share > 127 for name, reading in usable.items()}, _middles(rig))
-    masks, soft = {}, {}
+    masks, soft, specked = {}, {}, list[str]()
     for name, reading in usable.items():
-        share = _in_picture(255 - reading.share if name in inverted else reading.share, reading, name, rig, pixels_most)
+        whole, lost = _without_specks(255 - reading.share if name in inverted else reading.share)
+        specked += [files[name]] if lost > SPECKS_TOLD else []
+        share = _in_picture(whole, reading, name, rig, pixels_most)
         masks[name] = share > 127
         masks[name].setflags(write=False)
         if not masks[name].any():
@@ -55,9 +62,37 @@ def mask_subjects(
             soft[name].setflags(write=False)
     grouped = _by_cause({files[name]: reading.remark for name, reading in usable.items()})
     remarks = [compose("mask-undecided", remark=remark) for remark in grouped]
+    if specked:
+        remarks.append(compose("mask-specks", masks=_of_masks(specked)))
     if inverted:
         remarks.append(compose("mask-inverted", remark=_inverted([files[name] for name in inverted], len(planes))))
     return MaskSubjects(masks, soft, tuple(remarks))
+
+
+def _without_specks(share: Share) -> tuple[Share, float]:
+    """A mask without small pieces apart from the subject and without small holes, and their area by the subject's.
+
+    One speck at the border of the picture would be part of the outline that cameras are compared by."""
+    white = share > 127
+    changed, area, lost = share, max(int(np.count_nonzero(white)), 1), 0
+    for of, fill in ((white, 0), (~white, 255)):
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(of.astype(np.uint8), connectivity=8 if fill == 0 else 4)
+        labels, areas = np.asarray(labels, np.int32), np.asarray(stats, np.int64)[:, cv2.CC_STAT_AREA]
+        largest = int(areas[1:].max(initial=0))
+        limit = SPECK_SHARE * largest if fill == 0 else HOLE_SHARE * area
+        small: np.ndarray = np.asarray(areas < limit)
+        small[0] = False
+        if fill == 255:  # background that the picture's border cuts off is no hole
+            small[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = False
+        if small.any():
+            inside = np.take(small, labels)
+            lost += int(areas[small].sum())
+            changed = np.where(inside, np.uint8(fill), changed)
+    if lost == 0:
+        return share, 0.0
+    near = cv2.dilate((changed != share).astype(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
+    changed = np.where(near, np.where(changed > 127, np.uint8(255), np.uint8(0)), changed)  # their soft rims, too
+    return changed, lost / area
 
 
 def _in_picture(

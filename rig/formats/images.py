@@ -132,6 +132,18 @@ def decode_image_file(
     return pixels, hashlib.sha256(data).hexdigest(), None
 
 
+def cut_out_alpha(path: Path) -> Plane | None:
+    """Returns the alpha of a picture that was cut out, in the file's own numbers; None where it has none, or the same
+    everywhere."""
+    data = path.read_bytes()
+    if not data.startswith(PNG) and path.suffix.lower() not in (".webp", ".tif", ".tiff"):
+        return None
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 4 or pixels[..., 3].min() == pixels[..., 3].max():
+        return None
+    return np.ascontiguousarray(pixels[..., 3])
+
+
 @contextmanager
 def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
     """What decoders raise for a damaged file, as InputError."""

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
+from rig.formats.fault_groups import some_of
 from rig.formats.foreign import (
     LENS_LOSS_PX,
     brown_conrady,
@@ -26,7 +27,7 @@ from rig.formats.foreign import (
     xml_root,
 )
 from rig.formats.foreign_keys import METASHAPE
-from rig.formats.reading import CamerasRead, Reading, shown, some_of
+from rig.formats.reading import CamerasRead, Reading, shown
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

@@ -15,9 +15,10 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
+from rig.formats.fault_groups import some_of
 from rig.formats.foreign import MATRIX_PLACES, METRES_MOST, Malformed, lens_entry, number_array, parsed, sized
 from rig.formats.foreign_keys import OPENCV_YAML
-from rig.formats.reading import CamerasRead, Reading, some_of
+from rig.formats.reading import CamerasRead, Reading
 from rig.geometry import rotation_from_vector
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS

@@ -1,18 +1,16 @@
 """What a reader of another program's cameras finds on its way: faults, unused keys, cameras that take no part."""
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from rig.errors import InputError
 from rig.formats.cameras_json import FORMAT, rig_from_document
+from rig.formats.fault_groups import say_once, some_of
 from rig.formats.foreign_keys import ForeignKey, Table, says_nothing
-from rig.messages.message import Message, compose, message_of
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-NAMED_MOST = 4  # cameras or keys that one sentence names
-SAME_LEAST = 3  # faults that differ in names alone, from which on they are one cause
 VALUE_MOST = 40  # characters of a value
 
 
@@ -85,32 +83,6 @@ class Reading:
             compose("cameras-left-out", cameras=some_of(names), why=why, file=self.subject)
             for why, names in reasons.items()
         ]
-
-
-def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Message]:
-    """Returns faults that differ only in the names of cameras and of their files, as one sentence that names the first
-    and how many others there are."""
-    ordered = sorted(set(names), key=len, reverse=True)
-    name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
-    plate = re.compile(r"\b(background/)\S+")
-    groups: dict[str, list[Message]] = {}
-    for fault in dict.fromkeys(message_of(fault) for fault in faults):
-        masked = plate.sub(r"\1", fault.text)
-        groups.setdefault(masked if name is None else name.sub("\0", masked), []).append(fault)
-    grouped = []
-    for group in groups.values():
-        if len(group) < SAME_LEAST or name is None:
-            grouped += group
-            continue
-        others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault.text)))
-        grouped.append(compose("same-of-more", fault=group[0], count=len(group) - 1, names=some_of([*others])))
-    return grouped
-
-
-def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Message:
-    """Returns a few names, and how many more there are, for a message."""
-    more = len(names) - most
-    return compose("names-and-more", names=names[:most], more=more) if more > 0 else names
 
 
 def shown(value: object, most: int = VALUE_MOST) -> str:

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rig.formats.fault_groups import some_of
 from rig.formats.images import is_picture
 from rig.formats.picture_names import UNREAD_PICTURES, is_junk, match_names, picture_stem
-from rig.formats.reading import some_of
 from rig.formats.serials import pictures_by_serial
 from rig.messages.message import Message, compose
 from rig.rig import Rig

@@ -21,12 +21,15 @@ from rig.messages.message import MessageDocument
 SEVERE = frozenset(
     {
         "camera-moved", "cameras-exchanged", "contour-implausible", "face-elsewhere", "mask-contradicted",
+        "masks-exchanged", "masks-off-edges",
         "outlines-unexplained", "plates-exchanged", "pose-doubtful", "scale-implausible", "shape-implausible",
         "size-unusual",
     }
 )  # fmt: skip
 """Codes of warnings after which the head may be wrong as a whole; docs/operator.md says of each what to do."""
-REMARKS = frozenset({"cameras-scaled", "file-unread", "old-setting", "picture-levels", "unknown-key", "views-many"})
+REMARKS = frozenset(
+    {"cameras-scaled", "file-unread", "masks-of-alpha", "old-setting", "picture-levels", "unknown-key", "views-many"}
+)
 """Codes of what was only told."""
 PANEL_PX = (112, 144)  # of a view on the sheet
 JPEG_QUALITY = 82

@@ -29,9 +29,9 @@ from rig.formats.capture_folder import (
     read_shot,
     size_fault,
 )
+from rig.formats.fault_groups import say_once
 from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.images import IMAGE_SUFFIXES, picture_size
-from rig.formats.reading import say_once
 from rig.formats.rig_toml import ShotConfig
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence

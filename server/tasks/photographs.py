@@ -33,8 +33,8 @@ from rig.formats.capture_folder import (
     read_shot,
     unread_pictures,
 )
+from rig.formats.fault_groups import say_once
 from rig.formats.images import is_picture, picture_size, write_image
-from rig.formats.reading import say_once
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import find_files, picture_folder
 from rig.formats.work_size import WORK_PIXELS, work_rig

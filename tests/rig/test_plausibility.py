@@ -85,6 +85,26 @@ def test_fisheyes_and_rational_lenses_of_real_cameras_have_no_faults():
     assert rig_faults(recorded(rig, "cam05", rational)) == []
 
 
+def test_principal_points_that_nobody_gave_are_named_once():
+    rig = default_layout()
+    bare = Rig(tuple(replace(c, intrinsics=replace(c.intrinsics, cx=0.0, cy=0.0)) for c in rig))
+    (fault,) = rig_faults(bare)
+    assert fault.code == "principal-points-missing"
+
+
+@pytest.mark.parametrize(("factor", "told"), [(2.0, "2 times"), (0.5, "0.5 times"), (0.25, "0.25 times")])
+def test_intrinsics_of_pictures_of_another_size_are_named_with_the_factor(factor, told):
+    rig = default_layout()
+    keys = ("fx", "fy", "cx", "cy")
+    other = [
+        replace(c, intrinsics=replace(c.intrinsics, **{key: factor * getattr(c.intrinsics, key) for key in keys}))
+        for c in rig
+    ]
+    (fault,) = rig_faults(Rig(tuple(other)))
+    assert fault.text.startswith(f"the intrinsics are of pictures {told} as large")
+    assert f"by {1 / factor:g}," in fault.text
+
+
 def test_a_focal_length_in_mm_is_named_and_not_its_lens():
     rig = default_layout()
     in_mm = Rig(tuple(replace(c, intrinsics=replace(c.intrinsics, fx=50.0, fy=50.0)) for c in rig))
@@ -97,6 +117,13 @@ def test_other_units_are_recognised_by_what_the_pictures_show(unit, name):
     (fault,) = rig_faults(posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation / unit)))
     assert f"look like {name}" in fault.text
     assert f"multiply them by {unit}" in fault.text
+
+
+@pytest.mark.parametrize("unit", [10, 25.4])
+def test_centimetres_and_inches_are_both_named_for_either_may_be_meant(unit):
+    (fault,) = rig_faults(posed(default_layout(), lambda pose: RigidTransform(pose.rotation, pose.translation / unit)))
+    other = 25.4 if unit == 10 else 10
+    assert f"multiply them by {unit}, or by {other} if they are" in fault.text
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ TEMPLATES = {
     "key-rolling-shutter": "a picture is taken as exposed at one time: calibrate without it",
     "no-camera-list": "is no object with a list 'cameras'",
     "unit-is": "unit is {unit}, wanted 'mm'",
+    "unit-of-length": "unit is {unit}, wanted 'mm': multiply the translations by {factor:g} and write 'mm'",
     "cameras-few-or-many": "{count} cameras; between {least} and {most} work",
     "camera-repeated": "camera {camera} occurs {times} times",
     "cameras-repeated": "camera {camera} occurs {times} times, and {count} more name occurs several times | camera {camera} occurs {times} times, and {count} more names occur several times",

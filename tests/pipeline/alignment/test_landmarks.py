@@ -8,15 +8,17 @@ from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from pipeline.alignment.feature_checks import feature_faults
 from pipeline.alignment.landmarks import (
     TooFewFeatures,
+    WrongFeatures,
     align_to_features,
     consensus,
     feature_alignment,
     landmark_statistics,
 )
 from pipeline.alignment.procrustes import generalised_procrustes, procrustes
-from pipeline.eigenheads.landmarks import SEVEN_POINTS
+from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS, mirrored
 from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.settings import AlignmentSettings
 from rig.camera import Camera, Intrinsics
@@ -169,3 +171,32 @@ def test_too_few_points_and_points_on_a_line_say_what_to_do(model: HeadModel) ->
     midline = picked(model, Similarity.identity(), ("stomion", "labiale_superius", "labiale_inferius"))
     with pytest.raises(TooFewFeatures, match="on one line"):
         align_to_features(model, midline, RIG, AlignmentSettings())
+
+
+def test_sides_that_are_the_viewer_s_are_named(model: HeadModel) -> None:
+    features = picked(model, Similarity(1.0, np.eye(3), np.array([5.0, 0.0, 0.0])), NAMES)
+    exchanged = {mirrored(name): views for name, views in features.items()}
+    with pytest.raises(WrongFeatures, match="once right and left are exchanged"):
+        align_to_features(model, exchanged, RIG, AlignmentSettings())
+
+
+def test_rows_and_columns_that_are_exchanged_are_named(model: HeadModel) -> None:
+    features = picked(model, Similarity(1.0, np.eye(3), np.array([45.0, 0.0, 0.0])), SEVEN_POINTS)
+    exchanged = {name: {camera: at[::-1] for camera, at in views.items()} for name, views in features.items()}
+    with pytest.raises(WrongFeatures, match=r"write each as \[column, row\]"):
+        align_to_features(model, exchanged, RIG, AlignmentSettings())
+    (fault,) = feature_faults(exchanged, RIG)
+    assert "once rows and columns are exchanged" in fault.text
+
+
+def test_points_of_other_pictures_are_named_and_careless_ones_are_not(model: HeadModel) -> None:
+    features = picked(model, Similarity(1.0, np.eye(3), np.array([45.0, 0.0, 0.0])), NAMES)
+    rng = np.random.default_rng(4)
+
+    def scattered(px: float) -> Features:
+        return {name: {c: at + rng.normal(0, px, 2) for c, at in views.items()} for name, views in features.items()}
+
+    assert feature_faults(scattered(3.0), RIG) == []
+    (fault,) = feature_faults(scattered(150.0), RIG)
+    assert "were picked in other pictures than these" in fault.text
+    assert "remove features.json" in fault.text

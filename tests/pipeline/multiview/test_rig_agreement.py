@@ -124,3 +124,16 @@ def test_the_calibration_of_another_rig_is_named(seen):
         assert found is not None
         assert "is of another rig" in found.text
         assert "calibrate it again" in found.text
+
+
+def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(seen):
+    rig, _, of_all = seen
+    changed = [lensed(c, cx=c.intrinsics.cx + 60, cy=c.intrinsics.cy + 40) for c in rig]
+    found = wrong_rig(of_all, Rig(tuple(changed)))
+    assert found is not None
+    moved = next(change for change in found.parameters["changes"] if change.code == "principal-points-moved")
+    assert (moved.parameters["right_px"], moved.parameters["down_px"]) == pytest.approx((-60, -40), abs=12)
+
+
+def lensed(camera, **changes):
+    return replace(camera, intrinsics=replace(camera.intrinsics, **changes))

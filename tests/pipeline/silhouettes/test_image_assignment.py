@@ -62,6 +62,21 @@ def test_an_exchange_is_named_and_filed_back(half_size_shot, planted, code):
     assert "cam04 and cam06 hold each other's" in found.warnings[0].text
 
 
+def test_masks_alone_that_are_exchanged_are_filed_back_and_photographs_stay(half_size_shot):
+    shot = half_size_shot
+    masked = Capture(shot.capture.images, masks=shot.masks)
+
+    def segmented(filed: Capture):
+        return {name: silhouette_from_mask(mask) for name, mask in filed.masks.items()}
+
+    found = assign_images(reassign_images(masked, masks=EXCHANGE), shot.rig, segmented, exchanged="repair")
+    assert [warning.code for warning in found.warnings] == ["masks-exchanged"]
+    assert "cam04 and cam06 hold each other's masks" in found.warnings[0].text
+    assert found.pictures == {}
+    assert all(found.capture.images[name] is shot.capture.images[name] for name in shot.rig.names)
+    assert all(np.array_equal(found.silhouettes[name].mask, shot.masks[name]) for name in shot.rig.names)
+
+
 def test_an_exchange_is_refused_where_the_settings_say_so(half_size_shot):
     with pytest.raises(ExchangedPictures, match="cam04 and cam06 hold each other's pictures"):
         judged(half_size_shot, reassign_images(half_size_shot.capture, pictures=EXCHANGE, plates=EXCHANGE), "refuse")

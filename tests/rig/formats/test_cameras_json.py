@@ -206,3 +206,20 @@ def test_subset_keeps_the_order_and_lookup_fails_loudly() -> None:
     assert len(rig) == 2
     assert "cam02" in rig
     assert "cam03" not in rig
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("m", "1000"), ("cm", "10"), ("Inch", "25.4")])
+def test_a_unit_that_is_known_is_refused_with_its_factor(unit: str, factor: str) -> None:
+    document: dict[str, Any] = document_from_rig(fan()) | {"unit": unit}
+    with pytest.raises(InputError, match=f"multiply the translations by {factor} and write 'mm'"):
+        rig_from_document(document)
+
+
+def test_what_is_wrong_in_every_camera_is_said_once() -> None:
+    document = json.loads(json.dumps(document_from_rig(fan())))
+    for camera in document["cameras"]:
+        camera["camera_from_world"]["rotation"] = [0.1, 0.2, 0.3]
+    with pytest.raises(InputError) as caught:
+        rig_from_document(document)
+    (fault,) = caught.value.faults
+    assert "write the matrix (cv2.Rodrigues); the same is true of 10 more (cam01, " in str(fault)

@@ -1,6 +1,7 @@
 """Capture folders: what is written is read back; every layout of docs/capture-format.md; every fault named at once."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,33 @@ def test_an_exif_turn_is_not_obeyed(folder: Path) -> None:
     Image.fromarray(picture()).save(folder / "images" / "a.jpg", exif=exif)
     capture, _ = read_capture(folder)
     assert capture.images["a"].shape == (HEIGHT, WIDTH, 3)
+
+
+def cut_out(path: Path) -> None:
+    """The picture with an alpha whose subject is its middle."""
+    rgb = cv2.imread(str(path))
+    assert rgb is not None
+    alpha = np.zeros(rgb.shape[:2], np.uint8)
+    alpha[rgb.shape[0] // 4 :, rgb.shape[1] // 4 : -rgb.shape[1] // 4] = 255
+    cv2.imwrite(str(path), np.dstack([rgb, alpha]))
+
+
+def test_the_alpha_of_cut_outs_is_their_mask_where_there_is_no_other(folder: Path) -> None:
+    plates = folder / "background"
+    pictures = sorted((folder / "images").glob("*.png"))
+    for path in pictures:
+        cut_out(path)
+    with_plates, _ = read_capture(folder)
+    assert with_plates.masks.keys() == {"c"}
+    shutil.rmtree(plates)
+    shutil.rmtree(folder / "masks", ignore_errors=True)
+    capture, rig = read_capture(folder)
+    assert [remark.code for remark in capture.remarks] == ["masks-of-alpha"]
+    assert capture.masks.keys() == set(rig.names)
+    assert capture.masks[rig.names[0]][-1].any()
+    assert not capture.masks[rig.names[0]][0].any()
+    write_image(pictures[0], read_image(pictures[0]))
+    assert dict(read_capture(folder)[0].masks) == {}
 
 
 def test_one_enclosing_folder(folder: Path) -> None:

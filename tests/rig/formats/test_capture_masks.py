@@ -49,6 +49,26 @@ def test_soft_masks_keep_their_greys_and_are_written_with_them(folder: Path, tmp
     np.testing.assert_array_equal(again.masks["a"], capture.masks["a"])
 
 
+def test_specks_apart_from_the_subject_are_taken_away_and_told(folder: Path) -> None:
+    specked = BUST.astype(np.uint8) * np.uint8(255)
+    specked[3:6, 2:5] = 255
+    specked[20, 60] = 255
+    write(folder, "b", specked)
+    capture, _ = read_capture(folder)
+    np.testing.assert_array_equal(capture.masks["b"], BUST)
+    (remark,) = capture.remarks
+    assert remark.code == "mask-specks"
+    assert remark.text.startswith("masks/b.png: small pieces apart from the subject")
+
+
+def test_a_head_above_a_collar_that_cuts_it_off_stays(folder: Path) -> None:
+    parted = BUST & ((ROWS < 28) | (ROWS > 33))
+    write(folder, "b", parted.astype(np.uint8) * np.uint8(255))
+    capture, _ = read_capture(folder)
+    np.testing.assert_array_equal(capture.masks["b"], parted)
+    assert capture.remarks == ()
+
+
 def test_what_is_true_of_all_masks_is_said_once(folder: Path) -> None:
     for name in "abc":
         write(folder, name, np.where(BUST, 1 + ROWS // 12, 0).astype(np.uint8))

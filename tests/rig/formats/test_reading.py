@@ -3,8 +3,9 @@
 import pytest
 
 from rig.errors import InputError
+from rig.formats.fault_groups import say_once, some_of
 from rig.formats.foreign_keys import ForeignKey
-from rig.formats.reading import Reading, say_once, shown, some_of
+from rig.formats.reading import Reading, shown
 from rig.messages.message import compose, texts_of
 
 TABLE = {
@@ -35,6 +36,14 @@ def test_many_files_with_one_fault_are_one_sentence() -> None:
     (sentence,) = texts_of(say_once(plates, names))
     assert "the same is true of 21 more (" in sentence
     assert say_once(["cam1 is a", "cam11 is a", "cam111 is a"], ["cam1", "cam11"])[0].text.startswith("cam1 is a")
+
+
+def test_faults_that_differ_in_what_was_measured_of_each_camera_are_one() -> None:
+    names = [f"cam{i:02}" for i in range(4)]
+    (sentence,) = texts_of(say_once([f"{n}: {27.5 + 0.1 * i:g} px is absurd" for i, n in enumerate(names)], names))
+    assert sentence == "cam00: 27.5 px is absurd; the same is true of 3 more (cam01, cam02, cam03)"
+    sizes = [f"{n} is {600 + i} x 400 pixels" for i, n in enumerate(names)]
+    assert texts_of(say_once(sizes, names)) == sizes
 
 
 def test_what_cameras_have_alike_is_said_once() -> None:

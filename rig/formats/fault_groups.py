@@ -1,0 +1,37 @@
+"""Faults that have one cause, said once: a file that is wrong is wrong in every camera."""
+
+import re
+from collections.abc import Iterable, Sequence
+
+from rig.messages.message import Message, compose, message_of
+
+NAMED_MOST = 4  # cameras or keys that one sentence names
+SAME_LEAST = 3  # faults that differ in names alone, from which on they are one cause
+MEASURED = re.compile(r"(?<![\w.])-?\d+\.\d+(?:e[+-]?\d+)?(?![\w.])")  # not a size in pixels, which tells cameras apart
+
+
+def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Message]:
+    """Returns faults that differ only in the names of cameras and of their files, and in what was measured of each, as
+    one sentence that names the first and how many others there are."""
+    ordered = sorted(set(names), key=len, reverse=True)
+    name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
+    plate = re.compile(r"\b(background/)\S+")
+    groups: dict[str, list[Message]] = {}
+    for fault in dict.fromkeys(message_of(fault) for fault in faults):
+        masked = plate.sub(r"\1", fault.text)
+        masked = masked if name is None else name.sub("\0", masked)
+        groups.setdefault(MEASURED.sub("\1", masked), []).append(fault)
+    grouped = []
+    for group in groups.values():
+        if len(group) < SAME_LEAST or name is None:
+            grouped += group
+            continue
+        others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault.text)))
+        grouped.append(compose("same-of-more", fault=group[0], count=len(group) - 1, names=some_of([*others])))
+    return grouped
+
+
+def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Message:
+    """Returns a few names, and how many more there are, for a message."""
+    more = len(names) - most
+    return compose("names-and-more", names=names[:most], more=more) if more > 0 else names
