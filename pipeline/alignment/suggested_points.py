@@ -9,7 +9,7 @@ As good as the finder is: on two subjects of the simulated studio 1 to 3.5 mm of
 of the nose, 1 and 12 (a beard) at the chin. Each is to be looked at.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -82,11 +82,3 @@ def _are_inside(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Bool[np.nda
     """Whether a camera's picture holds them; NaN is outside."""
     size = (camera.intrinsics.width, camera.intrinsics.height)
     return np.asarray(((pixels > -0.5) & (pixels < np.array(size) - 0.5)).all(axis=1))
-
-
-def plain_points(suggested: Mapping[str, Mapping[str, Pixels]]) -> dict[str, dict[str, list[float]]]:
-    """Returns points as features.json has them, to a tenth of a pixel."""
-    return {
-        name: {camera: [round(float(value), 1) for value in pixel] for camera, pixel in views.items()}
-        for name, views in suggested.items()
-    }

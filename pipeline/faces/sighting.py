@@ -22,7 +22,7 @@ from rig.rig import Rig
 GLANCE_PX = 640  # longer side: a face of a third of it fills the networks' 192 px
 SMALLEST_PX = 96  # shorter side: no face in a smaller picture is more than a guess
 MUST_SEE = 0.7  # cosine: a camera within 45 degrees of where a face looks shows it, hair beside it or not
-GLANCE = SearchEffort(max_fruitless=5, min_facing=MUST_SEE, looks=3, with_eyes=False)
+GLANCE = SearchEffort(max_fruitless=5, min_facing=MUST_SEE, rounds=3, with_eyes=False)
 MIN_FAN = 0.3  # mean of the unit directions to the cameras: a fan of 180 degrees has 0.64, a full circle 0
 MIN_WITNESSES = 2  # other cameras that show the face, before one is blamed that does not
 

@@ -44,13 +44,13 @@ class SearchEffort:
     """How far a search goes.
 
     ``max_fruitless``: views without a face after which it ends; None searches all, and small faces after that.
-    ``min_facing``: cosine between where a face looks and a camera in which it is looked for; ``looks``: how often
+    ``min_facing``: cosine between where a face looks and a camera in which it is looked for; ``rounds``: how often
     that is done again as views join.
     """
 
     max_fruitless: int | None = None
     min_facing: float = MIN_FACING
-    looks: int = 1
+    rounds: int = 1
     with_eyes: bool = True
 
 
@@ -142,7 +142,7 @@ def _search(
         name = _next_view(left, found, scene.rig)
         found[name] = find(scene.pyramids[name], scene.networks)
         if found[name] and (face := scene.match(found)) is not None:
-            for _ in range(scene.effort.looks):
+            for _ in range(scene.effort.rounds):
                 looked = {} if face is None else _look(scene, face, found)
                 if not looked:
                     break

@@ -12,7 +12,7 @@ from rig.messages.message import Message, compose
 
 TURNED_DEG = 15.0  # people who look into a camera are within 8 of it (the rendered captures' subjects: 13)
 EXPLAINING = frozenset(
-    {"empty", "cut-off", "dark", "lights-off", "view", "swapped", "moved", "overexposed", "blurred", "frozen"}
+    {"empty", "cut-off", "dark", "lights-off", "view", "swapped", "overexposed", "blurred", "frozen"}
 )
 """Faults of a camera with which nobody wonders that its picture shows no face."""
 

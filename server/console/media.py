@@ -18,6 +18,7 @@ from rig.errors import EigenheadError, InputError
 from rig.formats.images import open_picture, read_image, write_image
 from rig.messages.message import compose
 from server.console import comparison
+from server.console.found_faces import found_faces
 from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
@@ -115,6 +116,12 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
             with service.children.one() as child:
                 child.remote(draw)(capture=str(files), cache=str(folder.parent), target=str(folder))
     return FileResponse(folder / f"{name}.png", headers=FOREVER)
+
+
+@pages.get("/console/captures/{capture_id}/faces")
+def faces(who: Reader, capture_id: str) -> Response:
+    """Returns the faces in a capture's pictures, with their points (pixels), found at the first look."""
+    return JSONResponse(found_faces(who[0], capture_id)["faces"], headers=FOREVER)
 
 
 @pages.post("/console/captures")

@@ -58,7 +58,7 @@ TEMPLATES = {
     "nobody-in-pictures": "no picture differs from its clean plate as a head would",
     "nobody-in-picture": "its picture does not differ from its clean plate as a head would",
     "head-cut-off": "the head reaches the picture's edge ({sides:word})",
-    "face-missing": "no face in {cameras}, though it is turned there: see what hides it (hair, a hand, a stand), and shoot again",
+    "face-missing": "no face in {cameras}, though the subject looks that way: see what hides it (hair, a hand, a stand), and shoot again",
     "face-nowhere": "no face in the {count} picture that was searched: a statue may be right all the same; a person should show the face to the cameras | no face in the {count} pictures that were searched: a statue may be right all the same; a person should show the face to the cameras",
     "face-turned": "the face looks {way}, seen from the front camera {camera}: have the subject look there",
     "look-left": "{angle_deg:.0f} degrees to the subject's left",
