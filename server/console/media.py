@@ -22,7 +22,7 @@ from server.console.found_faces import found_faces
 from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
-from server.console.look_through import camera_views, rig_of, straightened
+from server.console.look_through import camera_views, rig_of, straightened, straightened_face
 from server.console.page import as_problem
 from server.console.silhouettes import draw
 from server.errors import NotFound
@@ -195,6 +195,15 @@ def photograph(who: Reader, job_id: str, camera: str) -> Response:
         picture = straightened(read_image(capture / name), rig_of(capture)[camera])
         write_image(kept, picture, quality=STRAIGHTENED_QUALITY)
     return FileResponse(kept, headers=FOREVER)
+
+
+@pages.get("/console/jobs/{job_id}/faces")
+def faces_of_job(who: Reader, job_id: str) -> Response:
+    """Returns the faces in the job's pictures, in pixels of its straightened photographs at full size."""
+    capture, record = _capture_files(who[0], job_id)
+    rig, found = rig_of(capture), found_faces(who[0], record.id)["faces"]
+    straight = {name: [straightened_face(face, rig[name]) for face in seen] for name, seen in found.items()}
+    return JSONResponse(straight, headers=FOREVER)
 
 
 @pages.get("/console/jobs/{job_id}/distance.f32")

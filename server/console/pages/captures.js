@@ -98,7 +98,7 @@ export default spoken({
     "current.id": {
       handler(id) {
         this.readChecks(id);
-        if (this.shown && !this.current?.board) this.readFaces(id);
+        if (this.withFaces && !this.current?.board) this.readFaces(id);
         this.removal = null;
         if (!this.state.loading) this.keepAddress();
       },
@@ -145,7 +145,7 @@ export default spoken({
         <template v-if="current">
           <template v-if="!current.board">
             <button class="b" :aria-pressed="outlines" @click="outlines = !outlines">Silhouettes</button>
-            <button class="b" id="faces" :aria-pressed="shown" :aria-busy="!!finding" @click="showFaces(current.id)">{{ say(finding ? 'Looking for faces ...' : 'Faces') }}</button>
+            <button class="b" id="faces" :aria-pressed="withFaces" :aria-busy="!!finding" @click="showFaces(current.id)">{{ say(finding ? 'Looking for faces ...' : 'Faces') }}</button>
             <a class="b" :href="'/features/' + current.id">Pick features</a>
             <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct', current.id, { method, model, template })">Reconstruct</button>
           </template>
@@ -227,12 +227,12 @@ export default spoken({
               <img :src="address(camera, '.jpg')" :alt="say('Picture of {name}', { name: camera })" loading="lazy">
               <img v-if="outlines && !current.board" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
               <outline v-else :view="view(current.id, camera)" :size="current.sizes[camera]"></outline>
-              <face-marks :faces="marks(current.id, camera)" :size="current.sizes[camera]"></face-marks>
+              <face-marks :faces="facesIn(current.id, camera)" :size="current.sizes[camera]"></face-marks>
               <span>{{ camera }}{{ camera === current.front ? ' · ' + say('front') : '' }} <b v-if="faultsOf(current, camera).length" class="warn">{{ faultsOf(current, camera).join(', ') }}</b><small v-else class="muted">{{ measures(current.id, camera) }}</small></span></button>
           </div>
           <div v-else-if="current" style="height: 100%; display: grid; grid-template-rows: auto minmax(0, 1fr); gap: .6rem">
             <div class="line"><strong>{{ current.cameras[large] }}</strong><span class="push group"><button class="b" @click="step(-1)" aria-label="Previous camera">&larr;</button><button class="b" @click="step(1)" aria-label="Next camera">&rarr;</button></span><button class="b" @click="large = null">All cameras <kbd>Esc</kbd></button></div>
-            <div class="thumb" style="aspect-ratio: auto"><img :src="address(current.cameras[large], '.image')" :alt="say('Picture of {name}', { name: current.cameras[large] })"><img v-if="outlines && !current.board" :src="address(current.cameras[large], '.silhouette.png')" alt=""><face-marks :faces="marks(current.id, current.cameras[large])" :size="current.sizes[current.cameras[large]]"></face-marks></div>
+            <div class="thumb" style="aspect-ratio: auto"><img :src="address(current.cameras[large], '.image')" :alt="say('Picture of {name}', { name: current.cameras[large] })"><img v-if="outlines && !current.board" :src="address(current.cameras[large], '.silhouette.png')" alt=""><face-marks :faces="facesIn(current.id, current.cameras[large])" :size="current.sizes[current.cameras[large]]"></face-marks></div>
           </div>
         </div>
       </div>

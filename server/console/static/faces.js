@@ -19,33 +19,33 @@ export const FaceMarks = {
     <g v-for="(face, i) in faces" :key="i" :class="{ other: !face.is_subject }"><rect :x="face.box_px[0]" :y="face.box_px[1]" :width="face.box_px[2] - face.box_px[0]" :height="face.box_px[3] - face.box_px[1]"></rect><path :d="dots(face)" :stroke-width="dot(face)"></path></g></svg>`,
 };
 
-// Keeps faces[id] of captures, which never change; `shown` is the switch, `finding` the capture in which
+// Keeps faces[id] of captures, or of jobs, which never change; `withFaces` is the switch, `finding` that in which
 // the service looks for them.
 export const facesOf = {
-  data: () => ({ faces: {}, shown: false, finding: "" }),
+  data: () => ({ faces: {}, withFaces: false, finding: "" }),
   methods: {
     showFaces(id) {
-      this.shown = !this.shown;
-      if (this.shown) this.readFaces(id);
+      this.withFaces = !this.withFaces;
+      if (this.withFaces) this.readFaces(id);
     },
-    async readFaces(id) {
+    async readFaces(id, address = `/console/captures/${id}/faces`) {
       if (!id || this.faces[id] || this.finding === id) return;
       this.finding = id;
-      const answer = await fetch(`/console/captures/${id}/faces`),
+      const answer = await fetch(address),
         document = await answer.json();
       const awaited = this.finding === id; // another capture may be looked at by now
       if (awaited) this.finding = "";
       if (answer.ok) this.faces[id] = document;
       else if (awaited) {
-        this.shown = false;
+        this.withFaces = false;
         window.eigenheadSay("fault", told(document), toldFaults(document));
       }
     },
-    marks(id, camera) {
-      return this.shown ? this.faces[id]?.[camera] : null;
+    facesIn(id, camera) {
+      return this.withFaces ? this.faces[id]?.[camera] : null;
     },
     facesTold(id) {
-      const found = this.shown && this.faces[id] && Object.values(this.faces[id]);
+      const found = this.withFaces && this.faces[id] && Object.values(this.faces[id]);
       if (!found) return "";
       const count = found.filter((faces) => faces.some((face) => face.is_subject)).length;
       return count

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from pipeline.eigenheads.landmarks import SEVEN_POINTS
 from tests.support.browser import keep_screenshots, keep_widths, visit
-from tests.support.services import RunningService, packed, running_service, upload
+from tests.support.services import RunningService, await_state, packed, running_service, upload
 from tests.support.shared_data import shared
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -137,3 +137,29 @@ def reject_take_and_drag(page: Page) -> None:
     page.keyboard.press("Delete")  # a pixel of the screen is three of the picture: it contradicts the other views
     expect(page.locator("[data-point]").first).to_contain_text("1 view")
     expect(page.locator("[data-offer]")).to_have_count(count - 3)
+
+
+def test_a_head_is_seen_with_the_face_that_its_photograph_shows(
+    browser: Browser, screenshots: Path, tmp_path: Path
+) -> None:
+    """The head is a ball; what lies over the photograph is the capture's face."""
+    work = "tests.support.ball_results:work"
+    with running_service(tmp_path / "data", work=work, console="true") as running:
+        capture = uploaded(running, tmp_path, "beard-smile")["id"]
+        with httpx.Client(base_url=running.url, timeout=60) as client:
+            job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+            await_state(client, job, ("succeeded",))
+        v = visit(browser, running.url)
+        page = v.go(f"/result/{job}")
+        page.wait_for_selector("canvas[data-loaded$=head]", timeout=SLOW_MS)
+        page.locator("#through").select_option("cam00")
+        expect(page.get_by_alt_text("Photograph of cam00")).to_be_visible(timeout=SLOW_MS)
+        expect(page.locator("svg.face-marks")).to_have_count(0)
+        page.locator("#faces").check()
+        expect(page.locator(".view3d svg.face-marks")).to_have_count(1, timeout=SLOW_MS)
+        photograph = page.locator(".view3d img").bounding_box()
+        assert page.locator(".view3d svg.face-marks").bounding_box() == photograph
+        keep_screenshots(page, screenshots, "result-face")
+        page.locator("#through").select_option("")
+        expect(page.locator("svg.face-marks")).to_have_count(0)
+        v.check_clean()

@@ -19,11 +19,11 @@ test("each point is a dot of no length, which round ends make round", () => {
 test("faces are shown while the switch is on, and counted where they are the subject's", () => {
   const shown = page();
   shown.faces.c1 = { cam00: [face(true)], cam01: [face(false)], cam02: [] };
-  assert.equal(shown.marks("c1", "cam00"), null);
+  assert.equal(shown.facesIn("c1", "cam00"), null);
   assert.equal(shown.facesTold("c1"), "");
-  shown.shown = true;
-  assert.equal(shown.marks("c1", "cam00").length, 1);
-  assert.equal(shown.marks("c1", "cam09"), undefined);
+  shown.withFaces = true;
+  assert.equal(shown.facesIn("c1", "cam00").length, 1);
+  assert.equal(shown.facesIn("c1", "cam09"), undefined);
   assert.equal(shown.facesTold("c1"), "The face is in 1 picture.");
   shown.faces.c2 = { cam00: [face(false)] };
   assert.equal(shown.facesTold("c2"), "No picture shows a face that others confirm.");
@@ -42,13 +42,13 @@ test("they are asked for once, and the switch goes off where the service refuses
       : { ok: true, json: async () => ({ cam00: [] }) };
   };
   const shown = page();
-  shown.shown = true;
+  shown.withFaces = true;
   await Promise.all([shown.readFaces("c1"), shown.readFaces("c1")]);
   await shown.readFaces("c1");
   assert.deepEqual(asked, ["/console/captures/c1/faces"]);
   assert.equal(shown.finding, "");
   await shown.readFaces("bad");
-  assert.equal(shown.shown, false);
+  assert.equal(shown.withFaces, false);
   assert.deepEqual(said, [["fault", "busy", ["try again"]]]);
   [globalThis.fetch, globalThis.window] = before;
 });
