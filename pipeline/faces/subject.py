@@ -39,6 +39,24 @@ MIN_EYES_FACING = 0.5  # the same for a camera that sees both eyes
 MIN_INSIDE = 0.6  # share of a face's points within a picture
 
 
+@dataclass(frozen=True, slots=True)
+class SearchEffort:
+    """How far a search goes.
+
+    ``max_fruitless``: views without a face after which it ends; None searches all, and small faces after that.
+    ``min_facing``: cosine between where a face looks and a camera in which it is looked for; ``rounds``: how often
+    that is done again as views join.
+    """
+
+    max_fruitless: int | None = None
+    min_facing: float = MIN_FACING
+    rounds: int = 1
+    with_eyes: bool = True
+
+
+THOROUGH = SearchEffort()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectFaces:
     """What was found in each view that was searched or looked at, best first, and the subject among it.
@@ -57,6 +75,7 @@ def find_subject(
     networks: FaceNetworks,
     *,
     eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
+    effort: SearchEffort = THOROUGH,
     report: Callable[[float], None] = lambda _: None,
 ) -> SubjectFaces:
     """Finds the subject's face in the views of one shot.
@@ -66,15 +85,16 @@ def find_subject(
         rig: the cameras.
         networks: as ``load_networks`` loads them.
         eye_distance_mm: limits of a face's size; None where the rig's scale is not known.
+        effort: how far the search goes.
         report: is told the share that is done.
     """
     views = rig.subset(name for name in rig.names if name in images)
     if not len(views):
         return SubjectFaces({}, None, ())
-    scene = _Scene(views, {name: make_pyramid(images[name]) for name in views.names}, networks, eye_distance_mm)
+    scene = _Scene(views, {name: make_pyramid(images[name]) for name in views.names}, networks, eye_distance_mm, effort)
     in_order = spread_views(views, len(views))
     found, face = _search(scene, in_order, find_large_faces, report)
-    if not any(found.values()):
+    if not any(found.values()) and effort.max_fruitless is None:
         found, face = _search(scene, in_order[:SMALL_FACE_VIEWS], find_small_faces, report)
     report(1.0)
     matched = complete_match(face, found, views) if face is not None else _matched_alone(found, views)
@@ -83,11 +103,13 @@ def find_subject(
     placed = matched.world_from_face
     with_eyes = {
         name: find_eyes(scene.pyramids[name], seen, networks)
-        if direction_from_face(placed, rig[name])[2] > MIN_EYES_FACING
+        if effort.with_eyes and direction_from_face(placed, rig[name])[2] > MIN_EYES_FACING
         else seen
         for name, seen in matched.detections.items()
     }
-    return SubjectFaces(found, replace(matched, detections=with_eyes), tuple(_expected(placed, views)))
+    return SubjectFaces(
+        found, replace(matched, detections=with_eyes), tuple(_expected(placed, views, effort.min_facing))
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +120,7 @@ class _Scene:
     pyramids: Mapping[str, Pyramid]
     networks: FaceNetworks
     eye_distance_mm: tuple[float, float] | None
+    effort: SearchEffort
 
     def match(self, found: Mapping[str, tuple[FaceDetection, ...]]) -> TriangulatedFace | None:
         """The subject among the faces of all views."""
@@ -119,11 +142,16 @@ def _search(
         name = _next_view(left, found, scene.rig)
         found[name] = find(scene.pyramids[name], scene.networks)
         if found[name] and (face := scene.match(found)) is not None:
-            looked = _look(scene, face, found)
-            found |= looked
-            face = scene.match(found) if looked else face
+            for _ in range(scene.effort.rounds):
+                looked = {} if face is None else _look(scene, face, found)
+                if not looked:
+                    break
+                found |= looked
+                face = scene.match(found)
             if face is not None and len(face.detections) >= CONFIRMING_VIEWS:
                 break
+        if sum(not faces for faces in found.values()) == scene.effort.max_fruitless:
+            break
     return found, face
 
 
@@ -158,7 +186,7 @@ def _look(
     """Looks for a face in the views in which it must be and was not found; what was found there comes after it."""
     looked = {}
     points = face.world_from_face.apply(point_table().shape_mm)
-    for name in _expected(face.world_from_face, scene.rig):
+    for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):
         if name in face.detections:
             continue
         crop = crop_around(scene.rig[name].project(points))
@@ -168,7 +196,7 @@ def _look(
     return looked
 
 
-def _expected(world_from_face: Similarity, rig: Rig) -> Iterator[str]:
+def _expected(world_from_face: Similarity, rig: Rig, min_facing: float) -> Iterator[str]:
     """The views towards which a face looks and whose pictures hold it."""
     points = world_from_face.apply(point_table().shape_mm)
     for camera in rig:
@@ -176,5 +204,5 @@ def _expected(world_from_face: Similarity, rig: Rig) -> Iterator[str]:
         size = (camera.intrinsics.width, camera.intrinsics.height)
         inside = ((pixels > -0.5) & (pixels < np.array(size) - 0.5)).all(axis=1)  # False where a pixel is NaN
         facing = direction_from_face(world_from_face, camera)[2]
-        if facing >= MIN_FACING and inside.mean() > MIN_INSIDE and np.isfinite(pixels).all():
+        if facing >= min_facing and inside.mean() > MIN_INSIDE and np.isfinite(pixels).all():
             yield camera.name

@@ -15,6 +15,7 @@ from rig.geometry import RigidTransform
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig
+from server.storage.face_cache import FoundFace
 
 WIDTH_MOST = 1600
 MM = 1000.0
@@ -62,6 +63,19 @@ def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
         lens.matrix(), lens.distortion.opencv(), np.eye(3), wanted, size, cv2.CV_32FC1
     )
     return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_AREA), np.uint8)
+
+
+def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
+    """Returns a face with the pixels that ``straightened`` shows it at, at full size; points that the lens does not
+    hold are left out."""
+    lens, pixels = camera.intrinsics, np.array(face["points"])
+    if camera.recorded is not None:
+        straight = camera.recorded.undistorted(pixels, lens.matrix())
+    else:
+        straight = camera.undistort(pixels) * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+    straight = straight[np.isfinite(straight).all(axis=1)].round(1)
+    box = [*straight.min(axis=0), *straight.max(axis=0)] if len(straight) else face["box_px"]
+    return {**face, "box_px": [float(side) for side in box], "points": straight.tolist()}
 
 
 def _view(camera: Camera, camera_from_head: RigidTransform) -> CameraView:

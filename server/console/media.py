@@ -18,10 +18,11 @@ from rig.errors import EigenheadError, InputError
 from rig.formats.images import open_picture, read_image, write_image
 from rig.messages.message import compose
 from server.console import comparison
+from server.console.found_faces import found_faces
 from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
-from server.console.look_through import camera_views, rig_of, straightened
+from server.console.look_through import camera_views, rig_of, straightened, straightened_face
 from server.console.page import as_problem
 from server.console.silhouettes import draw
 from server.errors import NotFound
@@ -117,6 +118,12 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
     return FileResponse(folder / f"{name}.png", headers=FOREVER)
 
 
+@pages.get("/console/captures/{capture_id}/faces")
+def faces(who: Reader, capture_id: str) -> Response:
+    """Returns the faces in a capture's pictures, with their points (pixels), found at the first look."""
+    return JSONResponse(found_faces(who[0], capture_id)["faces"], headers=FOREVER)
+
+
 @pages.post("/console/captures")
 async def upload(who: Taker, request: Request) -> Response:
     try:
@@ -188,6 +195,15 @@ def photograph(who: Reader, job_id: str, camera: str) -> Response:
         picture = straightened(read_image(capture / name), rig_of(capture)[camera])
         write_image(kept, picture, quality=STRAIGHTENED_QUALITY)
     return FileResponse(kept, headers=FOREVER)
+
+
+@pages.get("/console/jobs/{job_id}/faces")
+def faces_of_job(who: Reader, job_id: str) -> Response:
+    """Returns the faces in the job's pictures, in pixels of its straightened photographs at full size."""
+    capture, record = _capture_files(who[0], job_id)
+    rig, found = rig_of(capture), found_faces(who[0], record.id)["faces"]
+    straight = {name: [straightened_face(face, rig[name]) for face in seen] for name, seen in found.items()}
+    return JSONResponse(straight, headers=FOREVER)
 
 
 @pages.get("/console/jobs/{job_id}/distance.f32")

@@ -11,6 +11,7 @@ from typing import cast
 
 from pydantic import TypeAdapter
 
+from rig.acquisition.face_sighting import face_remarks
 from rig.acquisition.shot import Fault, ShotDocument, read_fault
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.atomic_write import write_atomically
@@ -284,7 +285,7 @@ class Captures:
             shot=shot,
             verdict=None if content.board else verdict_of(faults, [camera.name for camera in content.cameras]),
             faults=faults,
-            warnings=content.warnings,
+            warnings=(*content.warnings, *face_remarks(content.face, faults)),
             tags=about.tags,
         )
         self._store.add_capture(folder, record)

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Generic, NotRequired, TypedDict, TypeVar
 
 from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
+from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.shot import Fault, read_fault
 from rig.acquisition.verdict import ViewDocument
 from rig.messages.message import Message, MessageDocument, read_message
@@ -55,7 +56,8 @@ class CameraSize:
 class CaptureContent:
     """Holds what is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the
     calibration board, which show no head. ``checks``: what was measured of each camera's picture; ``warnings``: what
-    was said when its cameras were found from the photographs."""
+    was said when its cameras were found from the photographs; ``face``: what a glance at the pictures told of the
+    subject's face (None where nobody looked)."""
 
     cameras: tuple[CameraSize, ...]
     front: str
@@ -65,13 +67,14 @@ class CaptureContent:
     faults: tuple[StoredFault, ...] = ()
     checks: Mapping[str, ViewDocument] = field(default_factory=dict)
     warnings: tuple[StoredMessage, ...] = ()
+    face: FaceSighting | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
     """Holds a capture: where it came from, what people say of it, what is in it, the certificate of the rig's shot, and
     the verdict on it with its faults (None of what was not judged: the board, captures of earlier versions).
-    ``warnings``: what every result of it will be warned of."""
+    ``warnings``: what every result of it will be warned of, and what its pictures tell of the face."""
 
     id: str
     created: str

@@ -14,7 +14,6 @@ import os
 import zipfile
 import zlib
 from contextlib import suppress
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -30,9 +29,9 @@ from rig.capture import Capture
 from rig.messages.message import documents_of, read_message
 from rig.progress import Progress
 from rig.rig import Rig
+from server.storage.code_digest import code_digest
 
 SUFFIX = ".silhouettes"
-PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
 ROOMS = (
     ".",
     "faces",
@@ -63,17 +62,8 @@ def segment_once(
 def _key(capture: Capture, settings: SegmentationSettings) -> str:
     inputs = {name: digest for name, digest in capture.digests.items() if name != "features.json"}
     sizes = {name: image.shape for name, image in capture.images.items()}  # large pictures are read smaller
-    document = [inputs, sizes, dataclasses.asdict(settings), version("eigenhead"), cv2.__version__, _code()]
+    document = [inputs, sizes, dataclasses.asdict(settings), version("eigenhead"), cv2.__version__, code_digest(ROOMS)]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
-
-
-@cache
-def _code() -> str:
-    """Digest of the rooms that a silhouette may come from."""
-    digest = hashlib.sha256()
-    for path in sorted(path for room in ROOMS for path in (PIPELINE / room).glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def _encoded(silhouettes: dict[str, Silhouette]) -> bytes:

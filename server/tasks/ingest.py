@@ -6,6 +6,7 @@ Camera by camera, so that a rig of 64 large cameras is checked in the memory of 
 import hashlib
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,10 @@ import numpy as np
 
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
 from pipeline.diagnostics import ReportWarning
+from pipeline.faces.matching import EYE_DISTANCE_MM
+from pipeline.faces.networks import DamagedNetwork, FaceNetworks, load_networks
+from pipeline.faces.sighting import GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
+from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
 from rig.capture import Capture
@@ -35,6 +40,7 @@ from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
+from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
 from rig.progress import Progress
@@ -59,7 +65,7 @@ def ingest_archive(
     root = capture_root(unpacked)
     warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
     _name_by_camera(root)
-    described = check_capture(root, image_pixels, report)
+    described = check_capture(root, image_pixels, report, networks=_face_networks(context))
     if warnings is not None:
         described = _with_calibration(described, root, warnings)
     for name in described.inputs:
@@ -148,7 +154,15 @@ def ingest_folder(
 ) -> CaptureContent:
     """Returns the same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was
     taken."""
-    return check_capture(Path(folder), image_pixels, report, measured=measured)
+    return check_capture(Path(folder), image_pixels, report, measured=measured, networks=_face_networks(context))
+
+
+def _face_networks(context: WorkerContext) -> FaceNetworks | None:
+    """The networks of this process; None where their files are damaged, which jobs tell."""
+    try:
+        return context.keep("face networks", load_networks)
+    except DamagedNetwork:
+        return None
 
 
 def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
@@ -174,10 +188,16 @@ def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image
 
 
 def check_capture(
-    root: Path, image_pixels: int, report: Progress, *, measured: bool = False, strays_pass: bool = False
+    root: Path,
+    image_pixels: int,
+    report: Progress,
+    *,
+    measured: bool = False,
+    strays_pass: bool = False,
+    networks: FaceNetworks | None = None,
 ) -> CaptureContent:
-    """Returns what a capture folder holds; pictures of no camera are faults unless ``strays_pass``. Raises InputError
-    naming every fault."""
+    """Returns what a capture folder holds; pictures of no camera are faults unless ``strays_pass``. With ``networks``
+    the face is looked for, too. Raises InputError naming every fault."""
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", [NO_RIG])
@@ -192,6 +212,7 @@ def check_capture(
     digests: dict[str, str] = {}
     empty: list[str] = []
     views: dict[str, ViewCheck] = {}
+    small: dict[str, tuple[ImageRgb, Camera]] = {}
     for number, camera in enumerate(rig):
         report("check", number / len(rig))
         of_sizes, of_files = _size_faults(root, files, camera, image_pixels), list[Message]()
@@ -200,6 +221,9 @@ def check_capture(
             digests |= shot.digests
             empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
             views |= _view_of(shot, camera.name, measured)
+            image = shot.images.get(camera.name)
+            if networks is not None and image is not None and min(image.shape[:2]) >= SMALLEST_PX:
+                small[camera.name] = reduce_picture(image, camera, GLANCE_PX)
         faults += [*of_sizes, *of_files]
     if (root / "features.json").is_file():
         of_file: list[Message] = []
@@ -221,7 +245,23 @@ def check_capture(
         bytes=sum((root / name).stat().st_size for name in digests),
         faults=tuple(view_faults(views, ShotConfig())),
         checks={name: view.document() for name, view in views.items()},
+        face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
     )
+
+
+def _face_of(
+    small: Mapping[str, tuple[ImageRgb, Camera]], rig: Rig, networks: FaceNetworks, *, is_metric: bool
+) -> FaceSighting:
+    """The subject's face in small pictures. ``is_metric``: the cameras are in millimetres."""
+    images = {name: image for name, (image, _) in small.items()}
+    reduced = Rig(tuple(camera for _, camera in small.values()))
+    limits = EYE_DISTANCE_MM if is_metric else None
+    return sight_face(images, reduced, networks, front=rig.front_camera(), eye_distance_mm=limits)
+
+
+def _is_metric(root: Path) -> bool:
+    """Whether cameras.json is in millimetres: not where a length follows, or was assumed."""
+    return not has_known_length(root) and not (root / FIGURES).is_file()
 
 
 def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:

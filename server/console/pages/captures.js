@@ -1,6 +1,7 @@
 // Sessions and captures at the left, the pictures of the chosen one at the right.
 import { Pager, paged } from "/console/static/list.js";
 import { say, spoken } from "/console/static/language.js";
+import { FaceMarks, facesOf } from "/console/static/faces.js";
 import { english, told, toldFaults } from "/console/static/messages.js";
 import { Outline, Verdict, checksOf, faultsOf, verdictTag } from "/console/static/verdict.js";
 import {
@@ -18,8 +19,8 @@ import {
 const asked = new URLSearchParams(location.search);
 
 export default spoken({
-  mixins: [checksOf, paged],
-  components: { Outline, Pager, Verdict },
+  mixins: [checksOf, facesOf, paged],
+  components: { FaceMarks, Outline, Pager, Verdict },
   props: { state: Object },
   emits: ["act", "choose"],
   data: () => ({
@@ -97,6 +98,7 @@ export default spoken({
     "current.id": {
       handler(id) {
         this.readChecks(id);
+        if (this.withFaces && !this.current?.board) this.readFaces(id);
         this.removal = null;
         if (!this.state.loading) this.keepAddress();
       },
@@ -143,6 +145,7 @@ export default spoken({
         <template v-if="current">
           <template v-if="!current.board">
             <button class="b" :aria-pressed="outlines" @click="outlines = !outlines">Silhouettes</button>
+            <button class="b" id="faces" :aria-pressed="withFaces" :aria-busy="!!finding" @click="showFaces(current.id)">{{ say(finding ? 'Looking for faces ...' : 'Faces') }}</button>
             <a class="b" :href="'/features/' + current.id">Pick features</a>
             <button class="b main-action" id="reconstruct" :disabled="!!busy" @click="act('reconstruct', current.id, { method, model, template })">Reconstruct</button>
           </template>
@@ -218,16 +221,18 @@ export default spoken({
           <p v-if="current && large === null && !current.board && preset" id="preset" class="small muted" style="margin-bottom: .7rem">{{ say(preset.explanation) }}</p>
           <p v-if="current && large === null && current.jobs.length" class="line wrap small" id="jobs-of-capture" style="margin-bottom: .7rem"><span class="muted">Jobs</span><a v-for="j in current.jobs.slice(0, 12)" :key="j.id" class="tag" :class="jobKind(j)" :href="j.state === 'succeeded' ? '/result/' + j.id : '/jobs?job=' + j.id">{{ say(j.state === 'succeeded' ? 'head' : j.state) }} {{ j.progress === null ? j.id.slice(-6) : Math.round(100 * j.progress) + ' %' }}</a><a v-if="current.jobs.length > 12" :href="'/jobs?find=' + current.id">{{ say('all {count}', { count: current.jobs.length }) }}</a></p>
           <verdict v-if="current && large === null && !current.board" :capture="current" style="margin-bottom: .7rem"></verdict>
+          <p v-if="current && large === null && facesTold(current.id)" class="small muted" role="status" id="faces-told" style="margin-bottom: .7rem">{{ facesTold(current.id) }}</p>
           <div v-if="current && large === null" class="thumbs four">
             <button v-for="(camera, i) in current.cameras" :key="current.id + camera" class="thumb" style="padding: 0; border: 0; cursor: zoom-in" :style="{ aspectRatio: current.size.width + ' / ' + current.size.height }" :aria-label="say('Enlarge {name}', { name: camera })" @click="large = i">
               <img :src="address(camera, '.jpg')" :alt="say('Picture of {name}', { name: camera })" loading="lazy">
               <img v-if="outlines && !current.board" :src="address(camera, '.silhouette.png')" alt="" @error="failed">
               <outline v-else :view="view(current.id, camera)" :size="current.sizes[camera]"></outline>
+              <face-marks :faces="facesIn(current.id, camera)" :size="current.sizes[camera]"></face-marks>
               <span>{{ camera }}{{ camera === current.front ? ' · ' + say('front') : '' }} <b v-if="faultsOf(current, camera).length" class="warn">{{ faultsOf(current, camera).join(', ') }}</b><small v-else class="muted">{{ measures(current.id, camera) }}</small></span></button>
           </div>
           <div v-else-if="current" style="height: 100%; display: grid; grid-template-rows: auto minmax(0, 1fr); gap: .6rem">
             <div class="line"><strong>{{ current.cameras[large] }}</strong><span class="push group"><button class="b" @click="step(-1)" aria-label="Previous camera">&larr;</button><button class="b" @click="step(1)" aria-label="Next camera">&rarr;</button></span><button class="b" @click="large = null">All cameras <kbd>Esc</kbd></button></div>
-            <div class="thumb" style="aspect-ratio: auto"><img :src="address(current.cameras[large], '.image')" :alt="say('Picture of {name}', { name: current.cameras[large] })"><img v-if="outlines && !current.board" :src="address(current.cameras[large], '.silhouette.png')" alt=""></div>
+            <div class="thumb" style="aspect-ratio: auto"><img :src="address(current.cameras[large], '.image')" :alt="say('Picture of {name}', { name: current.cameras[large] })"><img v-if="outlines && !current.board" :src="address(current.cameras[large], '.silhouette.png')" alt=""><face-marks :faces="facesIn(current.id, current.cameras[large])" :size="current.sizes[current.cameras[large]]"></face-marks></div>
           </div>
         </div>
       </div>

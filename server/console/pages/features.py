@@ -4,7 +4,7 @@ without points the pipeline finds the alignment by itself."""
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
@@ -16,10 +16,12 @@ from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS
 from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.messages.message import Message, MessageDocument, compose
 from rig.rig import Rig
+from server.console.found_faces import found_faces
 from server.console.guides import Guides, Helps, mean_landmarks, nearest_views
 from server.console.page import Action, Page, shared, show
 from server.console.removal import removals
-from server.errors import Conflict
+from server.console.suggestions import drop_suggestions, open_suggestions, take_suggestions
+from server.errors import Conflict, InvalidInput
 from server.services.service import Service
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureQuery
@@ -45,13 +47,15 @@ class Size(TypedDict):
 
 class Picking(Helps):
     """One capture's points, and what helps to pick them. The first seven ``names`` are those of section 4.2;
-    ``asked``: whether contradictions are to be looked at before they are saved."""
+    ``suggested``: places that nobody took yet; ``is_contradictory``: whether contradictions are to be looked at before
+    they are saved."""
 
     id: str
     cameras: list[Size]
     views: list[str]
     names: list[str]
     points: Points
+    suggested: Points
     dirty: bool
     is_contradictory: bool
 
@@ -74,17 +78,26 @@ class Sure(TypedDict):
     sure: NotRequired[bool]
 
 
+class SuggestedPlaces(TypedDict):
+    """Which suggestions: of one point in one view, of one in all views, or all."""
+
+    point: NotRequired[str]
+    camera: NotRequired[str]
+
+
 @dataclass(slots=True)
 class Picked:
     """Holds the points of a capture as they stand on the page, and as they were saved.
 
-    ``unconfirmed``: as they stood when they were to be saved and contradicted each other.
+    ``suggested``: places where a found face has points that are not set there; they are no points before somebody
+    takes them. ``unconfirmed``: the points as they stood when they were to be saved and contradicted each other.
     """
 
     capture: str
     points: Points
     saved: Points
     guides: Guides
+    suggested: Points = field(default_factory=dict)
     unconfirmed: Points | None = None
 
 
@@ -143,6 +156,7 @@ class FeaturesPage(Page, component="features.js"):
             "views": nearest,
             "names": [*SEVEN_POINTS, *(name for name in NAMES if name not in SEVEN_POINTS)],
             "points": points,
+            "suggested": picked.suggested,
             "dirty": points != picked.saved,
             "is_contradictory": picked.unconfirmed == points,
             **picked.guides.helps(
@@ -208,7 +222,32 @@ def place(page: FeaturesPage, event: Place) -> None:
     else:
         views[event["camera"]] = [round(float(value), 2) for value in event["at"]]
     picked.points = {name: views for name, views in points.items() if views}
+    picked.suggested = open_suggestions(picked.suggested, picked.points)
     drafts.keep(page.caller.key, picked)
+
+
+def suggest(page: FeaturesPage, event: object) -> Message:
+    """Suggests all seven points in every view in which the face is seen. Nothing of it is stored, or used, before
+    somebody takes it."""
+    picked = page.of_capture()
+    found = found_faces(page.service, picked.capture)["suggested"]
+    if not found:
+        raise InvalidInput("no-subject", compose("nothing-suggested"))
+    picked.suggested = open_suggestions(found, picked.points)
+    return compose("points-suggested", count=sum(len(views) for views in picked.suggested.values()))
+
+
+def accept(page: FeaturesPage, event: SuggestedPlaces) -> None:
+    """Makes suggestions points, which are saved as any."""
+    picked = page.of_capture()
+    picked.points = take_suggestions(picked.points, picked.suggested, event.get("point"), event.get("camera"))
+    picked.suggested = open_suggestions(picked.suggested, picked.points)
+    drafts.keep(page.caller.key, picked)
+
+
+def reject(page: FeaturesPage, event: SuggestedPlaces) -> None:
+    picked = page.of_capture()
+    picked.suggested = drop_suggestions(picked.suggested, event.get("point"), event.get("camera"))
 
 
 def save(page: FeaturesPage, event: Sure) -> Message | None:
@@ -241,6 +280,9 @@ def reconstruct(page: FeaturesPage, event: Sure) -> Message | None:
 
 FeaturesPage.actions = {
     "place": Action("read", place),
+    "suggest": Action("read", suggest),
+    "accept": Action("read", accept),
+    "reject": Action("read", reject),
     "save": Action("capture", save),
     "reconstruct": Action("submit", reconstruct),
 }

@@ -1,6 +1,7 @@
 // The head in three.js: a mesh in metres, x to the subject's left, y up, the face towards +z.
 import { GLTFLoader, OrbitControls, THREE } from "nicegui-scene";
 import { besideIt } from "/console/static/beside.js";
+import { FaceMarks, facesOf } from "/console/static/faces.js";
 import { exports3d } from "/console/static/exports.js";
 import { say, spoken } from "/console/static/language.js";
 import { told } from "/console/static/messages.js";
@@ -76,7 +77,8 @@ function nice(value) {
 }
 
 export default spoken({
-  mixins: [besideIt, exports3d, views3d],
+  mixins: [besideIt, exports3d, facesOf, views3d],
+  components: { FaceMarks },
   props: { state: Object },
   emits: ["act", "choose"],
   data: () => ({
@@ -143,7 +145,7 @@ export default spoken({
     "job.id"(id) {
       if (id) {
         this.keepPlace();
-        this.strangers = false;
+        this.strangers = this.withFaces = false;
         this.load(id);
         this.readCameras(id);
       }
@@ -158,6 +160,9 @@ export default spoken({
     },
     through() {
       this.fit();
+    },
+    withFaces(on) {
+      if (on) this.readFaces(this.job.id, `/console/jobs/${this.job.id}/faces`);
     },
     async colouring() {
       await this.paint();
@@ -193,6 +198,7 @@ export default spoken({
           <img v-if="surfaces.length && !drawn" id="first-view" ref="first" class="first" :src="'/console/jobs/' + job.id + '/first-view.jpg'" alt="" @error="drawn = true">
           <img v-if="picture" :src="picture.address" :alt="say('Photograph of {name}', { name: through })" :style="picture.style">
           <canvas ref="canvas" v-show="job" :style="{ opacity: through ? 1 - fade : 1 }" tabindex="0" role="img" aria-label="The head in 3D: drag to turn, wheel to come near, arrow keys to turn" :data-loaded="loaded" @keydown="turn" @pointerdown="press" @click="pick"></canvas>
+          <face-marks v-if="picture" :faces="facesIn(job.id, through)" :size="picture.size" :style="picture.style"></face-marks>
           <div v-if="!state.loading && !job" class="empty" style="position: absolute; inset: 0; align-content: center"><h2>{{ say(state.requested ? 'This job has no head' : 'No heads yet') }}</h2><p>{{ say(state.requested ? 'It is not done, it failed, or it was removed.' : 'A head appears here when a job is done.') }}</p><a class="b main-action" :href="state.requested ? '/jobs' : '/captures'">{{ say(state.requested ? 'Go to jobs' : 'Go to captures') }}</a></div>
           <div v-if="scale" class="scale" role="img" :aria-label="say('{title}, 0 to {most} mm', { title: scale.title, most: fixed(scale.most, digits) })"><i :style="{ background: gradient }"></i><div><span>{{ scale.beyond ? '≥ ' : '' }}{{ fixed(scale.most, digits) }} mm</span><span>{{ fixed(scale.most / 2, digits) }}</span><span>0</span></div></div>
           <p v-if="scale" class="small" style="position: absolute; left: .9rem; top: .8rem">{{ scale.title }}<br><span class="muted">{{ say('median {median} mm, 95 % below {p95} mm', { median: fixed(scale.median, 2), p95: fixed(scale.p95, 2) }) }}</span></p>
@@ -213,6 +219,7 @@ export default spoken({
               <label v-if="elsewhere" class="check small"><input type="checkbox" v-model="strangers" id="strangers">{{ say('offer {count} head of other subjects, too | offer {count} heads of other subjects, too', { count: elsewhere }) }}</label>
               <label v-if="cameras.length || !camerasKnown" class="field">Look through<select v-model="through" id="through" :disabled="!cameras.length"><option value="">no camera</option><option v-for="c in cameras" :key="c.name">{{ c.name }}</option></select></label>
               <label v-if="through" class="field">Photograph<input type="range" min="0" max="1" step="0.05" v-model.number="fade" aria-label="How much of the photograph shines through the head"></label>
+              <label v-if="through" class="check small"><input type="checkbox" v-model="withFaces" id="faces">{{ say(finding ? 'Looking for faces ...' : 'the face that was found in it') }}</label>
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
             <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="fileName + '.zip'">All files (.zip)</a></div>
             <div class="line wrap"><button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours" @click="savePicture">Picture (PNG)</button><template v-if="video"><button class="b" id="turntable" :disabled="!!through || loading" :title="say(through ? 'Not through a camera' : 'One turn, as the view shows the head')" @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? say('Turntable (video)') : say('Stop, {share} %', { share: Math.round(100 * turning) }) }}</button><select v-model.number="turnS" aria-label="Seconds of the turn"><option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option></select></template></div>
@@ -326,6 +333,7 @@ export default spoken({
       this.picture = view
         ? {
             address: `/console/jobs/${this.job.id}/photographs/${encodeURIComponent(view.name)}.jpg`,
+            size: [view.width, view.height],
             style: `position: absolute; left: ${place.left}px; top: ${place.top}px; width: ${place.width}px; height: ${place.height}px`,
           }
         : null;

@@ -1,5 +1,7 @@
 """A head seen through a camera of the rig lies where the camera projects it, and photographs lose their lens."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,8 +9,10 @@ import pytest
 from pipeline.results.report_types import Report
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform, rotation_from_vector
+from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
-from server.console.look_through import camera_views, straightened
+from server.console.look_through import camera_views, straightened, straightened_face
+from server.storage.face_cache import FoundFace
 
 LENS = Distortion(-0.14, 0.04, 0.001, -0.0008, 0.0)
 
@@ -53,3 +57,29 @@ def test_a_straightened_photograph_shows_points_where_a_pinhole_does(width: int)
         found = np.array([left + (patch * columns).sum() / patch.sum(), top + (patch * rows).sum() / patch.sum()])
         # the disc's centroid: interpolation and anti-aliasing leave a few hundredths of a pixel, the bent disc a tenth
         np.testing.assert_allclose(found, [x, y], atol=0.15)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_face_lies_on_the_straightened_photograph(recorded: bool) -> None:
+    points = np.array([[-150.0, -90.0, 0.0], [140.0, 100.0, 20.0], [0.0, 0.0, 0.0]])
+    pinhole = camera(Distortion())
+    wanted = pinhole.project(points)
+    lens = camera(Distortion() if recorded else LENS)
+    pixels = lens.project(points)
+    if recorded:
+        fisheye = RecordedLens("kannala-brandt", (0.05, 0.01, 0.0, 0.0))
+        lens = replace(lens, recorded=fisheye)
+        pixels = fisheye.distorted(wanted, lens.intrinsics.matrix())
+    face: FoundFace = {
+        "box_px": [0.0, 0.0, 1.0, 1.0],
+        "roll_deg": 3.0,
+        "score": 20.0,
+        "is_subject": True,
+        "points": pixels.tolist(),
+    }
+    straight = straightened_face(face, lens)
+    np.testing.assert_allclose(straight["points"], wanted, atol=0.06)
+    np.testing.assert_allclose(straight["box_px"], [*wanted.min(axis=0), *wanted.max(axis=0)], atol=0.06)
+    assert straight["is_subject"]
+    beyond: FoundFace = {**face, "points": [[1e6, 1e6]]}
+    assert straightened_face(beyond, camera(LENS))["points"] == [], "no ray of the lens goes there"

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.faces.networks import DamagedNetwork
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, pack_folder
@@ -15,10 +16,12 @@ from rig.formats.capture_folder import read_capture, write_capture
 from rig.formats.images import read_image, write_image
 from rig.messages.message import texts_of
 from server.storage.records import CaptureContent
+from server.tasks import ingest
 from server.tasks.child import WorkerContext
-from server.tasks.ingest import check_capture, ingest_archive
+from server.tasks.ingest import check_capture, ingest_archive, ingest_folder
 from tests.rig.acquisition.test_session import flat_rig
 from tests.server.http.test_hostile import SPOILT
+from tests.support.drawn_studio import write_drawn_capture
 from tests.support.services import small_capture
 from tests.support.textured_studio import NAMES, FlatStudio
 
@@ -64,6 +67,29 @@ def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
     measured = check_capture(tmp_path, PIXELS_MOST, lambda stage, share: None, measured=True)
     assert {(fault.code, fault.camera) for fault in measured.faults} <= {("empty", "cam03")}, "the shot has the others"
     assert all(view.keys() == {"subject"} for view in measured.checks.values())
+
+
+def test_the_face_is_looked_for_as_a_capture_is_taken_in(tmp_path: Path) -> None:
+    """Whether it was uploaded or shot; a check of a folder (``eigenhead check``) leaves it to the job."""
+    folder = write_drawn_capture(tmp_path / "capture", left_deg=25.0, hidden=("cam3",))
+    content = ingest_folder(
+        WorkerContext(), lambda stage, share: None, folder=str(folder), image_pixels=PIXELS_MOST, measured=True
+    )
+    assert content.face is not None
+    assert content.face.is_found
+    assert content.face.missing == ("cam3",)
+    assert content.face.left_deg == pytest.approx(25.0, abs=5.0)
+    assert checked(folder).face is None
+
+
+def test_damaged_networks_keep_no_capture_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged() -> None:
+        raise DamagedNetwork(tmp_path, "it is another file")
+
+    monkeypatch.setattr(ingest, "load_networks", damaged)
+    folder = small_capture(tmp_path / "capture")
+    content = ingest_folder(WorkerContext(), lambda stage, share: None, folder=str(folder), image_pixels=PIXELS_MOST)
+    assert content.face is None
 
 
 @pytest.mark.parametrize(

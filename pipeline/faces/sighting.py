@@ -1,0 +1,93 @@
+"""The subject's face at a glance, for the verdict on a shot: which pictures lack it, and where it looks.
+
+Enters: small pictures (``reduce_picture``) and their cameras. Leaves: ``FaceSighting``. The search is a short one: it
+ends after a few views without a face, and asks those cameras alone that must show it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces
+from pipeline.faces.networks import FaceNetworks
+from pipeline.faces.subject import SearchEffort, SubjectFaces, find_subject
+from rig.acquisition.face_sighting import FaceSighting
+from rig.camera import Camera
+from rig.image import ImageRgb
+from rig.rig import Rig
+
+GLANCE_PX = 640  # longer side: a face of a third of it fills the networks' 192 px
+SMALLEST_PX = 96  # shorter side: no face in a smaller picture is more than a guess
+MUST_SEE = 0.7  # cosine: a camera within 45 degrees of where a face looks shows it, hair beside it or not
+GLANCE = SearchEffort(max_fruitless=5, min_facing=MUST_SEE, rounds=3, with_eyes=False)
+MIN_FAN = 0.3  # mean of the unit directions to the cameras: a fan of 180 degrees has 0.64, a full circle 0
+MIN_WITNESSES = 2  # other cameras that show the face, before one is blamed that does not
+
+
+def reduce_picture(image: ImageRgb, camera: Camera, longest_px: int) -> tuple[UInt8[np.ndarray, "_ _ 3"], Camera]:
+    """Makes a picture smaller, where its longer side is above ``longest_px``, and its camera with it."""
+    factor = longest_px / max(image.shape[:2])
+    if factor >= 1.0:
+        return image, camera
+    lens = camera.intrinsics.scaled(factor)
+    small = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8), replace(camera, intrinsics=lens)
+
+
+def sight_face(
+    images: Mapping[str, ImageRgb],
+    rig: Rig,
+    networks: FaceNetworks,
+    *,
+    front: str,
+    eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
+) -> FaceSighting:
+    """Finds the face and where it looks (0.1 to 0.4 s at 640 px, by the views that show it).
+
+    Args:
+        images: by camera, small.
+        rig: the cameras of these pictures.
+        networks: as ``load_networks`` loads them.
+        front: the camera that the subject is to look at.
+        eye_distance_mm: limits of a face's size; None where the rig's scale is not known.
+    """
+    subject = find_subject(images, rig, networks, eye_distance_mm=eye_distance_mm, effort=GLANCE)
+    face = subject.matched
+    if face is None:
+        return FaceSighting(len(subject.found), False, any(subject.found.values()), front)
+    sighting = FaceSighting(len(subject.found), True, True, front, _missing(subject, face))
+    if not has_front(rig):
+        return sighting
+    left_deg, up_deg = gaze_from(face, rig[front])
+    return replace(sighting, left_deg=left_deg, up_deg=up_deg)
+
+
+def has_front(rig: Rig) -> bool:
+    """Tells whether the cameras stand on one side of the subject, so that one of them is the front."""
+    directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return float(np.linalg.norm(directions.mean(axis=0))) > MIN_FAN
+
+
+def gaze_from(face: MatchedFaces, camera: Camera) -> tuple[float, float]:
+    """Returns by how many degrees a face is turned from a camera's axis: to the subject's left, and up."""
+    across, upwards, ahead = -camera.axis_world @ face.world_from_face.rotation
+    return float(-np.degrees(np.arctan2(across, ahead))), float(-np.degrees(np.arcsin(np.clip(upwards, -1.0, 1.0))))
+
+
+def _missing(subject: SubjectFaces, face: MatchedFaces) -> tuple[str, ...]:
+    """The cameras that must see the face, in which none was found, where others bear witness of it."""
+    if len(face.detections) < MIN_WITNESSES:
+        return ()
+    return tuple(name for name in subject.expected if name not in face.detections and not subject.found.get(name))
+
+
+def file_pixels(pixels: Float[np.ndarray, "n 2"], read_by: Camera, recorded_by: Camera) -> Float[np.ndarray, "n 2"]:
+    """Returns where pixels of a picture that was read smaller, and undistorted, lie in its file."""
+    small, full = read_by.intrinsics, recorded_by.intrinsics
+    scaled = (pixels + 0.5) * (full.width / small.width, full.height / small.height) - 0.5
+    lens = recorded_by.recorded
+    return scaled if lens is None else lens.distorted(scaled, full.matrix())

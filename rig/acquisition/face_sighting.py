@@ -1,0 +1,62 @@
+"""What the pictures of a shot tell of the subject's face, said while the subject still sits there.
+
+Who finds the face (``pipeline.faces``) leaves a ``FaceSighting``; here it becomes sentences. They are remarks, no
+faults: a head is made of a shot with a face that is turned away, and of a statue in which no network sees one.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from rig.acquisition.shot import Fault
+from rig.messages.message import Message, compose
+
+TURNED_DEG = 15.0  # people who look into a camera are within 8 of it (the rendered captures' subjects: 13)
+EXPLAINING = frozenset(
+    {"empty", "cut-off", "dark", "lights-off", "view", "swapped", "overexposed", "blurred", "frozen"}
+)
+"""Faults of a camera with which nobody wonders that its picture shows no face."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaceSighting:
+    """Holds where the face was seen, and where it looks.
+
+    ``searched`` counts the pictures that were looked at; ``missing``: cameras that the face is turned to and that do
+    not show it; ``left_deg``, ``up_deg``: how far it looks to the subject's left and up, seen from ``front``. None
+    where there is no face, or where the cameras stand all around and none is the front.
+    """
+
+    searched: int
+    is_found: bool
+    has_faces: bool  # some picture shows a face, be it the subject's or not
+    front: str
+    missing: tuple[str, ...] = ()
+    left_deg: float | None = None
+    up_deg: float | None = None
+
+
+def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tuple[Message, ...]:
+    """Says which cameras do not show the face, and where it looks; what ``faults`` explain is left out."""
+    explained = {fault.camera for fault in faults if fault.code in EXPLAINING}
+    if sighting is None or None in explained:
+        return ()
+    if not sighting.is_found:
+        return () if sighting.has_faces else (compose("face-nowhere", count=sighting.searched),)
+    missing = [name for name in sighting.missing if name not in explained]
+    remarks = [compose("face-missing", cameras=missing)] if missing else []
+    ways = _ways(sighting)
+    if ways:
+        way = ways[0] if len(ways) == 1 else compose("look-both", across=ways[0], upwards=ways[1])
+        remarks.append(compose("face-turned", way=way, camera=sighting.front))
+    return tuple(remarks)
+
+
+def _ways(sighting: FaceSighting) -> list[Message]:
+    """Where the face looks, beyond ``TURNED_DEG``: across, then up or down."""
+    left, up = sighting.left_deg or 0.0, sighting.up_deg or 0.0
+    ways = []
+    if abs(left) > TURNED_DEG:
+        ways.append(compose("look-left", angle_deg=left) if left > 0.0 else compose("look-right", angle_deg=-left))
+    if abs(up) > TURNED_DEG:
+        ways.append(compose("look-up", angle_deg=up) if up > 0.0 else compose("look-down", angle_deg=-up))
+    return ways

@@ -1,0 +1,53 @@
+"""Faces of a capture for the pages: found once, in a child process, and kept beside its silhouettes.
+
+Whoever asks waits in a thread, and no longer than ``PATIENCE_S``.
+"""
+
+import threading
+import time
+from collections import defaultdict
+from pathlib import Path
+
+from rig.errors import Cancelled
+from rig.messages.message import compose
+from server.errors import Unavailable
+from server.services.service import Service
+from server.services.work import refuse_board
+from server.storage.face_cache import FacesDocument, faces_once
+from server.tasks.faces import find_capture_faces
+
+PATIENCE_S = 60.0  # eleven pictures of 12 Mpx take 4 s, forty 15
+
+_finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+
+
+def found_faces(service: Service, identity: str) -> FacesDocument:
+    """Returns the faces in a capture's pictures. Blocks.
+
+    Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed as the work did, and Unavailable where
+    it takes too long.
+    """
+    deadline = time.monotonic() + PATIENCE_S
+    record = service.store.capture(identity)
+    refuse_board(record)
+    images = {Path(name).stem: name for name in record.inputs if Path(name).parent.name == "images"}
+    files = service.store.folder("captures", identity) / "files"
+
+    def find() -> FacesDocument:
+        with service.children.one() as child:
+            work = child.remote(find_capture_faces, cancelled=lambda: time.monotonic() > deadline)
+            return work(capture=str(files), images=images)
+
+    lock = _finding[identity]
+    if not lock.acquire(timeout=PATIENCE_S):
+        raise _slow()
+    try:
+        return faces_once(service.store.cache_of(identity) / "faces", record.inputs, find)
+    except Cancelled:
+        raise _slow() from None
+    finally:
+        lock.release()
+
+
+def _slow() -> Unavailable:
+    return Unavailable("service-unavailable", compose("faces-slow", seconds=PATIENCE_S))

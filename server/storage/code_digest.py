@@ -1,0 +1,16 @@
+"""The code that something kept on disk was made by, as part of its name: a new version of it makes the thing anew."""
+
+import hashlib
+from functools import cache
+from pathlib import Path
+
+PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
+
+
+@cache
+def code_digest(rooms: tuple[str, ...]) -> str:
+    """Returns the digest of all code in some rooms of the pipeline (paths below it)."""
+    digest = hashlib.sha256()
+    for path in sorted(path for room in rooms for path in (PIPELINE / room).glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,63 @@
+"""Faces that were found in a capture, kept on disk, so that the pages find them once.
+
+A file's name is the sha256 of all that its content follows from: the capture's files, the program's version and code.
+It tells of a face, and lies where ``Store.remove_capture`` erases it with its capture, also while the faces are being
+found. A file that cannot be read is made anew; one that cannot be written is done without.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypedDict, cast
+
+import cv2
+
+from rig.atomic_write import write_atomically
+from server.storage.code_digest import code_digest
+
+ROOMS = ("alignment", "eigenheads", "eigenheads/correspondence", "faces", "multiview")
+SUFFIX = ".faces.json"
+
+PixelsOfPoints = dict[str, dict[str, list[float]]]  # by landmark and camera, as features.json has them
+
+
+class FoundFace(TypedDict):
+    """Holds one face in the pixels of a picture's file; ``is_subject``: it is the one that the views agree on.
+    ``roll_deg``: how far its upright is turned clockwise."""
+
+    box_px: list[float]
+    roll_deg: float
+    score: float
+    is_subject: bool
+    points: list[list[float]]
+
+
+class FacesDocument(TypedDict):
+    """Holds the faces of every picture that was searched, and where the seven feature points are to be looked for
+    (none where no face is certain)."""
+
+    faces: dict[str, list[FoundFace]]
+    suggested: PixelsOfPoints
+
+
+def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], FacesDocument]) -> FacesDocument:
+    """Calls ``find``, unless ``folder`` holds what it found before. ``inputs``: sha256 of the capture's files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / (_key(inputs) + SUFFIX)
+    with suppress(OSError, ValueError):
+        document = json.loads(path.read_bytes())
+        if isinstance(document, dict) and document.keys() == {"faces", "suggested"}:
+            return cast(FacesDocument, document)
+    found = find()
+    with suppress(OSError):
+        write_atomically(path, json.dumps(found, separators=(",", ":")).encode(), parents=False)
+    return found
+
+
+def _key(inputs: Mapping[str, str]) -> str:
+    files = {name: digest for name, digest in sorted(inputs.items()) if name != "features.json"}
+    document = [files, version("eigenhead"), cv2.__version__, code_digest(ROOMS)]
+    return hashlib.sha256(json.dumps(document).encode()).hexdigest()

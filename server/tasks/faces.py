@@ -1,0 +1,116 @@
+"""The faces in a capture's pictures, for the operator's pages; runs in a child process.
+
+Camera by camera, each picture made smaller as it is read: the networks take 192 px of a face.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.camera import Camera
+from rig.errors import InputError
+from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
+from rig.formats.capture_folder import has_known_length
+from rig.formats.images import read_image
+from rig.progress import Progress
+from rig.rig import Rig
+from server.storage.face_cache import FacesDocument, FoundFace, PixelsOfPoints
+from server.tasks.child import WorkerContext
+
+if TYPE_CHECKING:
+    from pipeline.faces.detection import FaceDetection
+    from pipeline.faces.matching import MatchedFaces
+    from pipeline.faces.subject import SubjectFaces
+
+PICTURE_PX = 1600  # longer side: a face of an eighth of it has the networks' 192 px
+
+
+def find_capture_faces(
+    context: WorkerContext, report: Progress, *, capture: str, images: Mapping[str, str]
+) -> FacesDocument:
+    """Finds the faces in ``images`` (files below the folder ``capture``, by camera). Raises InputError, and
+    DamagedNetwork."""
+    from pipeline.faces.matching import EYE_DISTANCE_MM
+    from pipeline.faces.networks import load_networks
+    from pipeline.faces.sighting import reduce_picture
+    from pipeline.faces.subject import find_subject
+
+    root = Path(capture)
+    rig_file = find_rig_file(root)
+    if rig_file is None:
+        raise InputError("capture", [NO_RIG])
+    recorded = read_rig_file(rig_file)
+    pictures, cameras = {}, []
+    for number, camera in enumerate(camera for camera in recorded if camera.name in images):
+        report("read", number / len(images))
+        image = read_image(root / images[camera.name])
+        if camera.recorded is not None:
+            image = camera.recorded.undistort(image, camera.intrinsics.matrix())
+        pictures[camera.name], small = reduce_picture(image, camera, PICTURE_PX)
+        cameras.append(small)
+    rig = Rig(tuple(cameras))
+    subject = find_subject(
+        pictures,
+        rig,
+        context.keep("face networks", load_networks),
+        eye_distance_mm=None if has_known_length(root) else EYE_DISTANCE_MM,
+        report=lambda share: report("faces", share),
+    )
+    return describe(subject, rig, recorded, lambda face: _suggested(context, face, rig, recorded))
+
+
+def describe(
+    subject: "SubjectFaces", rig: Rig, recorded: Rig, suggest: "Callable[[MatchedFaces], PixelsOfPoints]"
+) -> FacesDocument:
+    """Returns what was found by ``rig`` in the pixels of ``recorded``; the subject's face comes first."""
+    matched = subject.matched
+    faces: dict[str, list[FoundFace]] = {}
+    for name, seen in subject.found.items():
+        best = None if matched is None else matched.detections.get(name)
+        found = [_face_of(face, rig[name], recorded[name], best) for face in seen]
+        faces[name] = sorted(found, key=lambda face: not face["is_subject"])
+    return {"faces": faces, "suggested": {} if matched is None else suggest(matched)}
+
+
+def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "FaceDetection | None") -> FoundFace:
+    points = _file_pixels(face.landmarks_px, camera, recorded)
+    return {
+        "box_px": _plain(np.concatenate([points.min(axis=0), points.max(axis=0)])),
+        "roll_deg": round(face.roll_deg, 1),
+        "score": round(face.score, 2),
+        "is_subject": best is not None and face.landmarks_px is best.landmarks_px,
+        "points": [_plain(point) for point in points],
+    }
+
+
+def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded: Rig) -> PixelsOfPoints:
+    """The seven points by the default model's landmarks; none where nobody knows the finder's points on it."""
+    from pipeline.alignment.suggested_points import suggest_points
+    from pipeline.eigenheads.landmarks import SEVEN_POINTS
+    from pipeline.eigenheads.model import load_model
+    from pipeline.faces.landmark_map import NoLandmarkMap, landmark_map
+
+    model = context.keep("model default", load_model)
+    try:
+        places = landmark_map(model)
+    except NoLandmarkMap:
+        return {}
+    suggested = suggest_points(face, rig, model, places, SEVEN_POINTS)
+    return {
+        name: {c: _plain(_file_pixels(pixel[None], rig[c], recorded[c])[0]) for c, pixel in views.items()}
+        for name, views in suggested.items()
+    }
+
+
+def _file_pixels(pixels: Float[np.ndarray, "n 2"], camera: Camera, recorded: Camera) -> Float[np.ndarray, "n 2"]:
+    from pipeline.faces.sighting import file_pixels
+
+    return file_pixels(pixels, camera, recorded)
+
+
+def _plain(values: Float[np.ndarray, " n"]) -> list[float]:
+    """To a tenth of a pixel."""
+    return [round(float(value), 1) for value in values]

@@ -1,0 +1,83 @@
+"""The face at a glance: which cameras lack it, and where it looks, of drawn heads in small pictures."""
+
+import numpy as np
+import pytest
+
+from pipeline.faces.networks import FaceNetworks, load_networks
+from pipeline.faces.sighting import file_pixels, has_front, reduce_picture, sight_face
+from rig.camera import Camera, Intrinsics
+from rig.geometry import RigidTransform, look_at
+from rig.recorded_lens import RecordedLens
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from tests.support.drawn_studio import drawn_pictures, drawn_studio, hidden_from
+
+
+@pytest.fixture(scope="module")
+def networks() -> FaceNetworks:
+    return load_networks()
+
+
+def test_nobody_blames_a_camera_behind_the_head(networks: FaceNetworks) -> None:
+    seen = sight_face(drawn_pictures(0.0), drawn_studio(), networks, front="cam0")
+    assert seen.is_found
+    assert seen.missing == ()
+    assert seen.left_deg == pytest.approx(0.0, abs=4.0)
+    assert seen.up_deg == pytest.approx(0.0, abs=6.0)  # a drawn head is no member of a population
+
+
+def test_a_face_that_looks_aside_is_told_by_how_much(networks: FaceNetworks) -> None:
+    seen = sight_face(drawn_pictures(25.0), drawn_studio(), networks, front="cam0")
+    assert seen.left_deg == pytest.approx(25.0, abs=5.0)
+    assert seen.missing == ()
+
+
+def test_a_face_that_looks_up_is_told(networks: FaceNetworks) -> None:
+    straight, up = (
+        sight_face(drawn_pictures(0.0, angle), drawn_studio(), networks, front="cam0") for angle in (0.0, 20.0)
+    )
+    assert straight.up_deg is not None
+    assert up.up_deg is not None
+    assert up.up_deg - straight.up_deg == pytest.approx(20.0, abs=6.0)
+
+
+def test_a_camera_that_should_show_the_face_and_does_not_is_named(networks: FaceNetworks) -> None:
+    shown = hidden_from(("cam2", "cam4", "cam5"), drawn_pictures())  # cam4 stands 50 degrees aside
+    assert sight_face(shown, drawn_studio(), networks, front="cam0").missing == ("cam2",)
+
+
+def test_without_a_face_nobody_is_blamed_and_the_search_ends_early(networks: FaceNetworks) -> None:
+    rig = default_layout().scaled(0.4)
+    blank = {c.name: np.full((c.intrinsics.height, c.intrinsics.width, 3), 90, np.uint8) for c in rig}
+    seen = sight_face(blank, rig, networks, front="cam00")
+    assert (seen.searched, seen.is_found, seen.has_faces, seen.missing, seen.left_deg) == (5, False, False, (), None)
+
+
+def test_a_ring_has_no_front() -> None:
+    angles = np.radians(np.arange(0, 360, 30))
+    lens = Intrinsics(480, 360, 675.0, 675.0, 239.5, 179.5)
+    around = [1000.0 * np.array([np.sin(a), 0.2, np.cos(a)]) for a in angles]
+    up = np.array([0.0, 1.0, 0.0])
+    ring = Rig(tuple(Camera(f"cam{k:02}", lens, look_at(c, np.zeros(3), up)) for k, c in enumerate(around)))
+    assert not has_front(ring)
+    assert has_front(default_layout())
+
+
+def test_pixels_go_back_to_the_files_picture() -> None:
+    lens = Intrinsics(1600, 1200, 1500.0, 1500.0, 799.5, 599.5)
+    camera = Camera("cam0", lens, RigidTransform(np.eye(3), np.zeros(3)))
+    image, small = reduce_picture(np.zeros((1200, 1600, 3), np.uint8), camera, 640)
+    assert image.shape == (480, 640, 3)
+    point = np.array([[30.0, -20.0, 900.0], [-90.0, 60.0, 1000.0]])
+    np.testing.assert_allclose(file_pixels(small.project(point), small, camera), camera.project(point), atol=1e-9)
+    same, unchanged = reduce_picture(image, small, 640)
+    assert (same is image, unchanged is small) == (True, True)
+
+
+def test_pixels_of_an_undistorted_picture_go_back_through_the_lens() -> None:
+    lens, recorded = Intrinsics(1600, 1200, 900.0, 900.0, 799.5, 599.5), RecordedLens("kannala-brandt", (0.1, 0, 0, 0))
+    camera = Camera("cam0", lens, RigidTransform(np.eye(3), np.zeros(3)), recorded=recorded)
+    pixels = np.array([[700.0, 900.0], [1200.0, 100.0]])
+    np.testing.assert_allclose(
+        recorded.undistorted(file_pixels(pixels, camera, camera), lens.matrix()), pixels, atol=1e-6
+    )
