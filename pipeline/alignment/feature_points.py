@@ -17,7 +17,7 @@ from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 GROSS_NOISE = 3.0  # times the noise of a click: who clicks carelessly is not told that points are another shot's
-VIEWS_ASKED, POINTS_ASKED = 3, 3  # of a point, whose contradiction is its own; and points
+MIN_JUDGED_VIEWS, MIN_JUDGED_POINTS = 3, 3  # of a point, whose contradiction is its own; and points
 WRONG_SHARE, RIGHT_SHARE = 0.6, 0.8  # of the points
 CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point in 10,000 is lost without need
 
@@ -54,17 +54,17 @@ def locate_features(features: Features, rig: Rig, *, noise_px: float) -> Located
 
 def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Message | None:
     """What is wrong with most points together: rows and columns exchanged, or another shot's. None where most points
-    agree in their views, or where too few are told to ask."""
+    agree in their views, or where too few points are there to judge."""
     grossly = GROSS_NOISE * noise_px
-    asked = {name: views for name, views in features.items() if len(views) >= VIEWS_ASKED}
-    wrong = len(asked) - len(locate_features(asked, rig, noise_px=grossly).points)
-    if len(asked) < POINTS_ASKED or wrong < WRONG_SHARE * len(asked):
+    judged = {name: views for name, views in features.items() if len(views) >= MIN_JUDGED_VIEWS}
+    wrong = len(judged) - len(locate_features(judged, rig, noise_px=grossly).points)
+    if len(judged) < MIN_JUDGED_POINTS or wrong < WRONG_SHARE * len(judged):
         return None
-    exchanged = {name: {camera: at[::-1] for camera, at in views.items()} for name, views in asked.items()}
+    exchanged = {name: {camera: at[::-1] for camera, at in views.items()} for name, views in judged.items()}
     right = len(locate_features(exchanged, rig, noise_px=grossly).points)
-    if right >= RIGHT_SHARE * len(asked):
+    if right >= RIGHT_SHARE * len(judged):
         return compose("features-transposed")
-    return compose("features-of-other-pictures", count=wrong, all=len(asked))
+    return compose("features-of-other-pictures", count=wrong, all=len(judged))
 
 
 def _consistent(

@@ -22,8 +22,8 @@ FACTORS = (1.0, 0.5, 0.67, 1.5, 2.0)  # of the focal lengths, of which the best 
 SEARCHES, STEPS = 2, 90  # and how often the misses are asked in each
 STRIDE = 0.1  # of a factor's logarithm, and of a picture's side
 OTHER_FACTOR, OTHER_SHIFT = 0.15, 0.03  # of a factor's logarithm and a side: what makes a rig contradict itself
-FACTOR_LEAST = 0.04  # from one; less is not told
-SHIFT_LEAST = 0.02  # of the picture's width; less is not told
+MIN_FACTOR = 0.04  # from one; less is not told
+MIN_SHIFT = 0.02  # of the picture's width; less is not told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,9 +44,9 @@ class LensReading:
         """Returns the sentence of the refusal."""
         k = self.rig.cameras[0].intrinsics
         changes = []
-        if abs(self.factor - 1.0) >= FACTOR_LEAST:
+        if abs(self.factor - 1.0) >= MIN_FACTOR:
             changes.append(compose("focal-lengths-times", factor=self.factor))
-        if max(map(abs, self.shift)) >= SHIFT_LEAST:
+        if max(map(abs, self.shift)) >= MIN_SHIFT:
             right, down = self.shift[0] * k.width, self.shift[1] * k.height
             changes.append(compose("principal-points-moved", right_px=right, down_px=down))
         return compose("other-lenses", changes=changes)

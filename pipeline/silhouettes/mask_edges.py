@@ -23,11 +23,11 @@ from rig.messages.message import compose
 REACH = 0.06  # of a mask's size (root of its area), to both sides of the outline: 15 mm of a head
 STEADY_PX = 3.0  # blur under which the outline's direction is measured
 BLUR_PX = 1.5  # of the photograph, against noise
-SAMPLES_LEAST, SAMPLES_MOST = 50, 2000  # of an outline
+MIN_SAMPLES, MAX_SAMPLES = 50, 2000  # of an outline
 FLAT_LEVELS = 5.0  # change across the whole reach below which a sample says little
 CLEAR = 2.0  # height of a peak that is an edge's: 2.1 and more in 69 true masks, 1.1 in the mean of others'
 CLEARER = 1.5  # than what lies at the outline itself
-OFF_LEAST = 0.006  # of a mask's size: 3 px of 480, 1.6 mm of a head; true masks have 1 px at most, in hair
+MIN_OFF = 0.006  # of a mask's size: 3 px of 480, 1.6 mm of a head; true masks have 1 px at most, in hair
 OWN_GAIN = 1.5  # how much higher the peaks must be where masks are given to other pictures
 
 
@@ -45,7 +45,7 @@ class Edge:
     def is_off(self) -> bool:
         """Tells whether the edge is clear and lies beside the outline."""
         clear = self.height >= max(CLEAR, CLEARER * self.height_at_outline)
-        return clear and abs(self.offset_px) >= OFF_LEAST * self.size_px
+        return clear and abs(self.offset_px) >= MIN_OFF * self.size_px
 
 
 def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
@@ -53,7 +53,7 @@ def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
     size = float(np.sqrt(np.count_nonzero(silhouette.mask)))
     reach = max(4, round(REACH * size))
     pixels, normals = _outline(silhouette, reach)
-    if len(pixels) < SAMPLES_LEAST:
+    if len(pixels) < MIN_SAMPLES:
         return None
     offsets = np.arange(-reach - 1, reach + 2, dtype=np.float32)
     across = pixels[:, None] + offsets[:, None] * normals[:, None]
@@ -72,7 +72,7 @@ def _outline(silhouette: Silhouette, reach: int) -> tuple[Float32[np.ndarray, "n
     height, width = distance.shape
     rows, columns = np.nonzero(np.abs(distance) < 0.6)
     inner = (columns > reach) & (columns < width - reach - 1) & (rows > reach) & (rows < height - reach - 1)
-    rows, columns = (of[inner][:: max(1, int(inner.sum()) // SAMPLES_MOST)] for of in (rows, columns))
+    rows, columns = (of[inner][:: max(1, int(inner.sum()) // MAX_SAMPLES)] for of in (rows, columns))
     steady = cv2.GaussianBlur(distance, (0, 0), STEADY_PX)
     slope = [cv2.Sobel(steady, cv2.CV_32F, *way)[rows, columns] for way in ((1, 0), (0, 1))]
     normals = np.stack(slope, axis=-1)
@@ -90,15 +90,15 @@ def masks_off_edges(
         silhouettes: by camera.
         ready: cameras whose mask was given.
     """
-    asked = [name for name in ready if name in images and name in silhouettes and silhouettes[name].quality.usable]
-    edges = [edge for name in asked if (edge := edge_beside(images[name], silhouettes[name])) is not None]
+    judged = [name for name in ready if name in images and name in silhouettes and silhouettes[name].quality.usable]
+    edges = [edge for name in judged if (edge := edge_beside(images[name], silhouettes[name])) is not None]
     off = [edge.offset_px for edge in edges if edge.is_off]
     middle = float(np.median(off)) if off else 0.0
     alike = [offset for offset in off if offset * middle > 0]
     if 2 * len(alike) <= len(edges):
         return []
     where = compose("outlines-outside") if middle < 0 else compose("outlines-inside")
-    return [compose("masks-off-edges", count=len(alike), all=len(asked), offset_px=abs(middle), where=where)]
+    return [compose("masks-off-edges", count=len(alike), all=len(judged), offset_px=abs(middle), where=where)]
 
 
 def masks_alone_exchanged(

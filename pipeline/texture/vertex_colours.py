@@ -14,6 +14,7 @@ cameras that had to be raised or lowered much, and a smooth fill where no camera
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -85,19 +86,12 @@ def texture(
     if not len(views):
         return _untextured(len(normals))
 
+    see = partial(see_points, points=mesh_world.vertices, normals=normals, settings=settings)
+
     def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
-        sight = see_points(
-            camera,
-            image,
-            silhouettes[name],
-            depths[name],
-            points=mesh_world.vertices,
-            normals=normals,
-            settings=settings,
-        )
-        return sight, image
+        return see(camera, image, silhouettes[name], depths[name]), image
 
     with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
         found = list(pool.map(look, views))
