@@ -88,15 +88,8 @@ def texture(
     def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
-        sight = see_points(
-            camera,
-            image,
-            silhouettes[name],
-            depths[name],
-            points=mesh_world.vertices,
-            normals=normals,
-            settings=settings,
-        )
+        points, silhouette = mesh_world.vertices, silhouettes[name]
+        sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
         return sight, image
 
     with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
