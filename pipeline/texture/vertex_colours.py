@@ -14,7 +14,6 @@ cameras that had to be raised or lowered much, and a smooth fill where no camera
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -86,12 +85,12 @@ def texture(
     if not len(views):
         return _untextured(len(normals))
 
-    see = partial(see_points, points=mesh_world.vertices, normals=normals, settings=settings)
-
     def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
-        return see(camera, image, silhouettes[name], depths[name]), image
+        points, silhouette = mesh_world.vertices, silhouettes[name]
+        sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
+        return sight, image
 
     with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
         found = list(pool.map(look, views))

@@ -41,9 +41,9 @@ def see_points(
     image: UInt8[np.ndarray, "h w 3"],
     silhouette: Silhouette,
     depth: Float32[np.ndarray, "h w"],
-    *,
     points: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
+    *,
     settings: TextureSettings,
 ) -> Sight:
     """Returns what ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
